@@ -13,9 +13,9 @@ from types import ModuleType
 from typing import Any
 
 from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.common.arguments import at_least, command_parser, parse_options
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from freshfield.files import write_json, write_text
@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name in args.field or field_names():
             make_field(name, args.option)
         figures = _known(args.json, args.quick) if args.resume else {}
-    except (BenchError, FitError, ValueError) as error:
+    except (BenchError, ValueError) as error:
         parser.error(str(error))
     figures |= {"machine": machine(), "versions": versions(), "quick": args.quick}
     figures["runs"] = figures.get("runs", 0) + 1
@@ -109,8 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server bench", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("bench", DESCRIPTION)
     add = parser.add_argument
     add("part", nargs="*", metavar="PART", help=f"{', '.join((*PARTS, *MORE))}, all [all]")
     add("--json", type=Path, metavar="FILE", help="write figures there; plots and tables beside")
@@ -132,25 +131,19 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", action="append", default=[], choices=scenes, help="[track: both; drift: room]")
     add(
         "--updates",
-        type=_at_least_one,
+        type=at_least(1),
         metavar="N",
         help="consecutive updates [100, drift 300; --quick: 16, drift 32]",
     )
     add("--update-s", type=_seconds, metavar="S,...", help="seconds of an update, a run each [1,0.25]")
-    add("--steps", type=_at_least_one, metavar="N", help="steps of an update instead: repeats bit for bit")
-    add("--samples", type=_at_least_one, metavar="N", help="frames with a fresh fit [8; --quick: 3]")
+    add("--steps", type=at_least(1), metavar="N", help="steps of an update instead: repeats bit for bit")
+    add("--samples", type=at_least(1), metavar="N", help="frames with a fresh fit [8; --quick: 3]")
     add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
     return parser
 
 
 def _expanded(part: str) -> tuple[str, ...]:
     return PARTS if part == "all" else (part,)
-
-
-def _at_least_one(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from 1")
-    return int(text)
 
 
 def _seconds(text: str) -> tuple[float, ...]:

@@ -24,8 +24,12 @@ from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_rec
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.common.tables import grouped, markdown_table, number
-from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import MultiviewStill, smallest_angle_deg, synthetic_still
+from edge_server.experiments.scenes.multiview_still import (
+    MultiviewStill,
+    score_views,
+    smallest_angle_deg,
+    synthetic_still,
+)
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
@@ -172,7 +176,7 @@ def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | Non
 def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
     model = make_field(field, seed=seed)
     report = model.fit(still.training, Budget(seconds=seconds))
-    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     return {
         "fitted_s": report.seconds, "steps": report.steps, "psnr_db": score.psnr_db, "ssim": score.ssim,
         "lpips": score.lpips,

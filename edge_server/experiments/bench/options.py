@@ -20,7 +20,7 @@ from edge_server.experiments.bench.run import BenchError, BenchRun, result_setti
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db
-from edge_server.experiments.fitting.evaluate import evaluate
+from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
@@ -146,7 +146,7 @@ def _from_scratch(where: Scene, model: Field, budget: Budget) -> _Fitted:
     cpu = time.process_time()
     report = model.fit(still.training, budget)
     cpu_s = time.process_time() - cpu
-    score, _ = evaluate(model, still.held_out, Scorer(background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(background=still.background))
     return _Fitted(score.psnr_db, score.psnr_moving_db, report.steps, report.seconds, cpu_s)
 
 

@@ -1,4 +1,4 @@
-"""Fits a field to still views and scores it on held-out ones: what fit, frontier and bench share."""
+"""Fits a field in slices of time, scores it after each, and ends early after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from types import FrameType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Field, FitReport, View
 
 # Dense where a field learns fastest; after that every 30 s.
@@ -40,13 +39,6 @@ def marks_s(total_s: float) -> list[float]:
     """Seconds of fitting after which to evaluate, the last being ``total_s``."""
     later = np.arange(_MARKS_S[-1] + _THEN_EVERY_S, total_s, _THEN_EVERY_S)
     return [m for m in (*_MARKS_S, *map(float, later)) if m <= (1.0 - _LAST_SHARE) * total_s] + [total_s]
-
-
-def evaluate(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
-    """Mean score over ``views``, and the rendering (H, W, 3) of the first."""
-    renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
-    scores = [scorer.score(v.camera, image, 0, v.image, 0) for v, image in zip(views, renderings)]
-    return mean_score(scores), renderings[0]
 
 
 def fit_in_slices(

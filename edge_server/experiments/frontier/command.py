@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.synthetic.scene import SCENES, SceneError
+from camera_node.synthetic.scene import SCENES
+from edge_server.experiments.common.arguments import command_parser, parse_options, run_command
 from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
-from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.experiments.frontier import effort_sweep, update_time
 from edge_server.experiments.frontier.output import write_output
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
@@ -121,22 +121,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     try:
         frontier = _frontier(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
-    except (DatasetError, SceneError, FitError, ScenarioError, ValueError) as error:
+    except (DatasetError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
-    try:
-        frontier.run()
-    except KeyboardInterrupt:
-        print(
-            f"\nstopped; what was measured is in {frontier.file.path}: the same command goes on", flush=True
-        )
-        return 130
-    return 0
+    stopped = f"what was measured is in {frontier.file.path}: the same command goes on"
+    return run_command("frontier", frontier.run, (), stopped)
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server frontier", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("frontier", DESCRIPTION)
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
     size("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")

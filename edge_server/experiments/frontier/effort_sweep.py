@@ -10,8 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import MultiviewStill
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, score_views
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import efforts_of, make_field
@@ -96,7 +95,7 @@ def fit_from_scratch(
     load = LoadMeter()
     report = model.fit(still.training, Budget(seconds=seconds))
     outside = load.outside_cores()
-    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
     return {
         "effort": effort.label,

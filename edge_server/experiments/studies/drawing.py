@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from edge_server.experiments.studies.statistics import Interval
+from edge_server.experiments.common.statistics import Interval
 from edge_server.experiments.studies.study import METRICS, Curve, Table, mean_curve
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
@@ -75,6 +75,6 @@ def draw_pictures(
 
 
 def _mean(values: Sequence[float | None]) -> Interval:
-    from edge_server.experiments.studies.statistics import interval
+    from edge_server.experiments.common.statistics import interval
 
     return interval(values)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
+from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.drawing import draw_pictures
-from edge_server.experiments.studies.statistics import interval, negated, paired
-from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, number
+from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
@@ -67,16 +67,16 @@ class Metrics:
     name = "metrics"
     title = "What the three metrics say of three artefacts (figure 3.6)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         return []
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        lpips, missing = open_lpips(ask.folders.lpips)
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+        lpips, missing = open_lpips(request.folders.lpips)
         scores: dict[str, dict[str, list[float | None]]] = {}
         pictures: list[tuple[str, Unit]] = []
         scene = make_scene("room", {"count": 19, "width": 192, "height": 192})
         cameras = list(scene.cameras)
-        for seed in ask.repeats(8, 19):
+        for seed in request.repeats(8, 19):
             name = cameras[seed % len(cameras)]
             reference = scene.render(name, 0.3 * seed).astype(np.float32) / 255.0
             for case, image in distortions(reference).items():
@@ -88,13 +88,13 @@ class Metrics:
             if not pictures:
                 pictures = [("reference", reference), *distortions(reference).items()]
         shown = [(label, (image * 255).astype(np.uint8)) for label, image in pictures]
-        draw_pictures(ask.out / "metrics.png", [("room", shown)])
+        draw_pictures(request.out / "metrics.png", [("room", shown)])
         rows = []
         for case, found in scores.items():
             psnr_db, ssim_, lpips_ = (number(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
             rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_,
                          "seeds": len(found["psnr"])})  # fmt: skip
-        write_csv(ask.out / "metrics.csv", rows)
+        write_csv(request.out / "metrics.csv", rows)
         verdicts = [
             self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
             self._ordering(scores, "ssim", "highest for ghosting, against the prose",

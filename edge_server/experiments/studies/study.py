@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.statistics import Interval, interval, paired
 from edge_server.experiments.common.tables import number, write_csv
 from edge_server.experiments.studies.engine import Engine, StudyError
-from edge_server.experiments.studies.statistics import Interval, interval, paired
-from edge_server.experiments.studies.trial import Folders, Row, Trial
+from edge_server.experiments.studies.trial import Row, Trial
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.files import write_text
 
@@ -32,7 +33,7 @@ Curve = dict[float, dict[int, float | None]]
 
 
 @dataclass(frozen=True)
-class Ask:
+class StudyRequest:
     """Requested settings; None or no case selects the study's default. seeds: repetitions per point. scenes:
     a subset of those with local data. For studies that train, jobs: processes; cases: words in the names of
     selected cases; episodes: number per training."""
@@ -130,23 +131,23 @@ class Study(Protocol):
     name: str
     title: str
 
-    def points(self, ask: Ask) -> list[Point]: ...
+    def points(self, request: StudyRequest) -> list[Point]: ...
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        """Draw the figures into ``ask.out`` and judge the claims."""
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+        """Draw the figures into ``request.out`` and judge the claims."""
         ...
 
 
-def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
+def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
     """Run what is missing, write OUT/NAME.csv, figures and OUT/NAME.md, return the verdicts."""
-    ask.out.mkdir(parents=True, exist_ok=True)
-    points = study.points(ask)
+    request.out.mkdir(parents=True, exist_ok=True)
+    points = study.points(request)
     table = Table(points, engine.run([p.trial for p in points], study.name))
     if table.rows:
-        write_csv(ask.out / f"{study.name}.csv", table.rows)
-    verdicts = study.report(ask, table)
+        write_csv(request.out / f"{study.name}.csv", table.rows)
+    verdicts = study.report(request, table)
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
-    write_text(ask.out / f"{study.name}.md", text)
+    write_text(request.out / f"{study.name}.md", text)
     return verdicts
 
 
@@ -176,13 +177,13 @@ def by_bool(answer: bool | None) -> str:
     return UNDECIDED if answer is None else HOLDS if answer else DOES_NOT_HOLD
 
 
-def with_data(ask: Ask, scenes: Sequence[str], needs: Callable[[str], str | None]) -> list[str]:
+def with_data(request: StudyRequest, scenes: Sequence[str], needs: Callable[[str], str | None]) -> list[str]:
     """Of ``scenes``, those asked for and there. needs: the file below the data folder, None: none."""
-    wanted = [s for s in (ask.scenes or scenes)]
+    wanted = [s for s in (request.scenes or scenes)]
     found = []
     for scene in wanted:
         file = needs(scene)
-        if file is None or (ask.folders.data is not None and (ask.folders.data / file).exists()):
+        if file is None or (request.folders.data is not None and (request.folders.data / file).exists()):
             found.append(scene)
         else:
             print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")

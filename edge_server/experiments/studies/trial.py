@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from camera_node.capture import Camera
 from camera_node.config import source_config
 from edge_server.config import read_config
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -112,14 +113,6 @@ class Trial:
             first_ms=first_ms,
             scratch=self.scratch,
         )
-
-
-@dataclass(frozen=True)
-class Folders:
-    """Local folders for files outside the repository. data: recorded data sets. lpips: weights."""
-
-    data: Path | None = None
-    lpips: Path | None = None
 
 
 @dataclass

@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 
+from edge_server.experiments.common.statistics import Interval, move_of_optimum, optimum
 from edge_server.experiments.studies.age.max_age import GAMMAS, QUICK_GAMMAS, RECORDED, trial_of
-from edge_server.experiments.studies.statistics import Interval, move_of_optimum, optimum
 from edge_server.experiments.studies.study import (
-    Ask,
     Curve,
     Point,
     Row,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -34,25 +34,27 @@ class Weighing:
     name = "lambda"
     title = "The weight of timeliness in the objective (equation 5.8)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room",), RECORDED.get):
-            for seed in ask.repeats(10, 40):
+        for scene in with_data(request, ("room",), RECORDED.get):
+            for seed in request.repeats(10, 40):
                 # The thresholds are the very trials of ``mat``: where that has been run, they are known.
-                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"})
+                base = trial_of(
+                    request, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"}
+                )
                 found.append(Point({"scene": scene, "policy": "all"}, base))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
                 for policy, values in (
-                    ("threshold", QUICK_GAMMAS if ask.quick else GAMMAS),
-                    ("wait", QUICK_WAITS if ask.quick else WAITS),
+                    ("threshold", QUICK_GAMMAS if request.quick else GAMMAS),
+                    ("wait", QUICK_WAITS if request.quick else WAITS),
                 ):
                     for omega in values:
                         trial = dataclasses.replace(base, policy=policy, value=omega)
                         found.append(Point({"scene": scene, "policy": policy, "omega_ms": omega}, trial))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         for row in table.rows:
             row["used_age_sum_ms"] = row["aaoi_ms"] * row["views"]
         verdicts = []
@@ -77,7 +79,7 @@ class Weighing:
                                 by_bool(_falls(move)),
                             )
                         )
-            with figure(ask.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
                 at = axes[0, 0]
                 for k, ((policy, label), xs) in enumerate(best.items()):
                     at.plot(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
+from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
 from edge_server.experiments.studies.drawing import draw_metrics
-from edge_server.experiments.studies.statistics import interval, negated, paired
 from edge_server.experiments.studies.study import (
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -33,28 +33,28 @@ class Images:
     name = "images"
     title = "Perceptual distance and age against the number of images (figures 6.5, 6.6)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, tuple(SCENES), RECORDED.get):
-            field = SCENES[scene][0] if scene in SCENES and not ask.quick else "splat"
-            for seed in ask.repeats(6, 40):
-                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5"}, field=field)
+        for scene in with_data(request, tuple(SCENES), RECORDED.get):
+            field = SCENES[scene][0] if scene in SCENES and not request.quick else "splat"
+            for seed in request.repeats(6, 40):
+                base = trial_of(request, scene, seed=seed, channel={"preset": "ch5"}, field=field)
                 cameras = len(base.scenario().training)
                 found.append(Point({"scene": scene, "field": field, "policy": "all"}, base))
                 ideal = dataclasses.replace(base, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "field": field, "policy": "no delay"}, ideal))
-                for count in [c for c in (QUICK_COUNTS if ask.quick else COUNTS) if c <= cameras]:
+                for count in [c for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]:
                     trial = dataclasses.replace(base, policy="freshest-k", value=float(count))
                     found.append(Point({"scene": scene, "field": field, "images": count}, trial))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             field = table.where(scene=scene)[0]["field"]
             _, way, thesis = SCENES.get(scene, ("", "", "the same"))
             draw_metrics(
-                ask.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
+                request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
                 [(field, {"scene": scene})], f"{scene}, cameras {way}",
             )  # fmt: skip
             for metric, rises in (

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from edge_server.experiments.common.statistics import interval, optimum
 from edge_server.experiments.studies.drawing import Image, draw_metrics, draw_pictures
-from edge_server.experiments.studies.statistics import interval, optimum
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -34,11 +34,11 @@ RECORDED = {
 }
 
 
-def trial_of(ask: Ask, scene: str, **more: Any) -> Trial:
-    """The study's usual trial of a scene: pictures and steps as ``ask`` has it."""
-    sized = ask.pictured()
+def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
+    """The study's usual trial of a scene: pictures and steps as ``request`` has it."""
+    sized = request.pictured()
     if scene in RECORDED:
-        sized = {"scale": 2.0 if ask.quick else 1.0, "steps": sized["steps"], "speed_m_per_s": None}
+        sized = {"scale": 2.0 if request.quick else 1.0, "steps": sized["steps"], "speed_m_per_s": None}
     return Trial(scene=scene, **{**sized, **more})
 
 
@@ -46,38 +46,38 @@ class Mat:
     name = "mat"
     title = "Fidelity against the maximum age of used views (figures 5.6, 5.7)"
 
-    def points(self, ask: Ask) -> list[Point]:
-        gammas = QUICK_GAMMAS if ask.quick else GAMMAS
+    def points(self, request: StudyRequest) -> list[Point]:
+        gammas = QUICK_GAMMAS if request.quick else GAMMAS
         found = []
-        for scene in with_data(ask, ("room", "kitchen", "people"), RECORDED.get):
+        for scene in with_data(request, ("room", "kitchen", "people"), RECORDED.get):
             ours = scene not in RECORDED
-            seeds = ask.repeats(10 if ours else 4, 40)
+            seeds = request.repeats(10 if ours else 4, 40)
             for seed in seeds:
-                for discipline in DISCIPLINES if ours or not ask.quick else DISCIPLINES[:1]:
+                for discipline in DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]:
                     channel = {"preset": "ch5", "discipline": discipline}
-                    base = trial_of(ask, scene, seed=seed, channel=channel)
+                    base = trial_of(request, scene, seed=seed, channel=channel)
                     labels = {"scene": scene, "discipline": discipline}
                     found.append(Point({**labels, "policy": "all", "gamma_ms": None}, base))
                     for gamma in gammas:
                         trial = dataclasses.replace(base, policy="threshold", value=gamma)
                         found.append(Point({**labels, "policy": "threshold", "gamma_ms": gamma}, trial))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "discipline": "-", "policy": "no delay"}, ideal))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             disciplines = [d for d in DISCIPLINES if table.where(scene=scene, discipline=d)]
             draw_metrics(
-                ask.out / f"mat-{scene}.png", table, "gamma_ms", "maximum age (ms)", _METRICS,
+                request.out / f"mat-{scene}.png", table, "gamma_ms", "maximum age (ms)", _METRICS,
                 [(d, {"scene": scene, "discipline": d, "policy": "threshold"}) for d in disciplines],
                 f"{scene}: threshold on age, from scratch",
                 [("no delay", {"scene": scene, "policy": "no delay"})],
             )  # fmt: skip
             for discipline in disciplines:
                 verdicts += self._judge(table, scene, discipline)
-        self._pictures(ask, table)
+        self._pictures(request, table)
         return verdicts
 
     def _judge(self, table: Table, scene: str, discipline: str) -> list[Verdict]:
@@ -105,14 +105,14 @@ class Mat:
             )
         return found
 
-    def _pictures(self, ask: Ask, table: Table) -> None:
+    def _pictures(self, request: StudyRequest, table: Table) -> None:
         """Figure 5.7: one instant under three thresholds."""
         rows = []
         for scene in table.distinct("scene"):
             shown: list[tuple[str, Image]] = []
             for gamma in PICTURED:
                 trial = trial_of(
-                    ask,
+                    request,
                     scene,
                     seed=3,
                     channel={"preset": "ch5"},
@@ -120,10 +120,10 @@ class Mat:
                     value=gamma,
                     lpips=False,
                 )
-                truth, rendering, row = picture(trial, ask.folders)
+                truth, rendering, row = picture(trial, request.folders)
                 if not shown:
                     shown.append(("truth at the present", truth))
                 shown.append((f"{gamma:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB", rendering))
             rows.append((scene, shown))
         if rows:
-            draw_pictures(ask.out / "mat-pictures.png", rows)
+            draw_pictures(request.out / "mat-pictures.png", rows)

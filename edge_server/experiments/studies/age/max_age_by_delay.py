@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
+from edge_server.experiments.common.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
     Curve,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -34,23 +34,23 @@ class MatDelay:
     name = "mat-delay"
     title = "The best maximum age against the mean delay (figure 5.8)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room",), RECORDED.get):
-            for seed in ask.repeats(8, 40):
-                for delay in QUICK_DELAYS_MS if ask.quick else DELAYS_MS:
+        for scene in with_data(request, ("room",), RECORDED.get):
+            for seed in request.repeats(8, 40):
+                for delay in QUICK_DELAYS_MS if request.quick else DELAYS_MS:
                     channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": delay}}
-                    base = trial_of(ask, scene, seed=seed, channel=channel, every_ms=1500.0)
+                    base = trial_of(request, scene, seed=seed, channel=channel, every_ms=1500.0)
                     labels = {"scene": scene, "delay_ms": delay}
                     found.append(Point({**labels, "policy": "all"}, base))
-                    for gamma in QUICK_GAMMAS if ask.quick else GAMMAS:
+                    for gamma in QUICK_GAMMAS if request.quick else GAMMAS:
                         trial = dataclasses.replace(base, policy="threshold", value=gamma)
                         found.append(Point({**labels, "policy": "threshold", "gamma_ms": gamma}, trial))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"}, every_ms=1500.0)
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"}, every_ms=1500.0)
                 found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             best: dict[str, dict[float, Optimum]] = {}
@@ -62,7 +62,7 @@ class MatDelay:
                         best[metric][delay] = optimum(curve, METRICS[metric][1])
                 if len(best[metric]) > 1:
                     verdicts.append(self._judge(table, scene, metric, best[metric]))
-            self._draw(ask, table, scene, best)
+            self._draw(request, table, scene, best)
         return verdicts
 
     def _judge(self, table: Table, scene: str, metric: str, best: dict[float, Optimum]) -> Verdict:
@@ -85,8 +85,10 @@ class MatDelay:
             by_bool(slope.above(0.0)),
         )
 
-    def _draw(self, ask: Ask, table: Table, scene: str, best: dict[str, dict[float, Optimum]]) -> None:
-        with figure(ask.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
+    def _draw(
+        self, request: StudyRequest, table: Table, scene: str, best: dict[str, dict[float, Optimum]]
+    ) -> None:
+        with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
             top, bottom = axes[:, 0]
             for k, (metric, found) in enumerate(best.items()):
                 xs = [d * (1 + 0.02 * (k - 1.5)) for d in found]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
-from edge_server.experiments.studies.drawing import Image, draw_metrics, draw_pictures
-from edge_server.experiments.studies.statistics import (
+from edge_server.experiments.common.statistics import (
     Interval,
     at_its_best,
     interval,
@@ -14,11 +12,13 @@ from edge_server.experiments.studies.statistics import (
     optimum,
     paired,
 )
+from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
+from edge_server.experiments.studies.drawing import Image, draw_metrics, draw_pictures
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -43,32 +43,32 @@ class Omega:
     name = "omega"
     title = "Threshold and wait against omega in two traffic states (figures 6.3, 6.4)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room", "kitchen", "people"), RECORDED.get):
+        for scene in with_data(request, ("room", "kitchen", "people"), RECORDED.get):
             ours = scene not in RECORDED
-            for seed in ask.repeats(6 if ours else 3, 40):
+            for seed in request.repeats(6 if ours else 3, 40):
                 for state, (preset, _, _) in STATES.items():
-                    if ask.quick and not ours and state == "low":
+                    if request.quick and not ours and state == "low":
                         continue
-                    base = trial_of(ask, scene, seed=seed, channel={"preset": preset}, every_ms=2400.0)
+                    base = trial_of(request, scene, seed=seed, channel={"preset": preset}, every_ms=2400.0)
                     labels = {"scene": scene, "state": state}
                     found.append(Point({**labels, "policy": "all", "omega_ms": None}, base))
                     for policy in POLICIES:
-                        for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
+                        for omega in QUICK_OMEGAS if request.quick else OMEGAS:
                             trial = dataclasses.replace(base, policy=policy, value=omega)
                             found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "state": "-", "policy": "no delay"}, ideal))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             states = [s for s in STATES if table.where(scene=scene, state=s)]
             for state in states:
                 draw_metrics(
-                    ask.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
+                    request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
                     [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
                     f"{scene}, {state} traffic: from scratch, scored at the present",
                     [("use all", {"scene": scene, "state": state, "policy": "all"}),
@@ -78,7 +78,7 @@ class Omega:
                     verdicts += self._threshold(table, scene, state, metric)
                     for policy in POLICIES[1:]:
                         verdicts += self._wait(table, scene, state, metric, policy)
-        self._pictures(ask, table)
+        self._pictures(request, table)
         return verdicts
 
     def _threshold(self, table: Table, scene: str, state: str, metric: str) -> list[Verdict]:
@@ -141,7 +141,7 @@ class Omega:
             ),
         ]
 
-    def _pictures(self, ask: Ask, table: Table) -> None:
+    def _pictures(self, request: StudyRequest, table: Table) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
         rows = []
         for scene in table.distinct("scene"):
@@ -149,17 +149,17 @@ class Omega:
                 shown: list[tuple[str, Image]] = []
                 for omega in PICTURED:
                     trial = trial_of(
-                        ask, scene, seed=3, channel={"preset": "ch6-high"}, policy=policy, value=omega,
+                        request, scene, seed=3, channel={"preset": "ch6-high"}, policy=policy, value=omega,
                         lpips=False, every_ms=2400.0,
                     )  # fmt: skip
-                    truth, rendering, row = picture(trial, ask.folders)
+                    truth, rendering, row = picture(trial, request.folders)
                     if not shown:
                         shown.append(("truth at the present", truth))
                     label = f"{omega:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB"
                     shown.append((label, rendering))
                 rows.append((f"{scene}, {policy}", shown))
         if rows:
-            draw_pictures(ask.out / "omega-pictures.png", rows)
+            draw_pictures(request.out / "omega-pictures.png", rows)
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+from edge_server.experiments.common.statistics import optimum
 from edge_server.experiments.studies.age.max_age import trial_of
 from edge_server.experiments.studies.drawing import draw_metrics
-from edge_server.experiments.studies.statistics import optimum
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
@@ -32,30 +32,32 @@ class Representations:
     name = "representations"
     title = "Threshold and wait, by representation (figure 6.7)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in ask.scenes or ("room",):
-            for field, steps in (QUICK_FIELDS if ask.quick else FIELDS).items():
-                for seed in ask.repeats(4, 20):
-                    base = trial_of(ask, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0)
+        for scene in request.scenes or ("room",):
+            for field, steps in (QUICK_FIELDS if request.quick else FIELDS).items():
+                for seed in request.repeats(4, 20):
+                    base = trial_of(
+                        request, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0
+                    )
                     base = dataclasses.replace(base, field=field, steps=steps)
                     ideal = dataclasses.replace(base, channel={"preset": "ideal"})
                     labels = {"scene": scene, "field": field}
                     found.append(Point({**labels, "policy": "all"}, base))
                     found.append(Point({**labels, "policy": "no delay"}, ideal))
                     for policy in POLICIES:
-                        for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
+                        for omega in QUICK_OMEGAS if request.quick else OMEGAS:
                             trial = dataclasses.replace(base, policy=policy, value=omega)
                             found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             fields = table.distinct("field")
             for policy in POLICIES:
                 draw_metrics(
-                    ask.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
+                    request.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
                     _METRICS,
                     [(f, {"scene": scene, "field": f, "policy": policy}) for f in fields],
                     f"{scene}, {policy}: from scratch",

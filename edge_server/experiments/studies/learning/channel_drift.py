@@ -18,13 +18,12 @@ from edge_server.experiments.studies.learning.setup import (
     better,
     room,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict
 from edge_server.experiments.training.scheduler.choices import choose, named
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.episode import DecisionPoint
-from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals
+from edge_server.experiments.training.scheduler.evaluation import PerSeed, baseline_policies
 from edge_server.experiments.training.scheduler.report import smoothed
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
@@ -94,39 +93,39 @@ class Drift(TrainingStudy):
     name = "drift"
     title = "The channel changes during use: fixed, learnt, and still learning"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
+        with StudyTrainer(request) as trainer:
             known = changes()
-            for name in ask.chosen(list(known), list(known)[:1]):
-                trainings = RUNS[ask.quick]
-                each = max(1, len(ask.repeats(3, 9)) // trainings)
+            for name in request.chosen(list(known), list(known)[:1]):
+                trainings = RUNS[request.quick]
+                each = max(1, len(request.repeats(3, 9)) // trainings)
                 runs = [
                     [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
                     for training in range(trainings)
                 ]  # fmt: skip
                 found += judge(f"room, {name}", runs)
                 together = [run for of in runs for run in of]
-                _draw(ask, name, together)
+                _draw(request, name, together)
                 written += [
                     {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
                     for r, run in enumerate(together) for policy, values in run.items()
                     for k, value in enumerate(values)
                 ]  # fmt: skip
-        write_csv(ask.out / f"{self.name}.csv", written)
+        write_csv(request.out / f"{self.name}.csv", written)
         return found
 
 
 def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, run: int) -> Rewards:
     """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
     before, after = change.settings()
-    config = change.config(trainer, trainer.ask.training_episodes(EPISODES), training)
+    config = change.config(trainer, trainer.request.training_episodes(EPISODES), training)
     reward, priced = config.reward, "priced-" * bool(change.price)
     home = trainer.train_one(TrainingRun(f"drift-before-{priced}{training}", before, config))
     there = trainer.train_one(TrainingRun(f"drift-{name.replace(' ', '-')}-{training}", after, config))
-    thresholds = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random",))
+    thresholds = baseline_policies(OMEGAS_MS["threshold"], ["threshold"], ("random",))
     chosen = trainer.evaluate(before, thresholds, reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
@@ -215,8 +214,8 @@ def _after(values: list[float]) -> np.ndarray:
     return np.array(values[len(values) * BEFORE // (BEFORE + AFTER) :])
 
 
-def _draw(ask: Ask, name: str, runs: list[Rewards]) -> None:
-    with figure(ask.out / f"drift-{name.replace(' ', '-')}.png", 1, height_inch=3.2) as (_, axes):
+def _draw(request: StudyRequest, name: str, runs: list[Rewards]) -> None:
+    with figure(request.out / f"drift-{name.replace(' ', '-')}.png", 1, height_inch=3.2) as (_, axes):
         at = axes[0, 0]
         for k, policy in enumerate(POLICIES):
             mean = np.nanmean([run[policy] for run in runs], axis=0)

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
@@ -21,19 +22,17 @@ from edge_server.experiments.studies.learning.setup import (
     room,
     runs_of,
 )
-from edge_server.experiments.studies.statistics import interval
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     Evaluation,
     PerSeed,
-    rivals,
+    baseline_policies,
     rows,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
-from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -64,14 +63,14 @@ class PpoSelect(TrainingStudy):
     name = "ppo-select"
     title = "A scheduler that learns which views to use (figure 5.9)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         verdicts: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        count = len(ask.repeats(10, 100))
-        with StudyTrainer(ask) as trainer:
+        count = len(request.repeats(10, 100))
+        with StudyTrainer(request) as trainer:
             cases = {_called(*case): case for case in CASES}
-            for case in ask.chosen(list(cases), list(cases)):
+            for case in request.chosen(list(cases), list(cases)):
                 on, viewpoints, scratch, price = cases[case]
                 held_out = VIEWPOINTS[viewpoints]
                 field = FIELDS[scratch]
@@ -80,20 +79,20 @@ class PpoSelect(TrainingStudy):
                 reward = dataclasses.replace(reward, views=-price)
                 name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
                 trained = trainer.train_repeats(
-                    name, setting, TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
+                    name, setting, TrainingConfig(spec, reward, request.training_episodes(EPISODES))
                 )
                 mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
                 evaluation = trainer.evaluate(setting, {**_rivals(setting), **mine}, reward, count)
                 verdicts += [*judge(about, evaluation), _time(about, trained)]
                 labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
                 written += rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
-                few = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all"))
+                few = baseline_policies(OMEGAS_MS["threshold"], ["threshold"], ("random", "all"))
                 same = trainer.evaluate_as_rewarded(setting, {**few, **mine}, reward, count)
                 verdicts += _as_rewarded(about, same)
                 written += rows(same, **labels, judged_from="the same")
                 level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
-                draw_curve(ask.out / f"{trained[0].run.name}.png", trained[0].rows, level)
-        write_csv(ask.out / f"{self.name}.csv", written)
+                draw_curve(request.out / f"{trained[0].run.name}.png", trained[0].rows, level)
+        write_csv(request.out / f"{self.name}.csv", written)
         return verdicts
 
 
@@ -104,7 +103,7 @@ def _called(on: str, viewpoints: str, scratch: bool, price: float) -> str:
 def _rivals(setting: Setting) -> dict[str, Any]:
     """Everything that does not learn; those that know the held-out viewpoint, too."""
     near = {f"nearest:{k}": _nearest(setting, k) for k in NEAREST}
-    return {**rivals(OMEGAS_MS["threshold"], ["threshold"]), **near}
+    return {**baseline_policies(OMEGAS_MS["threshold"], ["threshold"]), **near}
 
 
 def _nearest(setting: Setting, k: int) -> Maker:
@@ -116,7 +115,7 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
     """What the contest says of the thesis's claims and ours."""
     mine, random = runs_of(evaluation, "learnt"), evaluation.rewards("random")
     best, best_name = evaluation.best_fixed("threshold")
-    varies = evaluation.varies("threshold")
+    best_values = evaluation.best_values("threshold")
     over_named = paired_difference(mine, evaluation.rewards(best_name))
     return [
         better(about, f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes "
@@ -130,10 +129,10 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
         _viewpoint(about, evaluation, mine),
         _share(about, evaluation, mine, best),
         Verdict(about, "the best threshold differs between decisions: who knew it beforehand would win.",
-                f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
-                f"{span(varies['gain'])} over the best fixed one, as another fit has it; "
+                f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+                f"{span(best_values['gain'])} over the best fixed one, as another fit has it; "
                 "whether the state tells it is another question.",
-                by_bool(varies["gain"].above(0.0))),
+                by_bool(best_values["gain"].above(0.0))),
     ]  # fmt: skip
 
 

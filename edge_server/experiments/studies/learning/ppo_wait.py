@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from edge_server.experiments.common.statistics import Interval, crossed
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.predictability import by_ages
 from edge_server.experiments.studies.learning.setup import (
@@ -18,12 +19,10 @@ from edge_server.experiments.studies.learning.setup import (
     room,
     runs_of,
 )
-from edge_server.experiments.studies.statistics import Interval, crossed
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
-from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, seeds
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Action, Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -49,32 +48,32 @@ class PpoWait(TrainingStudy):
     name = "ppo-wait"
     title = "A scheduler that learns how long to wait, or how old is too old (figure 6.8)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         verdicts: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
+        with StudyTrainer(request) as trainer:
             cases = {named(*case): case for case in CASES}
-            for case in ask.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
+            for case in request.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
                 channel, age, pixels = cases[case]
                 setting, mark = room(channel), "-moving" if pixels == "moving" else ""
                 reward = dataclasses.replace(trainer.reward("corrected", pixels), age=age)
-                everybody: dict[str, Any] = {}
+                candidates: dict[str, Any] = {}
                 for kind in KINDS:
                     spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
-                    config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
+                    config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
                     trained = trainer.train_repeats(
                         f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, config
                     )
-                    everybody |= rivals(OMEGAS_MS[kind], [kind], ("random", "all"))
-                    everybody |= named_runs(f"learnt-{kind}", trained)
-                count = len(ask.repeats(16, 100))
-                evaluation = trainer.evaluate(setting, everybody, reward, count)
+                    candidates |= baseline_policies(OMEGAS_MS[kind], [kind], ("random", "all"))
+                    candidates |= named_runs(f"learnt-{kind}", trained)
+                count = len(request.repeats(16, 100))
+                evaluation = trainer.evaluate(setting, candidates, reward, count)
                 moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
                 verdicts += judge(case, channel, evaluation)
                 verdicts += [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
                 written += rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
-        write_csv(ask.out / f"{self.name}.csv", written)
+        write_csv(request.out / f"{self.name}.csv", written)
         return verdicts
 
 
@@ -91,7 +90,7 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
     for kind in KINDS:
         about, mine = f"room, {case}, {kind}", trained[kind]
         best, name = evaluation.best_fixed(kind)
-        varies = evaluation.varies(kind)
+        best_values = evaluation.best_values(kind)
         same = paired_difference(mine, evaluation.rewards(name))
         text = (
             f"the best is {name}, over which it has {span(same)} where that is known from the very seeds it "
@@ -109,10 +108,10 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
         )  # fmt: skip
         found.append(
             Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
-                    f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
-                    f"{span(varies['gain'])} over the best fixed one, as another fit has it; learnt "
+                    f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+                    f"{span(best_values['gain'])} over the best fixed one, as another fit has it; learnt "
                     f"{span(crossed(mine))}.",
-                    by_bool(varies["gain"].above(0.0)))
+                    by_bool(best_values["gain"].above(0.0)))
         )  # fmt: skip
     wait, threshold = trained["wait"], trained["threshold"]
     found.append(

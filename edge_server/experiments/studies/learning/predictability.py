@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.studies.statistics import Interval, interval
+from edge_server.experiments.common.statistics import Interval, interval
 from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.evaluation import Evaluation
 

@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.statistics import crossed
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     StudyTrainer,
@@ -21,11 +22,10 @@ from edge_server.experiments.studies.learning.setup import (
     runs_of,
 )
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
-from edge_server.experiments.studies.statistics import crossed
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
 from edge_server.experiments.training.scheduler.report import span
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, layout_of
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, stage_file
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 from edge_server.scheduler.learned.actor import Actor
@@ -48,41 +48,41 @@ class RewardCost(TrainingStudy):
     name = "reward-cost"
     title = "Reward against the time of training, by the effort of a fit; and against embedding size"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         parts = {"fit budget": _by_budget, "embedding size": _by_dim}
         written: list[dict[str, Any]] = []
         found: list[Verdict] = []
-        with StudyTrainer(ask) as trainer:
-            for part in ask.chosen(list(parts), list(parts)):
-                more, verdicts = parts[part](trainer, ask)
+        with StudyTrainer(request) as trainer:
+            for part in request.chosen(list(parts), list(parts)):
+                more, verdicts = parts[part](trainer, request)
                 written, found = written + more, found + verdicts
-        write_csv(ask.out / f"{self.name}.csv", written)
+        write_csv(request.out / f"{self.name}.csv", written)
         return found
 
 
-def _by_budget(trainer: StudyTrainer, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
+def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[dict[str, Any]], list[Verdict]]:
     """Reward against the time of training, by the steps of a fit."""
-    budgets = QUICK_BUDGETS if ask.quick else BUDGETS
+    budgets = QUICK_BUDGETS if request.quick else BUDGETS
     reward = trainer.reward("set")
     config = TrainingConfig(
-        Spec("select", StateLayout(("age", "pose"))), reward, ask.training_episodes(EPISODES)
+        Spec("select", StateLayout(("age", "pose"))), reward, request.training_episodes(EPISODES)
     )
     config = dataclasses.replace(config, stages=stages(config.batches))
     trained = {steps: trainer.train_repeats(f"reward-cost-{steps}", room("ch5", steps=steps), config)
               for steps in budgets}  # fmt: skip
-    everybody: dict[str, Any] = {
-        **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
+    candidates: dict[str, Any] = {
+        **baseline_policies(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
     }
     for steps, stage in itertools.product(budgets, config.stages):
         then = [_then(one, stage) for one in trained[steps]]
-        everybody |= named_runs(_called(steps, stage), then)
+        candidates |= named_runs(_called(steps, stage), then)
     # Everything at every stage of every training, by dear fits: fewer seeds than elsewhere.
     judged = room("ch5", steps=JUDGED_STEPS)
-    evaluation = trainer.evaluate(judged, everybody, reward, len(ask.repeats(8, 40)))
+    evaluation = trainer.evaluate(judged, candidates, reward, len(request.repeats(8, 40)))
     spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in config.stages]
              for steps, runs in trained.items()}  # fmt: skip
-    _draw(ask, evaluation, config.stages, spent)
+    _draw(request, evaluation, config.stages, spent)
     return rows(evaluation, what="fit budget"), judge(evaluation, config.stages, spent)
 
 
@@ -140,7 +140,7 @@ def _then(trained: TrainedPolicy, batches: int) -> Actor:
     return Actor.load(stage_file(trained.folder, batches))
 
 
-def _by_dim(trainer: StudyTrainer, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
+def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[dict[str, Any]], list[Verdict]]:
     """Reward against the width of the embedding; nothing where there are no embeddings."""
     if missing := embeddings_missing():
         print(f"  embedding sizes are left out: {missing}")
@@ -152,11 +152,14 @@ def _by_dim(trainer: StudyTrainer, ask: Ask) -> tuple[list[dict[str, Any]], list
         setting = dataclasses.replace(usual, scenario=dataclasses.replace(usual.scenario, edge=edge))
         layout = layout_of(setting, PARTS if dim else PARTS[1:])
         reward = priced(trainer, "moving")
-        config = TrainingConfig(Spec("select", layout), reward, ask.training_episodes(EPISODES_BY_DIM))
+        config = TrainingConfig(Spec("select", layout), reward, request.training_episodes(EPISODES_BY_DIM))
         trained = trainer.train_repeats(f"reward-cost-d{dim}", setting, config)
-        everybody: dict[str, Any] = {**rivals((), (), ("random",)), **named_runs(f"d = {dim}", trained)}
-        contests[f"d = {dim}"] = trainer.evaluate(setting, everybody, reward, len(ask.repeats(10, 100)))
-    _draw_dims(ask, contests)
+        candidates: dict[str, Any] = {
+            **baseline_policies((), (), ("random",)),
+            **named_runs(f"d = {dim}", trained),
+        }
+        contests[f"d = {dim}"] = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
+    _draw_dims(request, contests)
     return [row for name, c in contests.items() for row in rows(c, what=name)], judge_dims(contests)
 
 
@@ -167,8 +170,10 @@ def judge_dims(contests: dict[str, Evaluation]) -> list[Verdict]:
             for name, values in runs.items() if name != "d = 0"]  # fmt: skip
 
 
-def _draw(ask: Ask, evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]) -> None:
-    with figure(ask.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
+def _draw(
+    request: StudyRequest, evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]
+) -> None:
+    with figure(request.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
         for k, (steps, seconds) in enumerate(spent.items()):
             means = [crossed(runs_of(evaluation, _called(steps, stage))).mean for stage in stages]
             axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
@@ -177,13 +182,13 @@ def _draw(ask: Ask, evaluation: Evaluation, stages: Sequence[int], spent: dict[i
                     "What a reward costs")  # fmt: skip
 
 
-def _draw_dims(ask: Ask, contests: dict[str, Evaluation]) -> None:
+def _draw_dims(request: StudyRequest, contests: dict[str, Evaluation]) -> None:
     """What is learnt over what is learnt without, against the width of the embedding: paired differences with
     their intervals."""
     runs = [runs_of(evaluation, name) for name, evaluation in contests.items()]
     found = [paired_difference(mine, runs[0]) for mine in runs[1:]]
     off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
-    with figure(ask.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
+    with figure(request.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
         axes[0, 0].axhline(0.0, color=GREY, linewidth=1.0)
         axes[0, 0].errorbar([str(dim) for dim in DIMS[1:]], [one.mean for one in found], off, fmt="o",
                             color=CYCLE[0], capsize=3)  # fmt: skip

@@ -16,10 +16,10 @@ from edge_server.experiments.studies.learning.setup import (
     room,
     runs_of,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
 from edge_server.experiments.training.scheduler.report import span
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward
@@ -32,23 +32,25 @@ class Weights(TrainingStudy):
     name = "weights"
     title = "Sensitivity to the weights of the reward (6.36-6.38)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         setting, spec = room("swing"), Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
-        with StudyTrainer(ask) as trainer:
+        with StudyTrainer(request) as trainer:
             rewards = variants(trainer)
-            everybody: dict[str, Any] = {**rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all"))}
+            candidates: dict[str, Any] = {**baseline_policies(OMEGAS_MS["wait"], ["wait"], ("random", "all"))}
             for name, reward in rewards.items():
-                config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
+                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
                 trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
-                everybody |= named_runs(f"learnt {name}", trained)
-            evaluation = trainer.evaluate(setting, everybody, rewards["corrected"], len(ask.repeats(8, 100)))
+                candidates |= named_runs(f"learnt {name}", trained)
+            evaluation = trainer.evaluate(
+                setting, candidates, rewards["corrected"], len(request.repeats(8, 100))
+            )
         found, written = [], []
         for name, reward in rewards.items():
             evaluation.reward = reward
             written += rows(evaluation, judged_by=name)
             found += judge(evaluation, name, list(rewards))
-        write_csv(ask.out / f"{self.name}.csv", written)
+        write_csv(request.out / f"{self.name}.csv", written)
         return found
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.engine import StudyError
 from edge_server.experiments.studies.learning.setup import (
@@ -21,12 +22,15 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.learning.visibility import Sees, Sight, telling
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
-from edge_server.experiments.studies.statistics import interval
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import RIVALS, Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import (
+    BASELINE_POLICIES,
+    Evaluation,
+    baseline_policies,
+    rows,
+)
 from edge_server.experiments.training.scheduler.report import span
-from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, layout_of, seeds
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -49,14 +53,14 @@ class Semantics(TrainingStudy):
     name = "semantics"
     title = "Where semantics help, and whether they cost anything where they do not (6.31-6.33)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         if missing := embeddings_missing():
             raise StudyError(f"{self.name}: {missing}")
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
-            for scene in ask.chosen(list(SCENES), list(SCENES)):
+        with StudyTrainer(request) as trainer:
+            for scene in request.chosen(list(SCENES), list(SCENES)):
                 speed, on = SCENES[scene]
                 setting = workshop(speed)
                 reward = priced(trainer, on)
@@ -65,24 +69,26 @@ class Semantics(TrainingStudy):
                     ("with", layout_of(setting, PARTS)),
                     ("without", layout_of(setting, PARTS[1:])),
                 ):
-                    config = TrainingConfig(Spec("select", layout), reward, ask.training_episodes(EPISODES))
+                    config = TrainingConfig(
+                        Spec("select", layout), reward, request.training_episodes(EPISODES)
+                    )
                     lesson = f"{self.name}-{scene.replace(' ', '-')}-{name}"
                     mine |= named_runs(name, trainer.train_repeats(lesson, setting, config))
-                everybody: dict[str, Any] = {
-                    **rivals(OMEGAS_MS["threshold"], ["threshold"], RIVALS), **mine
+                candidates: dict[str, Any] = {
+                    **baseline_policies(OMEGAS_MS["threshold"], ["threshold"], BASELINE_POLICIES), **mine
                 }  # fmt: skip
-                count = len(ask.repeats(10, 100))
+                count = len(request.repeats(10, 100))
                 sight = Sight(setting)
                 if speed:
-                    everybody |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
-                evaluation = trainer.evaluate(setting, everybody, reward, count)
+                    candidates |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
+                evaluation = trainer.evaluate(setting, candidates, reward, count)
                 written += rows(evaluation, scene=scene)
                 found += judge(scene, evaluation, on == "moving")
                 if speed:
                     moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
                     found += why(scene, evaluation, telling(sight, moments))
-        write_csv(ask.out / f"{self.name}.csv", written)
-        draw(ask.out / f"{self.name}.png", written)
+        write_csv(request.out / f"{self.name}.csv", written)
+        draw(request.out / f"{self.name}.png", written)
         return found
 
 

@@ -17,11 +17,10 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.config import WorldConfig, source_config
-from edge_server.experiments.studies.engine import source_digest
-from edge_server.experiments.studies.statistics import Interval, crossed, interval
-from edge_server.experiments.studies.study import Ask, Point, Verdict, by_bool
+from edge_server.experiments.common.source_digest import source_digest
+from edge_server.experiments.common.statistics import Interval, crossed, interval
+from edge_server.experiments.studies.study import Point, StudyRequest, Verdict, by_bool
 from edge_server.experiments.studies.trial import Trial
-from edge_server.experiments.training.scheduler.command import reward_of
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     Candidate,
@@ -30,7 +29,7 @@ from edge_server.experiments.training.scheduler.evaluation import (
     evaluate_policies,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, span
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.setting import Setting, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, read_log, train
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.experiments.virtual.from_scenario import exact_scene
@@ -55,7 +54,7 @@ Runs = Sequence[PerSeed]
 class TrainingStudy:
     """Base of studies that train policies; they have no independent trials."""
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         """An empty list."""
         return []
 
@@ -135,14 +134,14 @@ class Nearest(Policy):
 class StudyTrainer:
     """Trains and evaluates policies for one study; a context manager that owns the worker pool."""
 
-    ask: Ask
+    request: StudyRequest
     pool: WorkerPool = field(init=False)
     _told: bool = False
 
     def __post_init__(self) -> None:
-        self.folder = self.ask.out / "training"
+        self.folder = self.request.out / "training"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.pool = WorkerPool(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
+        self.pool = WorkerPool(self.request.folders, self.request.jobs, self.folder / "evaluations.jsonl")
 
     def __enter__(self) -> StudyTrainer:
         return self
@@ -152,7 +151,7 @@ class StudyTrainer:
 
     def reward(self, name: str, on: str = "whole") -> Reward:
         """A reward of the presets; said once where its LPIPS term has to be left out."""
-        reward, missing = reward_of(name, on, self.ask.folders.lpips)
+        reward, missing = reward_of(name, on, self.request.folders.lpips)
         if missing and not self._told:
             print(f"  {missing}")
             self._told = True
@@ -167,15 +166,15 @@ class StudyTrainer:
             lambda line: print(f"  {run.name}: {line}", flush=True),
         )  # fmt: skip
         rows = read_log(folder)
-        draw_curve(self.ask.out / f"{run.name}.png", rows)
+        draw_curve(self.request.out / f"{run.name}.png", rows)
         if not by.exists():
-            write_json(by, self.ask.jobs)
+            write_json(by, self.request.jobs)
         seconds = sum(row["seconds"] for row in rows)
         return TrainedPolicy(run, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
 
     def train_repeats(self, name: str, setting: Setting, config: TrainingConfig) -> list[TrainedPolicy]:
         """Train the lesson the requested number of times, with different episodes and initial values."""
-        runs = range(RUNS[self.ask.quick])
+        runs = range(RUNS[self.request.quick])
         return [
             self.train_one(TrainingRun(f"{name}-{run}", setting, dataclasses.replace(config, seed=run)))
             for run in runs
@@ -184,26 +183,26 @@ class StudyTrainer:
     def evaluate(
         self,
         setting: Setting,
-        everybody: Mapping[str, Candidate],
+        candidates: Mapping[str, Candidate],
         reward: Reward,
         count: int,
         seed: int = 0,
     ) -> Evaluation:
-        """All of ``everybody`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
+        """All of ``candidates`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
         none of what they are asked is what was rewarded."""
-        return self.evaluate_as_rewarded(setting.judged, everybody, reward, count, seed)
+        return self.evaluate_as_rewarded(setting.judged, candidates, reward, count, seed)
 
     def evaluate_as_rewarded(
         self,
         setting: Setting,
-        everybody: Mapping[str, Candidate],
+        candidates: Mapping[str, Candidate],
         reward: Reward,
         count: int,
         seed: int = 0,
     ) -> Evaluation:
         """Also evaluate with the reward cameras; this supplements the other evaluation, never replaces it."""
         return evaluate_policies(
-            setting, self.pool, seeds(seed, "test", count), everybody, reward,
+            setting, self.pool, seeds(seed, "test", count), candidates, reward,
             lambda line: print(f"  contest: {line}", flush=True),
         )  # fmt: skip
 

@@ -17,9 +17,9 @@ from edge_server.experiments.studies.learning.setup import (
     room,
     runs_of,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, layout_of
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 
@@ -35,7 +35,7 @@ class Ablation(TrainingStudy):
     name = "ablation"
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         variants = dict(VARIANTS)
         if missing := embeddings_missing():
@@ -44,19 +44,19 @@ class Ablation(TrainingStudy):
         # All see the same decisions, drawn with all that any of them looks at.
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
-        with StudyTrainer(ask) as trainer:
+        with StudyTrainer(request) as trainer:
             reward = trainer.reward("set", "moving")
             mine: dict[str, Any] = {}
             for name, used in variants.items():
                 spec = Spec("select", layout_of(setting, used))
-                config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
+                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
                 trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
                 mine |= named_runs(f"learnt {name}", trained)
-            everybody: dict[str, Any] = {
-                **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
+            candidates: dict[str, Any] = {
+                **baseline_policies(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
             }  # fmt: skip
-            evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(10, 100)))
-        write_csv(ask.out / f"{self.name}.csv", rows(evaluation))
+            evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
+        write_csv(request.out / f"{self.name}.csv", rows(evaluation))
         return judge(evaluation, list(variants))
 
 

@@ -16,10 +16,9 @@ from edge_server.experiments.studies.learning.setup import (
     room,
     runs_of,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
-from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -40,15 +39,15 @@ class Transfer(TrainingStudy):
     name = "transfer"
     title = "Trained on one scene and channel, used on another"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         del table
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
         spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
-        with StudyTrainer(ask) as trainer:
+        with StudyTrainer(request) as trainer:
             reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
-            places = settings(ask.quick)
-            config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
+            places = settings(request.quick)
+            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
             trained = {
                 place: trainer.train_repeats(
                     f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
@@ -57,15 +56,15 @@ class Transfer(TrainingStudy):
                 for place, setting in places.items()
             }  # fmt: skip
             for place, setting in places.items():
-                everybody: dict[str, Any] = {
-                    **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
+                candidates: dict[str, Any] = {
+                    **baseline_policies(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
                     **named_runs("learnt at home", trained[HOME]),
                     **named_runs("learnt here", trained[place]),
                 }  # fmt: skip
-                evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(8, 100)))
+                evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(8, 100)))
                 written += rows(evaluation, place=place)
                 found += judge(place, evaluation)
-        write_csv(ask.out / f"{self.name}.csv", written)
+        write_csv(request.out / f"{self.name}.csv", written)
         return found
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import MODELS, EmbeddingError
+from edge_server.experiments.common.arguments import command_parser, run_command
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, Layers, Perceptual, save_coefficients
 
@@ -45,22 +46,20 @@ _TOLD_EVERY = 20  # parts
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
+
+    def work() -> None:
+        results = run(args)
+        print(json.dumps(results) if args.json else show(results))
+
+    stopped = f"the same command goes on with the pictures in {args.out}"
     try:
-        told = run(args)
-    except (EmbeddingError, FitFailed) as error:
-        print(f"edge-server train-perceptual: {error}", file=sys.stderr)
-        return 2
+        return run_command("train-perceptual", work, (EmbeddingError, FitFailed), stopped)
     except ModuleNotFoundError as error:
         print(
             f"edge-server train-perceptual needs {error.name}: pip install 'freshfield[edge,embed]'",
             file=sys.stderr,
         )
         return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; the same command goes on with the pictures in {args.out}", flush=True)
-        return 130
-    print(json.dumps(told) if args.json else show(told))
-    return 0
 
 
 class FitFailed(ValueError):
@@ -117,7 +116,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     taps = tuple(layers.taps)
     Perceptual(layers, split, power)  # what is written can be read
     save_coefficients(args.out / COEFFICIENTS, taps, split, power)
-    told = {
+    results = {
         "fitted_to": f"LPIPS-{lpips.network}", "pairs": len(y), "power": power, "seed": args.seed,
         "share_by_layer": {
             tap: round(float((x[:, part] @ weights[part]).sum() / (x @ weights).sum()), 3)
@@ -126,8 +125,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
         "scene_left_out_of_the_fit": left_out(by_scene),
     }  # fmt: skip
-    write_json(args.out / "perceptual.json", told, indent=1)
-    return told
+    write_json(args.out / "perceptual.json", results, indent=1)
+    return results
 
 
 def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[str]]:
@@ -216,11 +215,11 @@ def correlation(found: Array, true: Array, names: Sequence[str]) -> dict[str, An
     }
 
 
-def show(told: dict[str, Any]) -> str:
+def show(results: dict[str, Any]) -> str:
     """The outcome for people."""
-    lines = [f"fitted to {told['fitted_to']} on {told['pairs']} pairs, power {told['power']:.2f}"]
-    left = {f"{name} not fitted to": row for name, row in told["scene_left_out_of_the_fit"].items()}
-    for name, found in (told["unseen"] | left).items():
+    lines = [f"fitted to {results['fitted_to']} on {results['pairs']} pairs, power {results['power']:.2f}"]
+    left = {f"{name} not fitted to": row for name, row in results["scene_left_out_of_the_fit"].items()}
+    for name, found in (results["unseen"] | left).items():
         lines.append(
             f"  {name:20} Spearman {found['spearman']:.3f}  Pearson {found['pearson']:.3f}  "
             f"mean error {found['mean_absolute_error']:.3f}  ({found['pairs']} pairs)"
@@ -234,10 +233,7 @@ def _slices(widths: Sequence[int]) -> list[slice]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "edge-server train-perceptual", description=DESCRIPTION, formatter_class=raw
-    )
+    parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--detector", type=Path, default=MODELS / DETECTOR, metavar="FILE", help="[the shipped one]")

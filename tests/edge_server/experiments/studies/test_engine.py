@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import engine as engine_module
 from edge_server.experiments.studies.engine import Engine, StudyError, content_key, run_task
-from edge_server.experiments.studies.trial import Folders, Trial, picture, run_trial
+from edge_server.experiments.studies.trial import Trial, picture, run_trial
 from freshfield.scenario import ScenarioError
 
 TINY = {"gaussians": 256, "start": 256}

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import command
 from edge_server.experiments.studies.command import LEARNING, STUDIES, make_study
 from edge_server.experiments.studies.learning import (
@@ -24,8 +25,7 @@ from edge_server.experiments.studies.learning import (
     transfer,
 )
 from edge_server.experiments.studies.learning.setup import better, no_worse
-from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, Ask, Verdict
-from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.choices import named
 from edge_server.experiments.training.scheduler.episode import Outcome
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, evaluate_policies
@@ -65,16 +65,16 @@ def small(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, tmp_path: Path, capsys):
-    ask = Ask(True, tmp_path, Folders(), seeds=2)
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2)
     study = make_study(name)
-    assert study.points(ask) == []
-    first = study.report(ask, None)
+    assert study.points(request) == []
+    first = study.report(request, None)
     assert first and all(v.line() for v in first)
     rows = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
     assert rows and all(row["reward"] for row in rows)
     assert list(tmp_path.glob(f"{name}*.png"))
     lines = (tmp_path / "training/evaluations.jsonl").read_text().count("\n")
-    again = make_study(name).report(ask, None)
+    again = make_study(name).report(request, None)
     assert [(v.about, v.claim, v.verdict) for v in again] == [(v.about, v.claim, v.verdict) for v in first]
     assert (tmp_path / "training/evaluations.jsonl").read_text().count("\n") == lines
     capsys.readouterr()
@@ -82,8 +82,8 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, 
 
 @pytest.mark.slow
 def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tmp_path: Path):
-    ask = Ask(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
-    verdicts = make_study("ppo-wait").report(ask, None)
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
+    verdicts = make_study("ppo-wait").report(request, None)
     assert all(v.about.startswith("room, ch6, age -0.003/ms") for v in verdicts)
     logs = list((tmp_path / "training").glob("ppo-wait-ch6-0.003-*/training.jsonl"))
     assert len(logs) == 4 and all(
@@ -110,7 +110,7 @@ def contest_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
     asked = [(seed, n) for seed in range(seeds) for n in range(2)]
     shared = {seed: rng.normal() for seed in range(seeds)}
     found = Evaluation(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
-    for into in (found.outcomes, found.again):
+    for into in (found.outcomes, found.repeated):
         for name, level in levels.items():
             psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
             into[name] = {at: Outcome(v, None, None, None, None, 50.0, 3.0, 0.0) for at, v in psnr.items()}
@@ -275,7 +275,7 @@ def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
 
 
 def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
-    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
+    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders())) as trainer:
         courses = {name: change.config(trainer, 7, 2) for name, change in channel_drift.changes().items()}
     priced = [name for name, config in courses.items() if config.reward.views < 0]
     assert [courses[name].spec.action for name in priced] == ["select"]
@@ -288,13 +288,13 @@ def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Pa
     assert usual.report == setup.REPORT and set(usual.report).isdisjoint(usual.rewarding)
     assert set(usual.report).isdisjoint(usual.scenario.training)
     assert set(setup.FOUR_VIEWPOINTS).isdisjoint(setup.REPORT)
-    reward, everybody = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
-    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
-        found = trainer.evaluate(reported(), everybody, reward, 2)
-        same = trainer.evaluate_as_rewarded(reported(), everybody, reward, 2)
+    reward, candidates = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
+    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders())) as trainer:
+        found = trainer.evaluate(reported(), candidates, reward, 2)
+        same = trainer.evaluate_as_rewarded(reported(), candidates, reward, 2)
     with WorkerPool(Folders()) as pool:
-        expected = evaluate_policies(reported().judged, pool, seeds(0, "test", 2), everybody, reward)
-    assert found.outcomes == expected.outcomes and found.again == expected.again
+        expected = evaluate_policies(reported().judged, pool, seeds(0, "test", 2), candidates, reward)
+    assert found.outcomes == expected.outcomes and found.repeated == expected.repeated
     assert found.outcomes["all"] != same.outcomes["all"]
 
 

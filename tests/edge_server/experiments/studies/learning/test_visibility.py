@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies.learning.visibility import SEES, Sees, Sight, area, telling
 from edge_server.experiments.studies.learning.workshop import workshop
-from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.state import State

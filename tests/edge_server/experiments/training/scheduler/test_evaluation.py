@@ -25,7 +25,7 @@ def contest_of(rng: np.random.Generator, matters: float, twice: bool = True) -> 
     spreads of a fit's luck."""
     found = Evaluation(BY_PSNR)
     best = rng.integers(len(OMEGAS), size=(20, 4))
-    for into in (found.outcomes, found.again)[: 2 if twice else 1]:
+    for into in (found.outcomes, found.repeated)[: 2 if twice else 1]:
         for k, omega in enumerate(OMEGAS):
             into[f"threshold:{omega}"] = {
                 (seed, n): outcome(20.0 + rng.normal() + matters * (best[seed, n] == k))
@@ -36,11 +36,11 @@ def contest_of(rng: np.random.Generator, matters: float, twice: bool = True) -> 
 
 
 def test_luck_is_not_something_to_be_won_and_a_real_difference_is():
-    noise = [contest_of(np.random.default_rng(s), 0.0).varies("threshold")["gain"] for s in range(60)]
+    noise = [contest_of(np.random.default_rng(s), 0.0).best_values("threshold")["gain"] for s in range(60)]
     assert sum(gain.above(0.0) is True for gain in noise) <= 5  # it was all of them
     assert abs(np.mean([gain.mean for gain in noise])) < 0.03
     for s in range(10):
-        gain = contest_of(np.random.default_rng(s), 5.0).varies("threshold")["gain"]
+        gain = contest_of(np.random.default_rng(s), 5.0).best_values("threshold")["gain"]
         # 5 at the best of ten, against about a tenth of it for any fixed one.
         assert gain.above(0.0) is True and 3.5 < gain.mean < 5.2
 
@@ -57,8 +57,8 @@ def test_hindsight_of_luck_alone_is_no_better_than_random():
 def test_what_was_carried_out_once_tells_nothing_of_hindsight():
     found = contest_of(np.random.default_rng(0), 5.0, twice=False)
     assert set(found.rewards(HINDSIGHT).values()) == {None}
-    varies = found.varies("threshold")
-    assert varies["quartiles"] == [None] * 3 and varies["gain"].above(0.0) is None
+    best_values = found.best_values("threshold")
+    assert best_values["quartiles"] == [None] * 3 and best_values["gain"].above(0.0) is None
     text = " ".join(lines(found, "random", "threshold"))
     assert "not known" in text
     json.dumps(summary(found, "random", "threshold"), allow_nan=False)
@@ -76,21 +76,21 @@ def test_seeds_without_a_value_are_not_counted():
 def test_a_decision_that_nobody_has_a_value_for_is_left_out_for_all():
     found = contest_of(np.random.default_rng(0), 0.0)
     whole = found.rewards("random")
-    for of in (found.outcomes, found.again):
+    for of in (found.outcomes, found.repeated):
         for name in of:
             of[name][3, 1] = outcome(None)
             of[name].update({(4, n): outcome(None) for n in range(4)})
     assert found.seeds("random") == (20, 19)
-    values = [outcome.psnr_db for of in (found.outcomes, found.again) for outcome in
+    values = [outcome.psnr_db for of in (found.outcomes, found.repeated) for outcome in
               (of["random"][3, n] for n in (0, 2, 3))]  # fmt: skip
     mine = found.rewards("random")
     assert mine[3] == pytest.approx(np.mean(values)) and mine[4] is None and mine[5] == whole[5]
-    assert found.rewards(HINDSIGHT)[3] is not None and found.varies("threshold")["gain"].count == 19
+    assert found.rewards(HINDSIGHT)[3] is not None and found.best_values("threshold")["gain"].count == 19
 
 
 def test_where_no_decision_has_a_value_the_summary_is_still_json():
     found = contest_of(np.random.default_rng(0), 0.0)
-    for of in (found.outcomes, found.again):
+    for of in (found.outcomes, found.repeated):
         for name in of:
             of[name] = {at: outcome(None) for at in of[name]}
     kept = json.loads(json.dumps(summary(found, "random", "threshold"), allow_nan=False))
@@ -101,7 +101,7 @@ def test_where_no_decision_has_a_value_the_summary_is_still_json():
 def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
     found = Evaluation(BY_PSNR)
     found.outcomes = {"a": {(0, 0): outcome(3.0)}, "b": {(0, 0): outcome(1.0)}, "c": {(0, 0): outcome(None)}}
-    found.again = {"a": {(0, 0): outcome(0.5)}, "b": {(0, 0): outcome(2.0)}, "c": {(0, 0): outcome(9.0)}}
+    found.repeated = {"a": {(0, 0): outcome(0.5)}, "b": {(0, 0): outcome(2.0)}, "c": {(0, 0): outcome(9.0)}}
     # The first fit prefers a, which the second has at 0.5; the second prefers b, which the first has at 1.
     assert found.rewards(HINDSIGHT) == {0: pytest.approx(0.75)}
     assert found.rewards("a") == {0: 1.75} and found.rewards("c") == {0: None}

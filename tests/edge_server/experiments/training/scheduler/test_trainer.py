@@ -11,19 +11,25 @@ import numpy as np
 import pytest
 import yaml
 
+from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import choices, named
-from edge_server.experiments.training.scheduler.command import main, reward_of
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, evaluate_policies, rivals, rows
+from edge_server.experiments.training.scheduler.command import main
+from edge_server.experiments.training.scheduler.evaluation import (
+    HINDSIGHT,
+    baseline_policies,
+    evaluate_policies,
+    rows,
+)
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
-from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.setting import reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import (
     TrainingConfig,
     TrainingError,
-    baseline_rewards,
     read_log,
     stage_file,
+    subtract_sibling_baseline,
     train,
 )
 from edge_server.experiments.training.scheduler.workers import WorkerPool
@@ -107,10 +113,10 @@ def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
     config = TrainingConfig(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
     with WorkerPool(NOTHING) as pool:
         learner = train(setting(steps=1), config, pool, tmp_path, quiet)
-        everybody = {**rivals(omegas, ["threshold"]), "learnt": learner.actor}
-        evaluation = evaluate_policies(setting(steps=1), pool, seeds(0, "test", 6), everybody, config.reward)
+        candidates = {**baseline_policies(omegas, ["threshold"]), "learnt": learner.actor}
+        evaluation = evaluate_policies(setting(steps=1), pool, seeds(0, "test", 6), candidates, config.reward)
     assert evaluation.term("learnt", "aaoi_ms").mean < evaluation.term("threshold:100", "aaoi_ms").mean
-    assert evaluation.against("learnt", evaluation.rewards("random")).low > 0.0
+    assert paired(evaluation.rewards("learnt"), evaluation.rewards("random")).low > 0.0
     found = read_log(tmp_path)
     assert found[-1]["omega_ms"] < 60.0 < found[0]["omega_ms"]
 
@@ -130,16 +136,16 @@ def test_evaluations_are_kept_in_a_file_and_a_torn_line_costs_only_itself(tmp_pa
 
 
 def test_tries_are_compared_with_the_others_of_their_decision():
-    found = baseline_rewards(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
+    found = subtract_sibling_baseline(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
     assert np.allclose(found, [1 - 4, 2 - 3.5, 6 - 1.5, 4.0, np.nan, -4.0], equal_nan=True)
-    alone = baseline_rewards(np.array([3.0, np.nan]), 2)
+    alone = subtract_sibling_baseline(np.array([3.0, np.nan]), 2)
     assert np.isnan(alone).all()  # nothing to compare with
-    assert baseline_rewards(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
+    assert subtract_sibling_baseline(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
 
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    names = rivals((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
+    names = baseline_policies((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
     with WorkerPool(NOTHING) as pool:
         actor = Learner(COURSE.spec, 0).actor
         return evaluate_policies(setting(), pool, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
@@ -155,9 +161,9 @@ def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(ev
     assert evaluation.share(best).mean == 1.0
     for at in evaluation.outcomes["all"]:
         first, second = ({n: evaluation.value(found[n][at]) for n in evaluation.outcomes}
-                         for found in (evaluation.outcomes, evaluation.again))  # fmt: skip
+                         for found in (evaluation.outcomes, evaluation.repeated))  # fmt: skip
         crossed = (second[max(first, key=first.get)] + first[max(second, key=second.get)]) / 2
-        assert evaluation._top(list(evaluation.outcomes))[0][at] == pytest.approx(crossed)
+        assert evaluation._hindsight(list(evaluation.outcomes))[0][at] == pytest.approx(crossed)
     assert set(best) == {seed for seed, _ in evaluation.outcomes["all"]}
 
 
@@ -333,7 +339,7 @@ def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: P
 
 
 def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("edge_server.experiments.training.scheduler.trainer._TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("edge_server.experiments.training.scheduler.trainer._PROGRESS_EVERY_S", 0.0)
     text: list[str] = []
     config = dataclasses.replace(COURSE, episodes=6, batch=6)
     with WorkerPool(NOTHING) as pool:
