@@ -106,18 +106,15 @@ def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
 
 
 def show(results: dict[str, Any]) -> str:
-    """The outcome for people."""
-    lines = [
-        f"{results['parameters']} parameters, {results['pictures']['train']} pictures, {results['boxes']} boxes"
-    ]
+    """The results as text."""
+    pictures, agreement = results["pictures"]["train"], results["int8_agreement"]["cosine_mean"]
+    lines = [f"{results['parameters']} parameters, {pictures} pictures, {results['boxes']} boxes"]
     for name, sets in results["quality"].items():
         lines.append(f"{name}: {sets['bytes'] / 1e3:.0f} kB")
         for where, found in sets.items():
             if isinstance(found, dict):
                 lines.append(f"  {where:20} mAP@.5 {found['map50']:.3f}  mAP@.5:.95 {found['map50_95']:.3f}")
-    lines.append(
-        f"embedding of int8 against fp32: mean cosine {results['int8_agreement']['cosine_mean']:.4f}"
-    )
+    lines.append(f"embedding of int8 against fp32: mean cosine {agreement:.4f}")
     return "\n".join(lines)
 
 

@@ -53,7 +53,7 @@ class Evaluation:
         return found.total if found.complete else None
 
     def rewards(self, name: str) -> PerSeed:
-        """seed -> mean reward of its decisions. ``hindsight``: of the best choice that any policy made at each
+        """seed -> mean reward of its decisions. ``hindsight``: of the best choice of all policies at each
         decision, chosen by one fit and measured by another."""
         values = self._hindsight(list(self.outcomes))[0] if name == HINDSIGHT else self.decisions(name)
         return _by_seed(values, self._unscored())
@@ -88,9 +88,9 @@ class Evaluation:
         return share_closed(values, self.rewards("random"), self.rewards(HINDSIGHT))
 
     def best_values(self, kind: str) -> dict[str, Any]:
-        """How much the best value of ``kind`` varies between decisions: its ``quartiles``, and the ``gain`` of
-        knowing it, which is hindsight among these values minus the best fixed one, paired over seeds. Both
-        are unknown where every choice was carried out only once."""
+        """How much the best value of ``kind`` varies between decisions: its ``quartiles``, and the ``gain``
+        of knowing it: hindsight among these values minus the best fixed one, paired over seeds. Both are
+        unknown where every choice was carried out only once."""
         names = [name for name in self.outcomes if name.startswith(f"{kind}:")]
         rewards, best = self._hindsight(names)
         gain = paired(_by_seed(rewards, self._unscored()), self.best_fixed(kind)[0])
@@ -188,8 +188,8 @@ def baseline_policies(
 
 
 def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
-    """A table row for each policy: its reward, its gain over random, its share and the fields of its outcomes;
-    intervals over seeds. labels: first columns of every row."""
+    """A table row for each policy: its reward, its gain over random, its share and the fields of its
+    outcomes; intervals over seeds. labels: first columns of every row."""
     terms = [f.name for f in fields(Outcome)]
     found = []
     for name in [*evaluation.outcomes, HINDSIGHT]:

@@ -97,8 +97,8 @@ def quartiles(best_values: dict[str, Any]) -> str:
 
 
 def percent(values: PerSeed, base: PerSeed) -> str:
-    """Gain in mean reward over ``base`` in percent of its size, as in the thesis. Undefined, and said so, where
-    the arbitrary zero of the reward lies near ``base`` or between the two."""
+    """Gain in mean reward over ``base`` in percent of its size, as in the thesis. The text says that there is
+    none where the arbitrary zero of the reward lies near ``base`` or between the two."""
     a, b = interval(list(values.values())), interval(list(base.values()))
     if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
         return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"

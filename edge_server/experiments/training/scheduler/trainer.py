@@ -89,8 +89,8 @@ def train(
 ) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
-    Writes OUT/training.jsonl (a line a batch), OUT/training.json, the ``stage_file`` of each stage and, at the
-    end, OUT/policy.npz. KeyboardInterrupt leaves the last checkpoint there.
+    Writes OUT/training.jsonl (a line a batch), OUT/training.json, the ``stage_file`` of each stage and, at
+    the end, OUT/policy.npz. KeyboardInterrupt leaves the last checkpoint there.
 
     setting: where decisions come from.
     pool: draws and evaluates them.
@@ -146,9 +146,9 @@ def _train_batch(
 ) -> Row:
     """One update of the weights; returns its row of the log. TrainingError where the first batch has no
     reward."""
-    seeds = config.seeds(number)
-    moments = [m for episode in pool.draw(setting, seeds) for m in episode]
-    pool.forget(setting, seeds)
+    episode_seeds = config.seeds(number)
+    moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
+    pool.forget(setting, episode_seeds)
     # The tries of one decision stand together.
     each = [m for m in moments for _ in range(config.tries)]
     states = [m.state for m in each]
@@ -164,7 +164,7 @@ def _train_batch(
     advantages = subtract_sibling_baseline(rewards, config.tries)
     update = learner.update(learner.batch(states, actions, logps, advantages))
     row: Row = {
-        "batch": number, "episodes": seeds[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
+        "batch": number, "episodes": episode_seeds[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
         "decisions": len(moments), "fits": len(each), "carried_out": pool.evaluated - before,
         "processor_seconds": pool.cost_s(setting, requests),
     }  # fmt: skip

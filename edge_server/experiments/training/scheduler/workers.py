@@ -150,8 +150,8 @@ class WorkerPool:
         return [self._known[key][0] for key in keys]
 
     def cost_s(self, setting: Setting, requests: Sequence[Request]) -> float:
-        """Processor time of evaluated requests: episodes, warm fields, fits and scores. Each counts once, with
-        the time that it took when it was carried out, however long ago. KeyError for an unknown one."""
+        """Processor time of evaluated requests: episodes, warm fields, fits and scores. Each counts once,
+        with the time that it took when it was carried out. KeyError for an unknown one."""
         return math.fsum(self._known[key][1] for key in {self._key(setting, r) for r in requests}) / 1e3
 
     def _results(self, setting: Setting, tasks: Sequence[_Task]) -> Iterator[tuple[list[str], list[Any]]]:
