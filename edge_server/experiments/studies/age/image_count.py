@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 from edge_server.experiments.common.statistics import interval, negated, paired
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
 from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
     METRICS,
@@ -16,7 +15,8 @@ from edge_server.experiments.studies.study import (
     by_bool,
     no_delay_gain,
     number,
-    with_data,
+    scenes_of,
+    trial_of,
 )
 
 COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
@@ -35,7 +35,7 @@ class Images:
 
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(request, tuple(SCENES), RECORDED.get):
+        for scene in scenes_of(request, tuple(SCENES)):
             field = SCENES[scene][0] if scene in SCENES and not request.quick else "splat"
             for seed in request.repeats(6, 40):
                 base = trial_of(request, scene, seed=seed, channel={"preset": "ch5"}, field=field)
@@ -76,8 +76,7 @@ class Images:
                         f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
                         f"from {xs[0]:g} to {xs[-1]:g} images {number(first, digits)} "
                         f"to {number(last, digits)}, "
-                        f"change {number(change.mean, digits)} [{number(change.low, digits)}, "
-                        f"{number(change.high, digits)}]; {no_delay_gain(table, metric, scene=scene)}.",
+                        f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}.",
                         by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
                     )
                 )

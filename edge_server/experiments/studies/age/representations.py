@@ -1,11 +1,10 @@
-"""Figure 6.7: is the trade the same whatever the representation?"""
+"""Figure 6.7: whether the trade-off is the same for every representation."""
 
 from __future__ import annotations
 
 import dataclasses
 
 from edge_server.experiments.common.statistics import optimum
-from edge_server.experiments.studies.age.max_age import trial_of
 from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
     LEAST,
@@ -17,11 +16,13 @@ from edge_server.experiments.studies.study import (
     by_bool,
     no_delay_gain,
     number,
+    policy_points,
+    trial_of,
 )
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (30.0, 75.0, 120.0, 240.0)
-# Steps of one update: about as long as one of splat, on two cores.
+# Steps of one update that take about as long as one of splat on two cores.
 FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "voxel": 60, "tensorf": 150}
 QUICK_FIELDS = {"splat": 150, "ngp": 80, "voxel": 40}
 POLICIES = ("threshold", "wait")
@@ -45,10 +46,8 @@ class Representations:
                     labels = {"scene": scene, "field": field}
                     found.append(Point({**labels, "policy": "all"}, base))
                     found.append(Point({**labels, "policy": "no delay"}, ideal))
-                    for policy in POLICIES:
-                        for omega in QUICK_OMEGAS if request.quick else OMEGAS:
-                            trial = dataclasses.replace(base, policy=policy, value=omega)
-                            found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
+                    omegas = QUICK_OMEGAS if request.quick else OMEGAS
+                    found += policy_points(base, labels, "omega_ms", dict.fromkeys(POLICIES, omegas))
         return found
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:

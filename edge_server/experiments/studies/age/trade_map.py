@@ -1,7 +1,7 @@
-"""Where is there a trade at all? A map over speed, delay, memory of the field and cost of computing.
+"""Where the trade-off exists: a map over speed, delay, memory of the field and cost of computing.
 
-The thesis does not have it. Beside every policy stands the limit, no delay at all: where it is close to
-using everything, there is nothing to win, whatever a scheduler does.
+It is not in the thesis. The limit of every policy is no delay at all: where using all views is close to it,
+no scheduler can gain anything.
 """
 
 from __future__ import annotations
@@ -14,29 +14,30 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.common.statistics import Interval, at_its_best, optimum, paired, share_closed
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
 from edge_server.experiments.studies.study import (
     DOES_NOT_HOLD,
     HOLDS,
     LEAST_DB,
+    RECORDED,
     UNDECIDED,
     Point,
     StudyRequest,
     Table,
     Verdict,
     number,
-    with_data,
+    scenes_of,
+    trial_of,
 )
 from edge_server.report.style import figure
 
-# What a step and an update of 18 new views cost: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
+# Cost of a step and of an update of 18 new views: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
 # and 4.0, 66 and 93).
 CHARGED = {"ms_per_step": 3.0, "ms_per_update": 70.0}
-# What treating a view of 64 x 64 takes there.
+# Time of treating a view of 64 x 64 there.
 COST_MS = {"mask": 0.5, "freshen": 4.0}
 PERIOD_MS = 30.0
 METRIC = "psnr_moving_db"
-# Thresholds and waits tried, in mean delays after one period.
+# Thresholds and waits, in mean delays after one period.
 THRESHOLDS, QUICK_THRESHOLDS = (0.5, 1.0, 2.0, 4.0), (0.75, 1.5, 3.0)
 WAITS, QUICK_WAITS = (0.5, 1.0, 2.0, 4.0), (1.0, 2.5)
 OWN = ("mask", "freshen")
@@ -44,7 +45,7 @@ OWN = ("mask", "freshen")
 
 @dataclass(frozen=True)
 class Cell:
-    """A place on the map."""
+    """A cell of the map."""
 
     scene: str
     speed: float | None
@@ -88,7 +89,7 @@ class Phase:
 
     def _cells(self, request: StudyRequest) -> Iterator[Cell]:
         quick = request.quick
-        for scene in with_data(request, ("room", "kitchen", "people"), RECORDED.get):
+        for scene in scenes_of(request, ("room", "kitchen", "people")):
             ours = scene not in RECORDED
             speeds: tuple[float | None, ...] = (None,)
             if ours:
@@ -98,7 +99,7 @@ class Phase:
                 delays = (60.0,)
             for speed in speeds:
                 for delay in delays:
-                    usual = delay == 60.0  # the thesis's mean; a quick pass looks at the others once
+                    usual = delay == 60.0  # the thesis's mean; a quick pass has one cell of the others
                     if usual or not quick:
                         yield Cell(scene, speed, delay, "scratch", "zero")
                     yield Cell(scene, speed, delay, "warm", "zero")
@@ -114,13 +115,8 @@ class Phase:
             more["speed_m_per_s"] = cell.speed
         base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":
-            update: dict[str, Any] = {
-                "first_steps": 2 * base.steps,
-                "steps": base.steps // 3,
-                "settle": 2,
-                "decisions": 3,
-            }
-            base = dataclasses.replace(base, scratch=False, **update)
+            steps = {"first_steps": 2 * base.steps, "steps": base.steps // 3}
+            base = dataclasses.replace(base, scratch=False, settle=2, decisions=3, **steps)
         if cell.compute == "charged":
             base = dataclasses.replace(base, compute=CHARGED)
         return base
@@ -183,7 +179,7 @@ class Phase:
         return found
 
     def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:
-        """A map a scene: speed up, delay across; colour: gain of the best policy over use-all."""
+        """Draw speed against delay for each scene, coloured by the gain of the best policy over use-all."""
         for scene in table.distinct("scene"):
             mine = [c for c in cells if c.scene == scene]
             kinds = list(dict.fromkeys((c.memory, c.compute) for c in mine))
@@ -217,7 +213,7 @@ class Phase:
 
 
 def _best(table: Table, cell: Cell, metric: str, policy: str) -> tuple[float, dict[int, float]]:
-    """The policy's best omega over the seeds, and its values at its best as other seeds chose it."""
+    """Best omega of a policy over the seeds, and seed -> value at the omega that the other half chose."""
     curve = table.curve("omega_ms", metric, policy=policy, **cell.labels)
     if not curve:
         return float("nan"), {}

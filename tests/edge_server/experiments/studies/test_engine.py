@@ -11,7 +11,7 @@ import pytest
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import engine as engine_module
 from edge_server.experiments.studies.engine import Engine, StudyError, content_key, run_task
-from edge_server.experiments.studies.trial import Trial, picture, run_trial
+from edge_server.experiments.studies.trial import Trial, last_images, run_trial
 from freshfield.scenario import ScenarioError
 
 TINY = {"gaussians": 256, "start": 256}
@@ -134,7 +134,7 @@ def test_the_key_is_of_all_that_decides(tmp_path: Path):
 
 
 def test_pictures_are_of_the_trial(tmp_path: Path):
-    truth, shown, row = picture(TRIAL, NO_DATA)
+    truth, shown, row = last_images(TRIAL, NO_DATA)
     assert truth.shape == shown.shape == (24, 24, 3)
     assert row["psnr_db"] == run_trial(TRIAL, NO_DATA)["psnr_db"]
 

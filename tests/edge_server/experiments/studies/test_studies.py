@@ -89,7 +89,7 @@ def verdicts(name: str, tmp_path: Path, rule, **more: Any) -> dict[str, str]:
 def no_pictures(monkeypatch):
     """Pictures are trials that are run; here only the figures are invented."""
     for module, cls in (("age.max_age", "Mat"), ("age.omega", "Omega")):
-        monkeypatch.setattr(f"edge_server.experiments.studies.{module}.{cls}._pictures", lambda *a: None)
+        monkeypatch.setattr(f"edge_server.experiments.studies.{module}.{cls}._draw_instants", lambda *a: None)
 
 
 def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
