@@ -1,4 +1,4 @@
-"""``edge-server bench``: what this machine does a second, with how busy others kept it beside each figure."""
+"""``edge-server bench``: measurements of this machine, each with the load of other processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ MORE = ("embed", "foreground", "peer", "surface")
 # Parts that store each figure as it comes, and skip what is known.
 _RESUMABLE = ("field", "track", "drift", "options", "surface")
 _FOLLOWING = ("track", "drift")
-# Flags that mean something to some parts only.
+# Flags of some parts only.
 _ONLY_OF = {
     "field": _RESUMABLE, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
@@ -68,7 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = _parser()
     args = parser.parse_args(argv)
-    parts = list(dict.fromkeys(p for part in args.part or ["all"] for p in _expanded(part)))
+    parts = list(
+        dict.fromkeys(p for part in args.part or ["all"] for p in (PARTS if part == "all" else (part,)))
+    )
     if unknown := set(parts) - {*PARTS, *MORE}:
         parser.error(f"no part is called {', '.join(unknown)}; there are: {', '.join((*PARTS, *MORE))}, all")
     args.field = [name for words in args.field for name in words.split(",")]
@@ -142,10 +144,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _expanded(part: str) -> tuple[str, ...]:
-    return PARTS if part == "all" else (part,)
-
-
 def _seconds(text: str) -> tuple[float, ...]:
     try:
         found = tuple(float(word) for word in text.split(","))
@@ -157,7 +155,7 @@ def _seconds(text: str) -> tuple[float, ...]:
 
 
 def _known(path: Path, quick: bool) -> dict[str, Any]:
-    """The figures of an earlier run. BenchError where they cannot be gone on with."""
+    """The figures of an earlier run. BenchError where they cannot be continued."""
     if not path.is_file():
         return {}
     try:
@@ -210,9 +208,9 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
         module = importlib.import_module(f"edge_server.experiments.bench.{part}")
         text.append(f"## {part}")
         if hasattr(module, "draw"):
-            picture = path.with_name(f"{part}.png")
-            module.draw(figures[part], picture)
-            text += [f"![{part}]({picture.name})"] if picture.is_file() else []
+            plot = path.with_name(f"{part}.png")
+            module.draw(figures[part], plot)
+            text += [f"![{part}]({plot.name})"] if plot.is_file() else []
         text.append(_table(module, figures[part]))
     write_text(path.with_suffix(".md"), "\n\n".join(text) + "\n")
 

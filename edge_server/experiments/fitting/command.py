@@ -52,13 +52,13 @@ ends it early; report, pictures and checkpoint are written all the same, and --r
 
 BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 _SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
-# Enough to tell how far a field is from the views it was trained on, where nothing is held out.
+# Number of training views that are scored where no view is held out.
 _SCORED_OF_TRAINING = 8
 
 
 @dataclass(frozen=True)
 class FitRequest:
-    """One fit as asked for. options: of the field, as in a scenario."""
+    """What the command asks for. options: of the field, as in a scenario."""
 
     data: Path
     field: str = "ngp"
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(
     request: FitRequest, out: Path, lpips_folder: Path | None = None, resume: bool = False
 ) -> dict[str, Any]:
-    """Fit, measure and leave everything in ``out``; returns the contents of report.json.
+    """Fit, measure and write everything to ``out``; returns the contents of report.json.
 
     Raises DatasetError or OptionError for input that cannot be used.
     """
@@ -195,7 +195,7 @@ class _Run:
         return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
-        """Load what ``finish`` left. OptionError where there is nothing to go on from."""
+        """Load the files of ``finish``. OptionError where there are none."""
         try:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
@@ -238,7 +238,7 @@ class _Run:
         self.spent_steps = at.steps if at.steps is not None else self.spent_steps
         self.processes[-1]["t_s"] = round(at.seconds, 3)
         outside = outside_cores(self.processes[-1])
-        self.load_meter.row(0.0)  # evaluation counts for nobody
+        self.load_meter.row(0.0)  # the evaluation is not measured
         self.rows.append(
             {
                 "number": len(self.rows),

@@ -52,7 +52,7 @@ def fit_in_slices(
 ) -> bool:
     """Fit until each of ``until_s`` in turn and score; False if Ctrl-C ended it early (scored all the same).
 
-    spent_s, spent_steps: what an earlier run has done already. Only fitting counts as time.
+    spent_s, spent_steps: of an earlier run. Only fitting counts as time.
     """
     seconds, steps = spent_s, spent_steps
     for mark in until_s:
@@ -60,7 +60,7 @@ def fit_in_slices(
             continue
         began = time.perf_counter()
         report: FitReport | None = None
-        # Interrupted, the parameters are those of the last step: good enough to be scored and saved.
+        # After an interruption the parameters are those of the last step and can be scored and saved.
         with _ctrl_c() as pressed, suppress(KeyboardInterrupt):
             report = field.fit(training, Budget(seconds=mark - seconds))
         slice_s = time.perf_counter() - began
@@ -76,8 +76,8 @@ def fit_in_slices(
 
 @contextmanager
 def _ctrl_c() -> Iterator[threading.Event]:
-    """Whether Ctrl-C was pressed meanwhile, also where Python cannot raise it: in a callback of the collector
-    it is printed and forgotten."""
+    """Whether Ctrl-C was pressed within the block, also where Python cannot raise it: in a callback of the
+    garbage collector the exception is printed and lost."""
     pressed, before = threading.Event(), signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed
