@@ -19,11 +19,7 @@ from edge_server.experiments.studies.learning.setup import (
     simple_policies,
 )
 from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
-from edge_server.experiments.training.scheduler.evaluation import (
-    Candidate,
-    Evaluation,
-    rows,
-)
+from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, seeds
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig

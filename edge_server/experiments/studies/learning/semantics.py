@@ -23,11 +23,7 @@ from edge_server.experiments.studies.learning.setup import (
 from edge_server.experiments.studies.learning.visibility import SeesMotion, VisibleMotion, embedding_areas
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
 from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.evaluation import (
-    BASELINE_POLICIES,
-    Evaluation,
-    rows,
-)
+from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import layout_of, seeds
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig

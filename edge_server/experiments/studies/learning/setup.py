@@ -210,24 +210,14 @@ class StudyTrainer:
         ]  # fmt: skip
 
     def evaluate(
-        self,
-        setting: Setting,
-        candidates: Mapping[str, Candidate],
-        reward: Reward,
-        count: int,
-        seed: int = 0,
+        self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
         """Evaluate candidates on ``count`` seeds that were never trained on, scored by the cameras that
         report, which never reward."""
         return self.evaluate_as_rewarded(setting.judged, candidates, reward, count, seed)
 
     def evaluate_as_rewarded(
-        self,
-        setting: Setting,
-        candidates: Mapping[str, Candidate],
-        reward: Reward,
-        count: int,
-        seed: int = 0,
+        self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
         """As ``evaluate``, scored by the cameras that reward; it supplements the other evaluation."""
         return evaluate_policies(

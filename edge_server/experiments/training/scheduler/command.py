@@ -29,13 +29,7 @@ from edge_server.experiments.training.scheduler.evaluation import (
 )
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
-from edge_server.experiments.training.scheduler.setting import (
-    OMEGAS_MS,
-    Setting,
-    layout_of,
-    reward_of,
-    seeds,
-)
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import (
     REPORTS,
     TrainingConfig,
