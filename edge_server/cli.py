@@ -79,7 +79,7 @@ _COMMANDS = {
         "experiments.virtual.simulate",
         "a scenario's whole deployment in virtual time, repeatable bit for bit",
     ),
-    "study": ("experiments.studies", "the thesis's figures as commands, each with a verdict"),
+    "study": ("experiments.studies.command", "the thesis's figures as commands, each with a verdict"),
     "bench": (
         "experiments.bench.command",
         "measure this machine: field, track, limits, ingest and more (bench --help)",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections import Counter
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,17 @@ def test_imports_form_no_circle() -> None:
         if module not in done:
             visit(module)
     assert not circles
+
+
+def test_folders_of_experiments_form_no_circle() -> None:
+    room = "edge_server.experiments"
+    folder = {m: m.removeprefix(f"{room}.").split(".")[0] for m in imports() if m.startswith(f"{room}.")}
+    arrows = {(folder[m], folder[t]) for m in folder for t in imports()[m] if t in folder}
+    order = TopologicalSorter()
+    for source, target in arrows:
+        if source != target:
+            order.add(source, target)
+    order.prepare()  # CycleError where there is one
 
 
 def test_a_level_holds_about_fifteen_files() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.training.scheduler.choices import choices, named
-from edge_server.experiments.training.scheduler.evaluation import evaluate_policies, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import baseline_policies, evaluate_policies, rows
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig, TrainingError, read_log, train
 from edge_server.experiments.training.scheduler.workers import WorkerPool
@@ -44,7 +44,7 @@ def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing
     assert not (tmp_path / "policy.npz").exists()
     with WorkerPool(NOTHING) as pool:
         evaluation = evaluate_policies(
-            silent, pool, seeds(0, "test", 2), rivals((50.0,), ["threshold"], ("random",)), REWARD
+            silent, pool, seeds(0, "test", 2), baseline_policies((50.0,), ["threshold"], ("random",)), REWARD
         )
     assert all(np.isnan(row["reward"]) for row in rows(evaluation))
 

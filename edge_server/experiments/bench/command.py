@@ -1,4 +1,4 @@
-"""``edge-server bench``: what this machine does a second, with how busy others kept it beside each figure."""
+"""``edge-server bench``: measurements of this machine, each with the load of other processes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from types import ModuleType
 from typing import Any
 
 from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.common.arguments import at_least, command_parser, parse_options
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from freshfield.files import write_json, write_text
@@ -56,7 +56,7 @@ MORE = ("embed", "foreground", "peer", "surface")
 # Parts that store each figure as it comes, and skip what is known.
 _RESUMABLE = ("field", "track", "drift", "options", "surface")
 _FOLLOWING = ("track", "drift")
-# Flags that mean something to some parts only.
+# Flags of some parts only.
 _ONLY_OF = {
     "field": _RESUMABLE, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
@@ -68,7 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = _parser()
     args = parser.parse_args(argv)
-    parts = list(dict.fromkeys(p for part in args.part or ["all"] for p in _expanded(part)))
+    parts = list(
+        dict.fromkeys(p for part in args.part or ["all"] for p in (PARTS if part == "all" else (part,)))
+    )
     if unknown := set(parts) - {*PARTS, *MORE}:
         parser.error(f"no part is called {', '.join(unknown)}; there are: {', '.join((*PARTS, *MORE))}, all")
     args.field = [name for words in args.field for name in words.split(",")]
@@ -84,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name in args.field or field_names():
             make_field(name, args.option)
         figures = _known(args.json, args.quick) if args.resume else {}
-    except (BenchError, FitError, ValueError) as error:
+    except (BenchError, ValueError) as error:
         parser.error(str(error))
     figures |= {"machine": machine(), "versions": versions(), "quick": args.quick}
     figures["runs"] = figures.get("runs", 0) + 1
@@ -109,8 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server bench", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("bench", DESCRIPTION)
     add = parser.add_argument
     add("part", nargs="*", metavar="PART", help=f"{', '.join((*PARTS, *MORE))}, all [all]")
     add("--json", type=Path, metavar="FILE", help="write figures there; plots and tables beside")
@@ -132,25 +133,15 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", action="append", default=[], choices=scenes, help="[track: both; drift: room]")
     add(
         "--updates",
-        type=_at_least_one,
+        type=at_least(1),
         metavar="N",
         help="consecutive updates [100, drift 300; --quick: 16, drift 32]",
     )
     add("--update-s", type=_seconds, metavar="S,...", help="seconds of an update, a run each [1,0.25]")
-    add("--steps", type=_at_least_one, metavar="N", help="steps of an update instead: repeats bit for bit")
-    add("--samples", type=_at_least_one, metavar="N", help="frames with a fresh fit [8; --quick: 3]")
+    add("--steps", type=at_least(1), metavar="N", help="steps of an update instead: repeats bit for bit")
+    add("--samples", type=at_least(1), metavar="N", help="frames with a fresh fit [8; --quick: 3]")
     add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
     return parser
-
-
-def _expanded(part: str) -> tuple[str, ...]:
-    return PARTS if part == "all" else (part,)
-
-
-def _at_least_one(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from 1")
-    return int(text)
 
 
 def _seconds(text: str) -> tuple[float, ...]:
@@ -164,7 +155,7 @@ def _seconds(text: str) -> tuple[float, ...]:
 
 
 def _known(path: Path, quick: bool) -> dict[str, Any]:
-    """The figures of an earlier run. BenchError where they cannot be gone on with."""
+    """The figures of an earlier run. BenchError where they cannot be continued."""
     if not path.is_file():
         return {}
     try:
@@ -217,9 +208,9 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
         module = importlib.import_module(f"edge_server.experiments.bench.{part}")
         text.append(f"## {part}")
         if hasattr(module, "draw"):
-            picture = path.with_name(f"{part}.png")
-            module.draw(figures[part], picture)
-            text += [f"![{part}]({picture.name})"] if picture.is_file() else []
+            plot = path.with_name(f"{part}.png")
+            module.draw(figures[part], plot)
+            text += [f"![{part}]({plot.name})"] if plot.is_file() else []
         text.append(_table(module, figures[part]))
     write_text(path.with_suffix(".md"), "\n\n".join(text) + "\n")
 

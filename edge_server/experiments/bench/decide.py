@@ -46,7 +46,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 def _decision(action: Any, n: int, repeats: int) -> dict[str, float]:
     spec = Spec(action, StateLayout(dim=DIM), () if action == "select" else OMEGAS_MS)
-    policy = BanditPolicy(Actor(spec, networks.init_actor(spec, np.random.default_rng(0))), "bandit", _rng())
+    policy = BanditPolicy(
+        Actor(spec, networks.init_actor(spec, np.random.default_rng(0))), "bandit", np.random.default_rng(1)
+    )
     newest, embeddings = _newest_frames(n), _StoredEmbeddings(n)
     names = tuple(newest)
     generated = {c: item.generated_ns for c, item in newest.items()}
@@ -72,7 +74,7 @@ def _decision(action: Any, n: int, repeats: int) -> dict[str, float]:
 
 
 def _ms(part: str, task: Callable[[], Any], repeats: int) -> dict[str, float]:
-    """By the clock, and of this thread's processor time, which others' load does not lengthen."""
+    """Wall-clock time, and processor time of this thread, which other processes do not lengthen."""
     for _ in range(20):  # libraries load and allocate at the first calls
         task()
     gc.collect()
@@ -87,10 +89,6 @@ def _ms(part: str, task: Callable[[], Any], repeats: int) -> dict[str, float]:
         f"{part}_ms_p99": float(np.percentile(wall_ms, 99)),
         f"{part}_cpu_ms_p99": float(np.percentile(cpu_ms, 99)),
     }
-
-
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(1)
 
 
 def _newest_frames(n: int) -> dict[str, BufferedFrame]:
@@ -108,7 +106,7 @@ class _StoredEmbeddings:
     """Embeddings that need no computing."""
 
     def __init__(self, n: int) -> None:
-        self._rows = _rng().standard_normal((n, DIM)).astype(np.float32)
+        self._rows = np.random.default_rng(1).standard_normal((n, DIM)).astype(np.float32)
 
     def of(self, items: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         return self._rows[: len(items)], np.ones(len(items), bool)

@@ -1,5 +1,5 @@
-"""Three hundred updates after motion: ``bench track`` at length, to see whether a field that follows a moving
-scene wears out."""
+"""``bench track`` with three hundred updates: whether the quality of a field that follows a moving scene
+decreases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What embedding a frame costs, beside ONNX Runtime alone on the same part of the same model."""
+"""Time of embedding a frame, compared with ONNX Runtime alone on the same part of the same model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _COLUMNS = (("embed_ms", 3), ("runtime_ms", 3), ("ratio", 2), ("cpu_ratio", 2), 
             ("camera_ratio", 2), ("camera_cpu_ratio", 2))  # fmt: skip
 
 
-def measure(run: BenchRun, threads: int = 1) -> dict[str, Any]:
+def measure(run: BenchRun) -> dict[str, Any]:
     """Median milliseconds a frame by model, size and batch.
 
     ``embed_ms``: of frames of the model's size. ``runtime_ms``: of ONNX Runtime on ready-made input in the
@@ -39,12 +39,12 @@ def measure(run: BenchRun, threads: int = 1) -> dict[str, Any]:
     """
     repeats = 20 if run.quick else 100
     files = [run.model] if run.model is not None else sorted(MODELS.glob("detector_*.onnx"))
-    found: dict[str, Any] = {"threads": threads, "repeats": repeats}
+    found: dict[str, Any] = {"threads": 1, "repeats": repeats}
     for path in files:
         of_model = {}
         for size in SIZES:
             try:
-                config = EmbeddingConfig(str(path), DIM, size, None, "cpu", threads)
+                config = EmbeddingConfig(str(path), DIM, size, None, "cpu", threads=1)
                 rows = {str(n): _by_batch(config, n, repeats) for n in BATCHES}
             except SizeError:
                 continue  # exported for one size, and measured at that one
@@ -61,8 +61,8 @@ def _by_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
     embedder = make_embedder(config)
     backbone = embedder.backbone
     rng = np.random.default_rng(0)
-    frames = _pictures(rng, n, backbone.height, backbone.width)
-    larger = _pictures(rng, n, *CAMERA)
+    frames = _images(rng, n, backbone.height, backbone.width)
+    larger = _images(rng, n, *CAMERA)
     ready = rng.random((n, 3, backbone.height, backbone.width)).astype(backbone.dtype)
     step = embedder.step
     parts = [ready[first : first + step] for first in range(0, n, step)]
@@ -104,7 +104,7 @@ def _in_turn(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list
     return spent
 
 
-def _pictures(rng: np.random.Generator, n: int, height: int, width: int) -> list[NDArray[np.uint8]]:
+def _images(rng: np.random.Generator, n: int, height: int, width: int) -> list[NDArray[np.uint8]]:
     return list(rng.integers(0, 256, (n, height, width, 3), dtype=np.uint8))
 
 

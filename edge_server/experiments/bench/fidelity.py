@@ -1,4 +1,4 @@
-"""What scoring one image costs: PSNR, SSIM, moving pixels, LPIPS and all of them together."""
+"""Time of scoring one image: PSNR, SSIM, moving pixels, LPIPS and all of them together."""
 
 from __future__ import annotations
 

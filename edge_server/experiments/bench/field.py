@@ -1,4 +1,4 @@
-"""How fast each representation is: seconds to a quality from scratch, rates, renderings, compilation, memory.
+"""Speed of each representation: seconds to a quality from scratch, rates, rendering, compilation, memory.
 
 Every point is a new field, fitted from scratch for a planned time, because a fit schedules its learning rate
 over its time. Scores are of held-out cameras. Beside every scene stand two baselines that need no field: the
@@ -24,8 +24,12 @@ from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_rec
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.common.tables import grouped, markdown_table, number
-from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import MultiviewStill, smallest_angle_deg, synthetic_still
+from edge_server.experiments.scenes.multiview_still import (
+    MultiviewStill,
+    score_views,
+    smallest_angle_deg,
+    synthetic_still,
+)
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
@@ -33,7 +37,7 @@ from edge_server.fields.registry import field_names, make_field
 from freshfield.geometry import Pinhole
 from freshfield.machine_load import LoadMeter, peak_rss_mb
 
-GROWN = 500  # steps after which every representation has its full size
+FULL_SIZE_STEPS = 500  # steps after which every representation has its full size
 VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
 
@@ -172,7 +176,7 @@ def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | Non
 def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
     model = make_field(field, seed=seed)
     report = model.fit(still.training, Budget(seconds=seconds))
-    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     return {
         "fitted_s": report.seconds, "steps": report.steps, "psnr_db": score.psnr_db, "ssim": score.ssim,
         "lpips": score.lpips,
@@ -180,7 +184,7 @@ def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: 
 
 
 def _rates(field: str, still: MultiviewStill, repeats: int) -> dict[str, Any]:
-    """Rates of a field that has settled, and milliseconds of a rendering."""
+    """Rates of a converged field, and milliseconds of a rendering."""
     model = make_field(field)
     model.fit(still.training, Budget(seconds=3.0))
     load, speed, reports = LoadMeter(), MachineSpeed(), []
@@ -200,8 +204,8 @@ def _rates(field: str, still: MultiviewStill, repeats: int) -> dict[str, Any]:
     }
 
 
-def _render_ms(field: Field, pose: Any, lens: Pinhole, repeats: int = 11) -> float:
-    return 1e3 * median_s(repeats, lambda: field.render(pose, lens))
+def _render_ms(field: Field, pose: Any, lens: Pinhole) -> float:
+    return 1e3 * median_s(11, lambda: field.render(pose, lens))
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
@@ -294,7 +298,7 @@ def _main(field: str) -> None:
     model.warm_up()
     jit_s, jit_cpu_s = time.perf_counter() - began, time.process_time() - cpu
     still = synthetic_still("room", cameras=VIEWS + 1, size=SIZE)
-    model.fit(still.training, Budget(steps=GROWN))
+    model.fit(still.training, Budget(steps=FULL_SIZE_STEPS))
     model.render(still.held_out[0].camera_to_world, still.held_out[0].intrinsics)
     print(json.dumps({"jit_s": jit_s, "jit_cpu_s": jit_cpu_s, "peak_rss_mb": peak_rss_mb()}))
 

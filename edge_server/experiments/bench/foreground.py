@@ -1,9 +1,8 @@
-"""What cutting the background out costs and gains, on pictures whose alpha is the truth (lego).
+"""Cost and gain of foreground segmentation, on images whose alpha is the truth (lego).
 
-The pictures have no background of their own, so they are composited over two: white, and a cluttered one.
-The clutter depends on the viewing direction alone, so that all cameras see the same place, infinitely far.
-Over the clutter a field is fitted as well, for the same steps: to whole pictures, to cut ones, and to the
-true alpha.
+The images have no background of their own, so they are composited over two: white, and a cluttered one. The
+clutter depends on the viewing direction alone, so that all cameras see the same place, infinitely far. On the
+clutter a field is fitted, for the same steps, to whole images, to segmented ones, and to the true alpha.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from edge_server.foreground.foreground import Foreground, make_foreground
 from freshfield.geometry import world_rays
 from freshfield.machine_load import LoadMeter
 
-# Half a percent of each side: what a detector that was trained for the object is good for.
+# Share of a side by which boxes are too large: the accuracy of a detector that was trained for the object.
 BOX_MARGIN = 0.005
 SIDES, ITERATIONS = (80, 160, 320), (1, 3, 5)
 FIELD = "ngp"
@@ -70,7 +69,7 @@ def _views(scale: float) -> tuple[View, ...]:
 
 
 def true_mask(view: View) -> Mask:
-    """(H, W): the object, by the picture's own alpha."""
+    """(H, W): the object, by the image's own alpha."""
     return view.image[..., 3] > 255 * _SEEN
 
 
@@ -98,7 +97,7 @@ _BACKGROUNDS: dict[str, Callable[[View], NDArray[np.uint8]]] = {"white": _white,
 
 
 def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
-    """Left, top, right, bottom around the object, as shares of the picture."""
+    """Left, top, right, bottom around the object, as shares of the image."""
     mask = true_mask(view)
     h, w = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -107,9 +106,9 @@ def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
 
 
 def _masks(views: Sequence[View], compose: Callable[[View], NDArray[np.uint8]]) -> dict[str, Any]:
-    """By way to cut: mean and worst IoU with the truth, and median milliseconds a picture."""
+    """By way to cut: mean and worst IoU with the truth, and median milliseconds an image."""
     boxes = {view.camera: true_box(view) for view in views}
-    pictures = [(view.camera, compose(view), true_mask(view)) for view in views]
+    composed = [(view.camera, compose(view), true_mask(view)) for view in views]
     ways = {BOX: ForegroundConfig(boxes=boxes, segment=BOX)}
     for side in SIDES:
         for iterations in ITERATIONS:
@@ -120,16 +119,16 @@ def _masks(views: Sequence[View], compose: Callable[[View], NDArray[np.uint8]]) 
     for name, config in ways.items():
         cut = make_foreground(config)
         ious, spent_ms = [], []
-        for camera, picture, truth in pictures:
+        for camera, image, truth in composed:
             begun = time.perf_counter()
-            rgba, _ = cut.apply(camera, picture)
+            rgba, _ = cut.apply(camera, image)
             spent_ms.append(1e3 * (time.perf_counter() - begun))
             ious.append(_iou(_foreground_mask(rgba), truth))
         found[name] = {
             "iou": statistics.fmean(ious),
             "worst": min(ious),
             "ms": statistics.median(spent_ms),
-            "whole": len(pictures) - cut.counts.masked,
+            "whole": len(composed) - cut.counts.masked,
         }
     return found
 
@@ -144,7 +143,7 @@ def _iou(a: Mask, b: Mask) -> float:
 
 
 def _detections(views: Sequence[View], model: str) -> dict[str, Any]:
-    """What a detector finds on white and on clutter: pictures with a detection, IoU of its box with the true
+    """What a detector finds on white and on clutter: images with a detection, IoU of its box with the true
     one, the kinds it took the object for, and median milliseconds."""
     try:
         from edge_server.foreground.detector import Detector
@@ -156,13 +155,13 @@ def _detections(views: Sequence[View], model: str) -> dict[str, Any]:
     for ground, compose in _BACKGROUNDS.items():
         ious, kinds, spent_ms = [], [], []
         for view in views:
-            picture = compose(view)
+            image = compose(view)
             begun = time.perf_counter()
-            detected = detector.detect(picture, 0.25)
+            detected = detector.detect(image, 0.25)
             spent_ms.append(1e3 * (time.perf_counter() - begun))
             if detected:
                 kinds.append(detected[0].kind)
-                ious.append(_box_iou(detected[0].box, true_box(view, 0.0), picture.shape))
+                ious.append(_box_iou(detected[0].box, true_box(view, 0.0), image.shape))
         found[ground] = {
             "detected": len(ious),
             "of": len(views),

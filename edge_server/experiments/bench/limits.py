@@ -1,12 +1,12 @@
-"""How far the fields' kernels are from what this machine allows: its limits, then each kernel against them.
+"""A roofline of the fields' kernels: the limits of this machine, and each kernel against them.
 
-The limits are measured, not looked up: random reads and writes of one vertex (two float32, as in the hash
-tables) in tables of several sizes, arithmetic in registers, divisions, and copies within a core's own cache.
-Multiply-adds of BLAS, on one large and one narrow matrix, are a peer and no limit: on a processor that BLAS
-was not tuned for they reach half of what is possible. A kernel's floor is the time that all cores together
-need at least for the slowest of its reads, writes and arithmetic; these processors do the others meanwhile.
-The rest of a kernel's time goes into addresses, sampling, marching, branches and waiting. Measured for
-``ngp`` and ``splat``: the default and the fastest.
+The limits are measured: random reads and writes of one vertex (two float32, as in the hash tables) in tables
+of several sizes, arithmetic in registers, divisions, and copies within a core's own cache. Multiply-adds of
+BLAS, on one large and one narrow matrix, are shown for comparison; they are no limit, because on a processor
+that BLAS was not tuned for they reach half of what is possible. A kernel's floor is the least time that all
+cores together need for the slowest of its reads, writes and arithmetic, which overlap. The rest of its time
+is spent on addresses, sampling, marching, branches and waiting. Measured for ``ngp`` and ``splat``: the
+default and the fastest field.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from freshfield.machine_load import LoadMeter
 TABLES_MB = (1, 4, 64)
 CORNERS = 8  # of a cell, each read once a level and sample, and written once by its gradient
 WARM_STEPS = 600
-LEAST_SHARE = 0.01  # of a step: what takes less has no row in the table
+LEAST_SHARE = 0.01  # of a step: kernels below it have no row in the table
 LIMITS = {
     **{f"reads_{mb}mb_m_per_s": f"million random reads a second from {mb} MB" for mb in TABLES_MB},
     **{f"adds_{mb}mb_m_per_s": f"million random additions a second to {mb} MB a core" for mb in TABLES_MB},
@@ -64,14 +64,14 @@ LIMITS = {
 # conversions, a multiplication with the addition that follows it as one. Of a pixel and a Gaussian in one of
 # its strips, forward (a power of 2 is 12 of them) and back (folding the sums of lanes is 11):
 COMPOSITING, COMPOSITING_BACK = 33, 31
-# Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
+# Of a Gaussian: its projection; the backward pass of the projection and a step of Adam.
 PROJECTING, UPDATING = 300, 680
-# Of a Gaussian that is sorted: counted and moved, twice. Of a pair: counted, owned, listed.
+# Moves of a sorted Gaussian (counted and moved, twice) and of a pair (counted, owned, listed).
 SORTING, BINNING = 4, 3
 
 
 class TimedPool(Pool):
-    """A pool that adds up the wall seconds spent in each kernel, by its name."""
+    """A pool that sums the wall-clock seconds of each kernel by name."""
 
     def __init__(self, threads: int | None = None) -> None:
         super().__init__(threads, nice=0)
@@ -85,8 +85,8 @@ class TimedPool(Pool):
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """The machine's limits and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share of a
-    step, its milliseconds a step and the share of them that its floor explains."""
+    """The limits of the machine and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share
+    of a step, its milliseconds a step and the share of them that its floor explains."""
     pool = TimedPool()
     load = LoadMeter()
     limits = Limits(repeats=5 if run.quick else 15)
@@ -104,11 +104,10 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 class Limits:
-    """The machine's limits, measured again after each fit that is compared with them: a shared machine
-    changes its speed within a minute, and a kernel must not seem faster than limits that were measured in a
-    slow one.
+    """The limits of the machine, measured again after each fit that is compared with them, because the speed
+    of a shared machine changes within a minute and a slow minute would underestimate the limits.
 
-    highest: of each limit, over all measurements.
+    highest: the highest value of each limit.
     """
 
     def __init__(self, repeats: int) -> None:
@@ -118,7 +117,7 @@ class Limits:
         self.highest = self._last
 
     def around(self) -> dict[str, float]:
-        """The limits for the time since the last measurement: the higher ones of that and of a new one."""
+        """The limits since the last measurement: the higher values of that and of a new one."""
         before, self._last = self._last, machine_limits(self.pool, self._repeats)
         self.highest = _higher(self.highest, self._last)
         return _higher(before, self._last)
@@ -136,8 +135,7 @@ def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
     rng = np.random.default_rng(0)
     for megabytes in TABLES_MB:
         vertices = megabytes * 2**20 // (4 * FEATURES)
-        # Reading: from one table, as the hash tables are. Adding: to a table each, since no two workers of
-        # the gradient's kernel share one either.
+        # All workers read one table, as the fields do. Each adds to its own, as in the gradient's kernel.
         tables = np.zeros((pool.threads, vertices, FEATURES), np.float32)
         rows = rng.integers(0, vertices, PER_TASK).astype(np.uint32)
         add_s = median_s(repeats, partial(pool.run, random_adds, tables, rows))
@@ -179,10 +177,10 @@ def _of_ngp(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) 
 
 def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
     field = SplatField(SplatSettings(), pool)
-    field.fit(views, Budget(steps=WARM_STEPS))  # grown to what it holds at most
+    field.fit(views, Budget(steps=WARM_STEPS))  # until it has its largest size
     pool.seconds.clear()
     report = field.fit(views, Budget(steps=steps))
-    spent = dict(pool.seconds)  # how much there is to do is counted without the clock
+    spent = dict(pool.seconds)  # the counting below is not timed
     counts = []
     for _ in range(len(views)):
         field.fit(views, Budget(steps=1))
@@ -194,9 +192,9 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
 
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:
-    """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
-    the strips that pairs which changed a pixel reach: the others are hidden. Some of these strips may have
-    been dark already, so that the floor is a little high where much is hidden."""
+    """Counts of a field's last step, on one image: Gaussians, visible Gaussians, pairs of a Gaussian and a
+    tile, and strips that are reached by pairs that changed a pixel (the other pairs are hidden). Some of
+    these strips may have been opaque already, so the floor is a little high where much is hidden."""
     raster, count = field._raster, len(field.cloud)
     lists, pairs = raster.lists, int(raster.lists.needed[0])
     used = (raster.sums[0, :pairs] != 0.0).any(axis=-1)
@@ -213,7 +211,7 @@ def _counted(field: SplatField) -> tuple[int, int, int, int]:
 
 
 def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: TimedPool) -> dict[str, Any]:
-    """What each kernel took in the steps reported, beside its floor's parts in milliseconds a step."""
+    """Time of each kernel in the reported steps, and the parts of its floor, in milliseconds a step."""
     spent_ms = {name: s / report.steps * 1e3 for name, s in sorted(pool.seconds.items(), key=lambda i: -i[1])}
     kernels: dict[str, Any] = {}
     for name, ms in spent_ms.items():
@@ -236,12 +234,14 @@ def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: Timed
 def _floors_of_ngp(
     samples: float, levels: int, widths: list[int], table_mb: float, limits: dict[str, float]
 ) -> dict[str, dict[str, float]]:
-    """For the two kernels that do nearly everything: milliseconds a step of reads, additions and
-    multiply-adds at the machine's limits. table_mb: of one level, which is what a pass walks through.
+    """Floors of the two kernels that take nearly all the time: milliseconds a step of reads, additions and
+    multiply-adds at the machine's limits.
 
-    The floor of ``scatter`` counts every sample, the kernel leaves out those without a gradient (behind the
-    first opaque surface): its share can pass 1. What BLAS makes of a product as narrow as the network's is
-    printed as a peer."""
+    table_mb: size of one level, which a pass reads.
+
+    The floor of ``scatter`` counts every sample, but the kernel leaves out those without a gradient (behind
+    the first opaque surface), so its share can exceed 1.
+    """
     size = min(TABLES_MB, key=lambda mb: abs(np.log(mb / table_mb)))
     vertices = samples * levels * CORNERS
     multiply_adds = samples * sum(a * b for a, b in pairwise(widths))
@@ -258,11 +258,16 @@ def _floors_of_ngp(
 def _floors_of_splat(
     gaussians: float, seen: float, pairs: float, strips: float, limits: dict[str, float]
 ) -> dict[str, dict[str, float]]:
-    """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
+    """Floors of the four kernels of a step on one image, in milliseconds at the machine's limits.
 
-    gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
-    pixel. Operations count as if that were all there is: what ``project`` and ``adam_step`` do is mostly to
-    move numbers so that they lie side by side, and ``bin_tiles`` to sort."""
+    gaussians: in the cloud.
+    seen: in the image.
+    pairs: of a Gaussian and a tile.
+    strips: in which pairs change a pixel.
+
+    Only operations count, although ``project`` and ``adam_step`` mostly rearrange numbers and ``bin_tiles``
+    mostly sorts.
+    """
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE

@@ -1,9 +1,9 @@
-"""What each optional part of a representation costs in time and gains in dB, one by one.
+"""Cost in time and gain in dB of each optional part of a representation.
 
-Every option is tried off and on, everything else at its default: after the same number of steps, which says
-what it is worth, and after the same seconds, which says whether it is worth its time. Some scenes call for
-an option (cameras whose gains differ, poses that are a little wrong, motion), others do not: there it should
-cost nothing. A representation that does not have an option is left out of its rows.
+Every option is measured off and on, everything else at its default: after the same number of steps (its gain)
+and after the same seconds (its gain for its time). Some scenes need an option (different gains of the
+cameras, slightly wrong poses, motion); on the others it should cost nothing. A representation without an
+option has no rows for it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from edge_server.experiments.bench.run import BenchError, BenchRun, result_setti
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db
-from edge_server.experiments.fitting.evaluate import evaluate
+from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
@@ -101,8 +101,8 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:
-    """Settings of a representation as text, without those that are at their default anyway. ValueError: it
-    does not have them, or not these values."""
+    """Settings of a representation as text, without those at their default. ValueError for unknown settings
+    or values."""
     usual = getattr(make_field(name), "settings", None)
     chosen = getattr(make_field(name, options), "settings", None)
     different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
@@ -146,7 +146,7 @@ def _from_scratch(where: Scene, model: Field, budget: Budget) -> _Fitted:
     cpu = time.process_time()
     report = model.fit(still.training, budget)
     cpu_s = time.process_time() - cpu
-    score, _ = evaluate(model, still.held_out, Scorer(background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(background=still.background))
     return _Fitted(score.psnr_db, score.psnr_moving_db, report.steps, report.seconds, cpu_s)
 
 

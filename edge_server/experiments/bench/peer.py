@@ -1,4 +1,4 @@
-"""Seconds to a quality, side by side with peers a user might pick on the same machine in the same run.
+"""Seconds to a quality, compared with peers on the same machine in the same run.
 
 Peers: nerfstudio's nerfacto (its torch implementation, which is what runs without a GPU) where nerfstudio can
 be imported, and our own field in plain torch, which does the same arithmetic as the kernels but for the
@@ -27,9 +27,9 @@ from freshfield.machine_load import LoadMeter
 
 TARGETS_DB = (20, 25)
 QUICK_S, FULL_S = 60.0, 900.0
-# Of fitting between two looks at the held-out view: a peer's picture takes it ten seconds.
+# Seconds of fitting between two evaluations: a peer needs ten seconds to render an image.
 _FIRST_SLICE_S, _FIRST_PEER_SLICE_S, _GROWTH = 0.25, 4.0, 1.3
-# What nerfacto is given a step: its default of 4096 rays would be a single step in half a minute.
+# Rays of a step of nerfacto: with its default of 4096 one step takes half a minute.
 _RAYS = 1024
 # Recordings, and by what their images are divided.
 SCALES = {"lego": 4.0, "kitchen": 1.0}
@@ -39,8 +39,8 @@ Contestant = tuple[Callable[[float], float], Callable[[View], np.ndarray]]
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """For every scene and contestant the seconds to each quality (None: not within ``limit_s``), and how
-    many times longer a peer took than our field; a lower bound where it did not arrive."""
+    """For every scene and contestant the seconds to each quality (None: not within ``limit_s``), and the
+    ratio of a peer's time to that of our field; a lower bound where the peer did not reach it."""
     limit_s = QUICK_S if run.quick else FULL_S
     figures: dict[str, Any] = {"limit_s": limit_s, "nerfacto_missing": nerfacto_missing()}
     for name, scale in SCALES.items():
@@ -53,7 +53,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def nerfacto_missing() -> str | None:
-    """Why nerfacto is no contestant here; None where it is one."""
+    """Why nerfacto cannot be measured here; None if it can."""
     try:
         import nerfstudio.models.nerfacto  # noqa: F401
     except ImportError as error:
@@ -217,7 +217,7 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
 
 
 def _callbacks(model: Any) -> list[tuple[Callable[[int], None], Callable[[int], None]]]:
-    """What nerfacto does before and after a step: the annealing of its proposals."""
+    """Callbacks of nerfacto before and after a step: the annealing of its proposals."""
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 
     attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)

@@ -1,4 +1,4 @@
-"""What the parts of the bench share: what each is given, the recordings, the size of a measurement."""
+"""Shared by the parts of the bench: their request, the recordings, the settings of a result."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ RECORDINGS = {
 
 
 class BenchError(RuntimeError):
-    """A measurement that could not be taken; the message says what stood in its way."""
+    """A measurement that failed; the message says why."""
 
 
 @dataclass
 class BenchRun:
-    """One part of the bench, as asked for. A part takes of it what it needs.
+    """What is asked of one part of the bench; a part uses what it needs.
 
     quick: fewer repetitions.
     folder: an empty folder for the part's temporary files.
@@ -86,7 +86,7 @@ def open_recording(name: str, scale: float) -> MultiviewStill:
 def mean_baselines(
     training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
 ) -> dict[str, Any]:
-    """What needs no field, means over the held-out cameras. color: the background."""
+    """PSNR of the baselines without a field, means over the held-out cameras. color: the background."""
     found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
     names = ("mean_colour_db", "nearest_view_db")
     return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}

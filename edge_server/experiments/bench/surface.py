@@ -1,10 +1,10 @@
 """Mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
 
-A field is fitted to a scan of ``tile`` from 0.3 m (``offline.scan``); after each of some seconds its depth is
-compared with the exact one, and meshes are made of it: from the depth as it is, from depth sharpened by the
-pictures, from voxels carved anew and then sharpened (``surface.carve``), with truncated signed distances at
-several voxel sizes and with a fitted distance function. Row
-``exact`` fuses the exact depth instead: what pictures of this size and these cameras allow at best.
+A field is fitted to a scan of ``tile`` from 0.3 m (``scenes.tile_scan``). After each fitting time its depth
+is compared with the exact depth, and meshes are made: from the depth of the field, from depth sharpened by
+the images, and from carved voxels that are then sharpened (``surface.carve``), with truncated signed
+distances at several voxel sizes and with a fitted distance function. Row ``exact`` fuses the exact depth: the
+best that images of this size and these cameras allow.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "ngp": ("ngp", {}),
     "voxel": ("voxel", {}),
 }
-# Depth that meshes are made from, and what makes it.
+# Depth that meshes are made from, and the settings that make it.
 DEPTHS = {
     "of the field": MeshSettings(sharpen=False),
     "sharpened": MeshSettings(carve=False),
@@ -63,7 +63,7 @@ TARGET = (
 class Workload:
     """How much is measured.
 
-    size: pixels a side of the pictures.
+    size: pixels a side of the images.
     fit_s: seconds of fitting after which meshes are made.
     voxels_mm: of the sharpened and carved meshes; the others are made at the middle one.
     cases: of ``CASES``.
@@ -183,7 +183,7 @@ def table(figures: dict[str, Any]) -> str:
     """Two Markdown tables: depth, and meshes."""
     facts = figures["scan"]
     about = (
-        f"{facts['views']} pictures of {facts['size']} x {facts['size']} of `tile` from "
+        f"{facts['views']} images of {facts['size']} x {facts['size']} of `tile` from "
         f"{facts['distance_m']:g} m. Target: {TARGET}."
     )
     fits = [(name, fit) for name, case in figures.get("cases", {}).items() for fit in case["fits"]]

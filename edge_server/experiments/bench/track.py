@@ -1,12 +1,11 @@
-"""Updates after motion: how far a field that follows a moving scene stays behind one fitted afresh.
+"""Updates after motion: the gap between a field that follows a moving scene and one fitted from scratch.
 
-A field that has settled on the first frame gets a short update with all training views of the next frame,
-then with those of the frame after that, and so on; each update is scored on the held-out camera at its frame.
-At some frames a new field of the same representation is fitted to the same views for fifteen seconds (or
-fifteen times the steps of an update): its score is what the follower could reach. Between those frames it is
-interpolated.
+A field that has converged on the first frame gets a short update with all training views of the next frame,
+and so on; each update is scored on the held-out camera at its frame. At some frames a new field of the same
+representation is fitted to the same views for fifteen seconds (or fifteen times the steps of an update): its
+score is the reference of the follower. Between those frames it is interpolated.
 
-Updates are of some seconds, or of a number of steps (``--steps``), which repeats bit for bit.
+Updates take a number of seconds, or of steps (``--steps``), which repeats bit for bit.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
     figures: dict[str, Any] = {"fresh": {}}
     make_field(name, workload.options).warm_up()
     start: Field | None = None
-    known: dict[int, dict[str, Any]] = {}  # of a sequence that repeats no frame is fitted twice
+    known: dict[int, dict[str, Any]] = {}  # a repeated frame is not fitted twice
     try:
         for frame in workload.sampled():
             key = sequence.key(frame)
@@ -152,7 +151,7 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
                 start = start or field  # the first frame comes first
                 score = _row(sequence.score(field, frame, scorer))
                 known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
-            # Beside each: what is seen of this frame by a field that stayed with the first one.
+            # For comparison: the field of the first frame, never updated.
             assert start is not None
             stayed = _row(sequence.score(start, frame, scorer))
             stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
@@ -199,7 +198,7 @@ def _run(
 
 
 def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of one run: the series, and per metric what lies between it and the fresh fits.
+    """Results of one run: the series, and the gap to the fresh fits in each metric.
 
     rows: one an update. fresh: by frame (as text) the scores of the fresh fits.
     """
@@ -220,7 +219,7 @@ def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, 
 def gaps(
     frames: Sequence[int], tracked: Sequence[float | None], fresh: Mapping[int, float]
 ) -> dict[str, Any]:
-    """What a follower lacks, fresh minus tracked in dB; every value None where nothing is known.
+    """The gap of a follower, fresh minus tracked in dB; every value None where nothing is known.
 
     frames, tracked: a score an update. fresh: scores of some frames, linearly interpolated over the others
     (beyond the first and the last: as those). share_near: of the updates within NEAR_DB. first_tenth_db,
@@ -321,7 +320,7 @@ def table(figures: dict[str, Any]) -> str:
     rows = []
     for scene, name, run, found, of_field in _runs(figures):
         whole, moving = found["whole"], found["moving"]
-        # A field that is never updated knows the first frame as well as any: that frame says nothing.
+        # At the first frame a field that is never updated is as good as any.
         later = {"fresh": {f: row for f, row in of_field["fresh"].items() if f != "0"}}
         values = [_fresh(later, f"not_updated_{metric}")[1] for metric in _METRICS.values()]
         stayed = [statistics.fmean(v) if v else None for v in values]

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from concurrent.futures import ProcessPoolExecutor
 
 import cv2
 
@@ -23,6 +24,13 @@ def init_worker(threads: int) -> None:
     cv2.setNumThreads(threads)
     if multiprocessing.parent_process() is not None:
         threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+
+
+def end_at_once(pool: ProcessPoolExecutor) -> None:
+    """Shut a pool down without waiting for what its processes are doing."""
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _end_with_parent() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -13,15 +12,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.fitting.evaluate import Scored, evaluate, fit_in_slices, marks_s
-from edge_server.experiments.scenes.multiview_still import synthetic_still
+from edge_server.experiments.common.arguments import OptionError, command_parser, parse_options
+from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
+from edge_server.experiments.scenes.multiview_still import score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Color, to_unit
@@ -53,17 +52,13 @@ ends it early; report, pictures and checkpoint are written all the same, and --r
 
 BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 _SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
-# Enough to tell how far a field is from the views it was trained on, where nothing is held out.
+# Number of training views that are scored where no view is held out.
 _SCORED_OF_TRAINING = 8
-
-
-class FitError(ValueError):
-    """An option that cannot work; the message says what to change."""
 
 
 @dataclass(frozen=True)
 class FitRequest:
-    """One fit as asked for. options: of the field, as in a scenario."""
+    """What the command asks for. options: of the field, as in a scenario."""
 
     data: Path
     field: str = "ngp"
@@ -79,8 +74,7 @@ class FitRequest:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server fit", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("fit", DESCRIPTION)
     add = parser.add_argument
     add("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
     add("--format", choices=list(FORMATS), help="of the data set [what its files say]")
@@ -124,44 +118,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         request.options.update(parse_options(args.option))
         run(request, out, args.lpips, args.resume)
-    except (DatasetError, FitError) as error:
+    except (DatasetError, OptionError) as error:
         print(f"edge-server fit: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """``key=value`` words as settings; values are YAML (8, 0.5, true, [0, 0, 1], white)."""
-    options: dict[str, Any] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not key or not equals:
-            raise FitError(f"--option {word}: expected KEY=VALUE")
-        try:
-            options[key] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise FitError(f"--option {word}: {value!r} is not a value") from None
-    return options
-
-
 def run(
     request: FitRequest, out: Path, lpips_folder: Path | None = None, resume: bool = False
 ) -> dict[str, Any]:
-    """Fit, measure and leave everything in ``out``; returns the contents of report.json.
+    """Fit, measure and write everything to ``out``; returns the contents of report.json.
 
-    Raises DatasetError or FitError for input that cannot be used.
+    Raises DatasetError or OptionError for input that cannot be used.
     """
     from edge_server.fields.registry import make_field  # numba loads only once the options are read
 
     if not 0.0 < request.seconds <= 1e6:
-        raise FitError(f"--seconds {request.seconds:g}: expected more than 0")
+        raise OptionError(f"--seconds {request.seconds:g}: expected more than 0")
     data = _open(request)
     transparent = any(v.image.shape[2] == 4 for v in data.training)
     options = {"background": request.background, **request.options} if transparent else request.options
     try:
         model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
-        raise FitError(f"--field {request.field}: {error}") from None
+        raise OptionError(f"--field {request.field}: {error}") from None
     out.mkdir(parents=True, exist_ok=True)
     run_ = _Run(request, options, data, model, out, lpips_folder)
     if resume:
@@ -215,7 +195,7 @@ class _Run:
         return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
-        """Load what ``finish`` left. FitError where there is nothing to go on from."""
+        """Load the files of ``finish``. OptionError where there are none."""
         try:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
@@ -223,9 +203,9 @@ class _Run:
             self.rows = _read_lines(self.out / "series.jsonl")
             self.processes = _read_lines(self.out / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
-            raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
+            raise OptionError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
         if self.spent_s >= self.request.seconds - 0.05:
-            raise FitError(
+            raise OptionError(
                 f"--resume: {self.out} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
             )
 
@@ -249,7 +229,7 @@ class _Run:
 
     def _score(self) -> Score:
         self.processes.append(self.load_meter.row(0.0))
-        score, self.rendered = evaluate(self.model, self.views, self.scorer)
+        score, self.rendered = score_views(self.model, self.views, self.scorer)
         return score
 
     def _scored(self, at: Scored) -> None:
@@ -258,7 +238,7 @@ class _Run:
         self.spent_steps = at.steps if at.steps is not None else self.spent_steps
         self.processes[-1]["t_s"] = round(at.seconds, 3)
         outside = outside_cores(self.processes[-1])
-        self.load_meter.row(0.0)  # evaluation counts for nobody
+        self.load_meter.row(0.0)  # the evaluation is not measured
         self.rows.append(
             {
                 "number": len(self.rows),

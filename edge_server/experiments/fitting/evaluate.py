@@ -1,4 +1,4 @@
-"""Fits a field to still views and scores it on held-out ones: what fit, frontier and bench share."""
+"""Fits a field in slices of time, scores it after each, and ends early after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from types import FrameType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Field, FitReport, View
 
 # Dense where a field learns fastest; after that every 30 s.
@@ -42,13 +41,6 @@ def marks_s(total_s: float) -> list[float]:
     return [m for m in (*_MARKS_S, *map(float, later)) if m <= (1.0 - _LAST_SHARE) * total_s] + [total_s]
 
 
-def evaluate(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
-    """Mean score over ``views``, and the rendering (H, W, 3) of the first."""
-    renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
-    scores = [scorer.score(v.camera, image, 0, v.image, 0) for v, image in zip(views, renderings)]
-    return mean_score(scores), renderings[0]
-
-
 def fit_in_slices(
     field: Field,
     training: Sequence[View],
@@ -60,7 +52,7 @@ def fit_in_slices(
 ) -> bool:
     """Fit until each of ``until_s`` in turn and score; False if Ctrl-C ended it early (scored all the same).
 
-    spent_s, spent_steps: what an earlier run has done already. Only fitting counts as time.
+    spent_s, spent_steps: of an earlier run. Only fitting counts as time.
     """
     seconds, steps = spent_s, spent_steps
     for mark in until_s:
@@ -68,7 +60,7 @@ def fit_in_slices(
             continue
         began = time.perf_counter()
         report: FitReport | None = None
-        # Interrupted, the parameters are those of the last step: good enough to be scored and saved.
+        # After an interruption the parameters are those of the last step and can be scored and saved.
         with _ctrl_c() as pressed, suppress(KeyboardInterrupt):
             report = field.fit(training, Budget(seconds=mark - seconds))
         slice_s = time.perf_counter() - began
@@ -84,8 +76,8 @@ def fit_in_slices(
 
 @contextmanager
 def _ctrl_c() -> Iterator[threading.Event]:
-    """Whether Ctrl-C was pressed meanwhile, also where Python cannot raise it: in a callback of the collector
-    it is printed and forgotten."""
+    """Whether Ctrl-C was pressed within the block, also where Python cannot raise it: in a callback of the
+    garbage collector the exception is printed and lost."""
     pressed, before = threading.Event(), signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed

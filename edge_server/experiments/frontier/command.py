@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.synthetic.scene import SCENES, SceneError
+from camera_node.synthetic.scene import SCENES
+from edge_server.experiments.common.arguments import command_parser, parse_options, run_command
 from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
-from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.experiments.frontier import effort_sweep, update_time
 from edge_server.experiments.frontier.output import write_output
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
@@ -104,8 +104,8 @@ FULL = Sweep(
     moving=update_time.MovingScene(cameras=19, size=128),
 )
 
-# Measured for the points that are shipped for scenarios without a frontier of their own. Unlike --quick, it
-# charges steps what they cost with as many and as large views as the runs have.
+# The sweep of the shipped points, for scenarios without a frontier of their own. Unlike --quick, it measures
+# the cost of a step with as many and as large views as the runs have.
 SHIPPED = replace(
     FULL,
     single_options=False,
@@ -121,22 +121,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     try:
         frontier = _frontier(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
-    except (DatasetError, SceneError, FitError, ScenarioError, ValueError) as error:
+    except (DatasetError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
-    try:
-        frontier.run()
-    except KeyboardInterrupt:
-        print(
-            f"\nstopped; what was measured is in {frontier.file.path}: the same command goes on", flush=True
-        )
-        return 130
-    return 0
+    stopped = f"what was measured is in {frontier.file.path}: the same command goes on"
+    return run_command("frontier", frontier.run, (), stopped)
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server frontier", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("frontier", DESCRIPTION)
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
     size("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
@@ -238,7 +231,10 @@ class Frontier:
             updates = self._updates(charged)
         else:
             updates = []
-            print(f"figure 2 left out: {_why_still(self.scene)}", flush=True)
+            why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
+            if self.scene in SCENES:
+                why = f"nothing moves in {self.scene}"
+            print(f"figure 2 left out: {why}", flush=True)
         self.file.write(
             scene=self.still.describe(),
             fields=list(self.fields),
@@ -286,8 +282,8 @@ class Frontier:
         return [e for e in self.levels if e.live and e.name in self.sweep.efforts]
 
     def _charged(self) -> dict[str, Compute]:
-        """What virtual time charges the updates of each effort: what they take on this machine with as many
-        images as the moving scene has, as large as those of figure 1."""
+        """Cost of an update of each effort in virtual time: measured on this machine with as many images as
+        the moving scene has, as large as those of figure 1."""
         sweep, found = self.sweep, {}
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         for effort in self._live:
@@ -337,7 +333,7 @@ class Frontier:
 
 
 def _settings(effort: effort_sweep.Effort) -> Row:
-    """What of an effort decides a result."""
+    """Settings of an effort that decide a result."""
     digest = settings_digest(effort.field, effort.options)
     return {"field": effort.field, "options": effort.options, "defaults": digest}
 
@@ -355,12 +351,6 @@ def _measured_compute(
 ) -> Row:
     compute = update_time.measure_compute(moving, speed, effort.field, effort.options, warm_steps)
     return {"ms_per_step": compute.ms_per_step, "ms_per_update": compute.ms_per_update}
-
-
-def _why_still(scene: str) -> str:
-    if scene in SCENES:
-        return f"nothing moves in {scene}"
-    return "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
 
 
 def _known(new: bool) -> str:

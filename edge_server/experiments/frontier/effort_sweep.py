@@ -1,4 +1,4 @@
-"""What fidelity costs in time, from scratch: effort levels of a field against seconds, Pareto front."""
+"""Fidelity against seconds from scratch, for the effort levels of a field, with its Pareto front."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import MultiviewStill
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, score_views
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import efforts_of, make_field
 from freshfield.machine_load import LoadMeter
 
-# What one option alone buys, against the level "medium" (only in the full sweep).
+# Single options, compared with the level "medium" (full sweep only).
 _SINGLE_OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     "ngp": {
         "fewer samples": {"samples": 96},
@@ -89,14 +88,14 @@ def downscaled(views: Sequence[View], divided: float) -> tuple[View, ...]:
 def fit_from_scratch(
     effort: Effort, still: MultiviewStill, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
-    """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost."""
+    """One point: a new field, ``seconds`` of fitting, its score on the held-out views and its cost."""
     model = make_field(effort.field, effort.options, seed=seed)
     still = replace(still, training=downscaled(still.training, effort.divided))
     model.warm_up()
     load = LoadMeter()
     report = model.fit(still.training, Budget(seconds=seconds))
     outside = load.outside_cores()
-    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
     return {
         "effort": effort.label,

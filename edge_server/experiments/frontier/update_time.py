@@ -1,7 +1,7 @@
-"""How long an update should take: a moving scene in virtual time, and fidelity at the present for each time.
+"""How long an update should take: fidelity at the present of a moving scene in virtual time, by update time.
 
-The field is warm (it has settled on the scene as it stood at the start) and keeps what it knows. A longer
-update fits the views it was given better; meanwhile they age, and so does everything it will show.
+The field is warm: it has converged on the first instant and is not reset. A longer update fits its views
+better, but they are older when it is published.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from freshfield.scenario import Scenario, parse
 SEEN_EVERY_S = 0.25
 # Publications of the first part of a run show the start more than the update time.
 _SETTLED_SHARE = 0.25
-# What updates cost is measured on so many short and long ones, their pictures so far apart.
+# To measure the cost of updates: steps of short and long ones, their number, time between their images.
 _FEW, _MANY, _UPDATES, _BETWEEN_NS = 4, 20, 5, 250_000_000
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 SEEN = ("seen_psnr_db", "seen_psnr_moving_db")
@@ -68,7 +68,7 @@ class MovingScene:
 
 
 class WarmStart:
-    """Cameras at one speed, which share what they rendered, and a field that has settled on the first
+    """Cameras at one speed, which share their renderings, and a field that has converged on the first
     instant."""
 
     def __init__(
@@ -95,11 +95,11 @@ class WarmStart:
         self.field.load_state(self._warm)
         update_s = compute.charge_ns(steps) / 1e9
         # 16 scores give the mean of a run as well as hundreds of them.
-        terms = RunSettings(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
+        settings = RunSettings(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
         settled_s = _SETTLED_SHARE * seconds
         viewer = ViewerScores(settled_s)
         deployment = build_deployment(
-            self.scenario, terms, field=self.field, scorer=Scorer(lpips), cameras=self.cameras,
+            self.scenario, settings, field=self.field, scorer=Scorer(lpips), cameras=self.cameras,
             on_published=lambda p: viewer.published(p, self.field),
         )  # fmt: skip
         viewer.truth = deployment.truth
@@ -121,10 +121,9 @@ class WarmStart:
 def measure_compute(
     moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int
 ) -> Compute:
-    """What updates of a warm field take on this machine where the scene moves and every image is new, as
-    virtual time charges them: ms_per_step for a step, ms_per_update for everything else (taking in the
-    images, finding and following what moved, a snapshot). Medians of ``_UPDATES`` short and as many long
-    updates."""
+    """Time of updates of a warm field on this machine where the scene moves and every image is new:
+    ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
+    snapshot). Medians of ``_UPDATES`` short and as many long updates."""
     start = WarmStart(moving, speed, field, options, 0, warm_steps)
     start.field.warm_up()
     taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
@@ -142,7 +141,7 @@ def measure_compute(
 
 
 class ViewerScores:
-    """Scores of what a viewer sees at evenly spaced instants: the newest publication, up to an update old."""
+    """Scores at evenly spaced instants of what a viewer sees: the newest publication, up to an update old."""
 
     def __init__(self, from_s: float) -> None:
         self.truth: Truth | None = None

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT, SCENES
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.fidelity.images import BLACK, Color
-from edge_server.fields import View
+from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fields import Field, View
 
 WHITE: Color = (1.0, 1.0, 1.0)
 
@@ -58,3 +61,10 @@ def smallest_angle_deg(still: MultiviewStill) -> float:
         np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
     ]
     return float(np.rad2deg(np.arccos(np.clip(forward[0] @ forward[1].T, -1.0, 1.0)).min()))
+
+
+def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
+    """Mean score over ``views``, and the rendering (H, W, 3) of the first."""
+    renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
+    scores = [scorer.score(v.camera, image, 0, v.image, 0) for v, image in zip(views, renderings)]
+    return mean_score(scores), renderings[0]

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.arguments import (
+    add_folders,
+    command_parser,
+    folders_of,
+    run_command,
+)
 from edge_server.experiments.studies.engine import Engine, StudyError
-from edge_server.experiments.studies.study import Ask, Verdict, run_study
-from edge_server.experiments.studies.trial import SCENARIOS, Folders
+from edge_server.experiments.studies.study import StudyRequest, run_study
+from edge_server.experiments.studies.trial import SCENARIOS
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
-from edge_server.fidelity.lpips_weights import weights_folder
 from freshfield.files import write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
@@ -41,9 +44,9 @@ STUDIES = {
     "semantics": ("learning.semantics", "Semantics"),
     "reward-cost": ("learning.reward_cost", "RewardCost"),
 }
-# Those of them that are made of cases, of which some can be asked for.
+# Studies that consist of cases: --case selects some of them.
 CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
-# Trainings, which go through no heap of trials: they take long, and are not part of "all".
+# Studies that train: they take long and are not part of "all".
 LEARNING = (
     "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
 )  # fmt: skip
@@ -88,31 +91,21 @@ Results are kept in OUT/trials by content; after Ctrl-C the same command goes on
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    folders = Folders(base, weights_folder(args.lpips, base))
+    folders = folders_of(args)
     scenes = tuple(args.scene.split(",")) if args.scene else None
-    ask = Ask(args.quick, args.out, folders, args.seeds, scenes, args.jobs, tuple(args.case), args.episodes)
-    names = [n for n in STUDIES if n not in LEARNING] if args.study == "all" else [args.study]
-    if args.study == "learning":
-        names = list(LEARNING)
+    request = StudyRequest(
+        args.quick, args.out, folders, args.seeds, scenes, args.jobs, tuple(args.case), args.episodes
+    )
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
-    try:
-        _check(ask, args.jobs)
-        if set(names) <= set(LEARNING) and (scenes or args.ray):
-            raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
-        if args.case and not set(names) <= set(CASED):
-            raise StudyError(f"--case is for {', '.join(CASED)}")
-        if args.episodes is not None and not set(names) <= set(LEARNING):
-            raise StudyError(f"--episodes is for {', '.join(LEARNING)}")
-        for name in names:
-            _run(name, ask, engine)
-    except (ScenarioError, DatasetError, StudyError, TrainingError) as error:
-        print(f"edge-server study: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; what is finished is in {engine.folder}: the same command goes on", flush=True)
-        return 130
-    return 0
+
+    def work() -> None:
+        names = {"all": [n for n in STUDIES if n not in LEARNING], "learning": list(LEARNING)}
+        for name in _checked(names.get(args.study, [args.study]), request, args.ray):
+            _run(name, request, engine)
+
+    errors = (ScenarioError, DatasetError, StudyError, TrainingError)
+    stopped = f"what is finished is in {engine.folder}: the same command goes on"
+    return run_command("study", work, errors, stopped)
 
 
 def make_study(name: str) -> Any:
@@ -121,39 +114,43 @@ def make_study(name: str) -> Any:
     return getattr(importlib.import_module(f"edge_server.experiments.studies.{module}"), cls)()
 
 
-def _run(name: str, ask: Ask, engine: Engine) -> list[Verdict]:
+def _run(name: str, request: StudyRequest, engine: Engine) -> None:
     study, began = make_study(name), time.monotonic()
-    ask.out.mkdir(parents=True, exist_ok=True)
     print(f"== {name}: {study.title}", flush=True)
-    verdicts = run_study(study, ask, engine)
+    verdicts = run_study(study, request, engine)
     for verdict in verdicts:
         print("  " + verdict.line())
     seconds = time.monotonic() - began
     found = {
-        "study": name, "title": study.title, "quick": ask.quick, "seconds": round(seconds, 1),
+        "study": name, "title": study.title, "quick": request.quick, "seconds": round(seconds, 1),
         "verdicts": [vars(v) for v in verdicts],
     }  # fmt: skip
-    write_json(ask.out / f"{name}.json", found)
-    print(f"  {seconds:.0f} s; {ask.out / name}.csv, .md, .json and figures", flush=True)
-    return verdicts
+    write_json(request.out / f"{name}.json", found)
+    print(f"  {seconds:.0f} s; {request.out / name}.csv, .md, .json and figures", flush=True)
 
 
-def _check(ask: Ask, jobs: int) -> None:
-    if ask.seeds is not None and not 1 <= ask.seeds <= 10_000:
-        raise StudyError(f"--seeds: expected 1 to 10000, got {ask.seeds}")
-    if ask.episodes is not None and not 1 <= ask.episodes <= SEEDS_A_PURPOSE:
-        raise StudyError(f"--episodes: expected 1 to {SEEDS_A_PURPOSE}, got {ask.episodes}")
-    if jobs < 1:
-        raise StudyError(f"--jobs: expected at least 1, got {jobs}")
-    for scene in ask.scenes or ():
+def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[str]:
+    """The names of studies, if the request suits all of them; else StudyError."""
+    if request.seeds is not None and not 1 <= request.seeds <= 10_000:
+        raise StudyError(f"--seeds: expected 1 to 10000, got {request.seeds}")
+    if request.episodes is not None and not 1 <= request.episodes <= SEEDS_A_PURPOSE:
+        raise StudyError(f"--episodes: expected 1 to {SEEDS_A_PURPOSE}, got {request.episodes}")
+    if request.jobs < 1:
+        raise StudyError(f"--jobs: expected at least 1, got {request.jobs}")
+    for scene in request.scenes or ():
         if scene not in SCENARIOS:
             raise StudyError(f"--scene {scene}: expected {', '.join(SCENARIOS)}")
+    if set(names) <= set(LEARNING) and (request.scenes or ray):
+        raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
+    if request.cases and not set(names) <= set(CASED):
+        raise StudyError(f"--case is for {', '.join(CASED)}")
+    if request.episodes is not None and not set(names) <= set(LEARNING):
+        raise StudyError(f"--episodes is for {', '.join(LEARNING)}")
+    return names
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server study", description=DESCRIPTION, formatter_class=raw)
-    cores = usable_cores()
+    parser = command_parser("study", DESCRIPTION)
     add = parser.add_argument
     add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
         help=f"{', '.join(STUDIES)}; all: those before ppo-select; learning: those from it on")  # fmt: skip
@@ -164,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         "learn in half an hour to an hour",
     )
     add("--seeds", type=int, metavar="N", help="repetitions of every point [the study's own]")
-    add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
+    add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")
     add(
         "--case",
         action="append",
@@ -176,12 +173,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--episodes", type=int, metavar="N", help="of one training, where there is one [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
     add("--scene", metavar="NAME,...", help=f"{', '.join(SCENARIOS)} [the study's own]")
-    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add(
-        "--lpips",
-        type=Path,
-        metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
-    )
+    add_folders(parser)
     add("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="[%(default)s]")
     return parser

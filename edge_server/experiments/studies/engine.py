@@ -18,23 +18,18 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import camera_node
-import channel_emu
-import edge_server
-import freshfield
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.result_store import content_key as key_of
-from edge_server.experiments.common.worker import init_worker
-from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
+from edge_server.experiments.common.source_digest import source_digest
+from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.studies.trial import Row, Trial, run_trial
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
 from freshfield.machine_load import usable_cores
 
 # Trials per task: enough to share images, few enough that Ctrl-C loses little work.
 _TRIALS_A_TASK = 6
-# Sources that do not affect a trial's result.
-_BESIDE = ("edge_server/page", "edge_server/report", "edge_server/experiments/studies")
-_DECIDES = "edge_server/experiments/studies/trial.py"
 
 
 class StudyError(RuntimeError):
@@ -107,7 +102,7 @@ class Engine:
     ) -> Iterator[tuple[list[str], list[Row]]]:
         # Fresh processes: forking one that has threads of kernels in it would hang.
         jobs = min(self.jobs, len(tasks))
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"), init_worker, (_threads_each(jobs),))
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), init_worker, (max(1, usable_cores() // jobs),))
         try:
             running: dict[Future[list[Row]], list[str]] = {
                 pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)
@@ -117,7 +112,7 @@ class Engine:
                 for future in finished:
                     yield running.pop(future), future.result()
         except BaseException:
-            _end_at_once(pool)
+            end_at_once(pool)
             raise
         pool.shutdown()
 
@@ -161,19 +156,6 @@ def content_key(trial: Trial, folders: Folders) -> str:
 
 
 @cache
-def source_digest() -> str:
-    """Of every Python file that can decide a trial's result."""
-    digest = hashlib.sha256()
-    for package in (freshfield, camera_node, channel_emu, edge_server):
-        root = Path(str(package.__file__)).parent
-        for path in sorted(root.rglob("*.py")):
-            name = f"{root.name}/{path.relative_to(root).as_posix()}"
-            if name == _DECIDES or not name.startswith(_BESIDE):
-                digest.update(name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-@cache
 def _data_digest(folder: Path | None, name: str | None) -> str | None:
     """Of a recorded data set: names and sizes of its files, and what its small ones say."""
     if name is None:
@@ -214,13 +196,3 @@ def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
         for group in groups.values()
         for i in range(0, len(group), _TRIALS_A_TASK)
     ]
-
-
-def _threads_each(jobs: int) -> int:
-    return max(1, usable_cores() // jobs)
-
-
-def _end_at_once(pool: ProcessPoolExecutor) -> None:
-    for process in list((pool._processes or {}).values()):
-        process.terminate()
-    pool.shutdown(wait=False, cancel_futures=True)

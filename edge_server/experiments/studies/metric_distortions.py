@@ -1,4 +1,4 @@
-"""Figure 3.6: what PSNR, SSIM and LPIPS say of a brightness shift, a blur and a ghost."""
+"""Figure 3.6: PSNR, SSIM and LPIPS of a brightness shift, a blur and a ghost."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
+from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.common.tables import write_csv
-from edge_server.experiments.studies.drawing import draw_pictures
-from edge_server.experiments.studies.statistics import interval, negated, paired
-from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, number
+from edge_server.experiments.studies.drawing import draw_images
+from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
@@ -27,15 +27,14 @@ Unit = NDArray[np.float32]
 
 
 def distortions(reference: Unit) -> dict[str, Unit]:
-    """Figure 3.6's three distortions of an image (H, W, 3) in [0, 1], each as strong as there: of its PSNR.
-
-    What SSIM and LPIPS then say can be compared; the PSNRs are alike by construction, as near as they go.
-    """
-    return {case: _as_strong(reference, case, THESIS[case][0]) for case in THESIS}
+    """Figure 3.6's three distortions of an image (H, W, 3) in [0, 1], each with the PSNR it has there, as
+    nearly as possible, so that SSIM and LPIPS can be compared."""
+    return {case: _with_psnr(reference, case, THESIS[case][0]) for case in THESIS}
 
 
 def distorted(reference: Unit, case: str, strength: float) -> Unit:
-    """One distortion: shift of all values, blur's sigma in widths, or weight of a shifted copy."""
+    """One distortion. strength: the shift of all values, the sigma of the blur in image widths, or the weight
+    of a shifted copy."""
     height, width = reference.shape[:2]
     if case == "brightness shift":
         return np.clip(reference + strength, 0.0, 1.0).astype(np.float32)
@@ -48,12 +47,12 @@ def distorted(reference: Unit, case: str, strength: float) -> Unit:
     return ghost
 
 
-# The strongest that is tried of each.
+# Highest strength of each.
 _STRONGEST = {"brightness shift": 0.5, "Gaussian blur": 0.1, "local ghosting": 1.0}
 
 
-def _as_strong(reference: Unit, case: str, wanted_db: float) -> Unit:
-    """By bisection: PSNR falls as the strength grows."""
+def _with_psnr(reference: Unit, case: str, wanted_db: float) -> Unit:
+    """The distortion that has a PSNR, by bisection: PSNR falls as the strength grows."""
     low, high = 0.0, _STRONGEST[case]
     for _ in range(24):
         middle = (low + high) / 2
@@ -67,16 +66,16 @@ class Metrics:
     name = "metrics"
     title = "What the three metrics say of three artefacts (figure 3.6)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         return []
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        lpips, missing = open_lpips(ask.folders.lpips)
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+        lpips, missing = open_lpips(request.folders.lpips)
         scores: dict[str, dict[str, list[float | None]]] = {}
-        pictures: list[tuple[str, Unit]] = []
+        examples: list[tuple[str, Unit]] = []
         scene = make_scene("room", {"count": 19, "width": 192, "height": 192})
         cameras = list(scene.cameras)
-        for seed in ask.repeats(8, 19):
+        for seed in request.repeats(8, 19):
             name = cameras[seed % len(cameras)]
             reference = scene.render(name, 0.3 * seed).astype(np.float32) / 255.0
             for case, image in distortions(reference).items():
@@ -85,16 +84,16 @@ class Metrics:
                 into["ssim"].append(ssim(image, reference))
                 if lpips is not None:
                     into["lpips"].append(lpips(image, reference))
-            if not pictures:
-                pictures = [("reference", reference), *distortions(reference).items()]
-        shown = [(label, (image * 255).astype(np.uint8)) for label, image in pictures]
-        draw_pictures(ask.out / "metrics.png", [("room", shown)])
+            if not examples:
+                examples = [("reference", reference), *distortions(reference).items()]
+        shown = [(label, (image * 255).astype(np.uint8)) for label, image in examples]
+        draw_images(request.out / "metrics.png", [("room", shown)])
         rows = []
         for case, found in scores.items():
             psnr_db, ssim_, lpips_ = (number(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
             rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_,
                          "seeds": len(found["psnr"])})  # fmt: skip
-        write_csv(ask.out / "metrics.csv", rows)
+        write_csv(request.out / "metrics.csv", rows)
         verdicts = [
             self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
             self._ordering(scores, "ssim", "highest for ghosting, against the prose",

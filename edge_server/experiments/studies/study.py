@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import number, write_csv
 from edge_server.experiments.studies.engine import Engine, StudyError
-from edge_server.experiments.studies.statistics import Interval, interval, paired
-from edge_server.experiments.studies.trial import Folders, Row, Trial
+from edge_server.experiments.studies.trial import Row, Trial
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.files import write_text
 
@@ -29,13 +31,23 @@ LEAST_DB = 0.1
 LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
 
 Curve = dict[float, dict[int, float | None]]
+# Recorded scenes and their file below the data folder.
+RECORDED = {
+    "kitchen": "blender_kitchen/transforms.json",
+    "people": "pose2sim_single_person/calibration_opencv.json",
+}
 
 
 @dataclass(frozen=True)
-class Ask:
-    """Requested settings; None or no case selects the study's default. seeds: repetitions per point. scenes:
-    a subset of those with local data. For studies that train, jobs: processes; cases: words in the names of
-    selected cases; episodes: number per training."""
+class StudyRequest:
+    """What the command asks for; None or no case selects the study's default.
+
+    quick: a small pass.
+    out: folder of tables and figures.
+    seeds: number of repetitions of a point.
+    jobs, cases, episodes: of studies that train: processes, words in the names of the selected cases, and
+        episodes of a training.
+    """
 
     quick: bool
     out: Path
@@ -47,8 +59,7 @@ class Ask:
     episodes: int | None = None
 
     def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
-        """Of a study's ``cases``, those that were asked for; of a quick pass that asked for none, ``quick``.
-        StudyError for one that there is not."""
+        """The selected cases: by default all, or ``quick`` in a quick pass. StudyError for an unknown one."""
         if not self.cases:
             return list(quick if self.quick else cases)
         if unknown := [word for word in self.cases if not any(word in case for case in cases)]:
@@ -62,16 +73,13 @@ class Ask:
         return self.episodes or episodes[self.quick]
 
     def repeats(self, quick: int, full: int) -> range:
+        """Seeds of a point: the requested number, else that of a quick or full pass."""
         return range(self.seeds or (quick if self.quick else full))
-
-    def pictured(self) -> dict[str, Any]:
-        """Size of pictures and steps of a fit."""
-        return {"size": 64, "steps": 150} if self.quick else {"size": 128, "steps": 400}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The thesis's claim, what was found here, and whether it holds. about: scene and setting, short."""
+    """The thesis's claim, the result here, and whether the claim holds. about: scene and setting."""
 
     about: str
     claim: str
@@ -84,7 +92,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Point:
-    """A trial and what a table calls it."""
+    """A trial and its labels in the table."""
 
     labels: Row
     trial: Trial
@@ -108,11 +116,11 @@ class Table:
         return [row for row in self.rows if all(row.get(k) == v for k, v in labels.items())]
 
     def values(self, metric: str, **labels: Any) -> dict[int, float | None]:
-        """seed -> value of the one point that the labels leave."""
+        """seed -> value of the point with these labels."""
         return {row["seed"]: row[metric] for row in self.where(**labels)}
 
     def curve(self, x: str, metric: str, **labels: Any) -> Curve:
-        """x -> seed -> value, for the points that have an x and, somewhere, a value."""
+        """x -> seed -> value, for the points that have an x and at least one value."""
         found: Curve = {}
         for row in self.where(**labels):
             if row.get(x) is not None:
@@ -130,23 +138,23 @@ class Study(Protocol):
     name: str
     title: str
 
-    def points(self, ask: Ask) -> list[Point]: ...
+    def points(self, request: StudyRequest) -> list[Point]: ...
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        """Draw the figures into ``ask.out`` and judge the claims."""
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+        """Draw the figures into ``request.out`` and judge the claims."""
         ...
 
 
-def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
+def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
     """Run what is missing, write OUT/NAME.csv, figures and OUT/NAME.md, return the verdicts."""
-    ask.out.mkdir(parents=True, exist_ok=True)
-    points = study.points(ask)
+    request.out.mkdir(parents=True, exist_ok=True)
+    points = study.points(request)
     table = Table(points, engine.run([p.trial for p in points], study.name))
     if table.rows:
-        write_csv(ask.out / f"{study.name}.csv", table.rows)
-    verdicts = study.report(ask, table)
+        write_csv(request.out / f"{study.name}.csv", table.rows)
+    verdicts = study.report(request, table)
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
-    write_text(ask.out / f"{study.name}.md", text)
+    write_text(request.out / f"{study.name}.md", text)
     return verdicts
 
 
@@ -160,15 +168,7 @@ def no_delay_gain(table: Table, metric: str, **labels: Any) -> str:
     if metric == "aaoi_ms":
         return f"with no delay it is {number(interval(list(limit.values())).mean, digits)}"
     nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
-    return (
-        f"no delay at all is {number(gap.mean, digits)} [{number(gap.low, digits)}, "
-        f"{number(gap.high, digits)}] better than use-all{nothing}"
-    )
-
-
-def mean_curve(curve: Curve) -> tuple[list[float], list[Interval]]:
-    """Points and intervals of a curve, as a plot takes them."""
-    return list(curve), [interval(list(values.values())) for values in curve.values()]
+    return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
 
 
 def by_bool(answer: bool | None) -> str:
@@ -176,16 +176,40 @@ def by_bool(answer: bool | None) -> str:
     return UNDECIDED if answer is None else HOLDS if answer else DOES_NOT_HOLD
 
 
-def with_data(ask: Ask, scenes: Sequence[str], needs: Callable[[str], str | None]) -> list[str]:
-    """Of ``scenes``, those asked for and there. needs: the file below the data folder, None: none."""
-    wanted = [s for s in (ask.scenes or scenes)]
+def scenes_of(request: StudyRequest, default: Sequence[str]) -> list[str]:
+    """The requested scenes, else ``default``, without recorded ones that are not below the data folder."""
+    wanted, data = list(request.scenes or default), request.folders.data
     found = []
     for scene in wanted:
-        file = needs(scene)
-        if file is None or (ask.folders.data is not None and (ask.folders.data / file).exists()):
+        file = RECORDED.get(scene)
+        if file is None or (data is not None and (data / file).exists()):
             found.append(scene)
         else:
             print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
     if not found:
         raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
     return found
+
+
+def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
+    """The usual trial of a scene, with the image size and the steps of the request. more: of ``Trial``."""
+    sized: Row = {"size": 64, "steps": 150} if request.quick else {"size": 128, "steps": 400}
+    if scene in RECORDED:
+        scale = 2.0 if request.quick else 1.0
+        sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
+    return Trial(scene=scene, **{**sized, **more})
+
+
+def policy_points(base: Trial, labels: Row, x: str, values: Mapping[str, Sequence[float]]) -> list[Point]:
+    """A point for every value of every policy.
+
+    base: the trial, of which only the policy is replaced.
+    labels: of all the points.
+    x: label that holds the value.
+    values: policy -> its values.
+    """
+    return [
+        Point({**labels, "policy": policy, x: value}, dataclasses.replace(base, policy=policy, value=value))
+        for policy, some in values.items()
+        for value in some
+    ]

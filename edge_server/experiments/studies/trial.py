@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 from camera_node.capture import Camera
 from camera_node.config import source_config
 from edge_server.config import read_config
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
+from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fidelity.scorer import Scorer
 from edge_server.live.state import Publication
 from freshfield.scenario import Scenario, ScenarioError, load, parse
 
@@ -101,25 +104,16 @@ class Trial:
         }  # fmt: skip
         return parse(data, Path(f"study {self.scene}"))
 
-    def terms(self) -> RunSettings:
-        first_ms = self.first_ms
+    def run_settings(self) -> RunSettings:
         return RunSettings(
             steps=self.steps,
             first_steps=self.first_steps,
             compute=Compute(**self.compute),
             epoch_ms=self.every_ms,
             grace_ms=0.0,
-            first_ms=first_ms,
+            first_ms=self.first_ms,
             scratch=self.scratch,
         )
-
-
-@dataclass(frozen=True)
-class Folders:
-    """Local folders for files outside the repository. data: recorded data sets. lpips: weights."""
-
-    data: Path | None = None
-    lpips: Path | None = None
 
 
 @dataclass
@@ -130,27 +124,15 @@ class Stage:
     truth: Truth | None
 
 
-class KnownTruth:
-    """A truth whose picture at an instant is scored against again and again."""
-
-    def __init__(self, truth: Any) -> None:
-        self._truth = truth
-        if hasattr(truth, "image"):  # exact: an analytic scene is rendered for every instant
-            self._truth = dataclasses.replace(truth, image=lru_cache(_TRUTHS_KEPT)(truth.image))
-
-    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
-        found: tuple[Any, Any, Any] = self._truth.view(camera, present_ns)
-        return found
-
-    def score(self, field: Any, present_ns: int) -> Score | None:
-        found: Score | None = self._truth.score(field, present_ns)
-        return found
-
-
 def run_trial(trial: Trial, folders: Folders) -> Row:
-    """Means over the trial's decisions: psnr_db, psnr_moving_db, ssim, lpips (None where there are none),
-    views, aaoi_ms (6.35: of the selected views at the present), age_sum_ms (5.8: of all cameras), wait_ms
-    (from decision to publication) and decisions. Raises ScenarioError or DatasetError."""
+    """Means over the trial's decisions.
+
+    psnr_db, psnr_moving_db, ssim, lpips: None where there are none. views: number of used views. aaoi_ms:
+    their mean age at publication (6.35). age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from
+    decision to publication. decisions: their number.
+
+    Raises ScenarioError or DatasetError.
+    """
     rows: list[Row] = []
     deployment: VirtualDeployment = _deploy(trial, folders, lambda p: rows.append(_row(p, deployment)))
     _finish(deployment, trial)
@@ -158,10 +140,10 @@ def run_trial(trial: Trial, folders: Folders) -> Row:
     if not kept:
         raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
     names = [n for n in kept[0] if n != "decisions"]
-    return {**{n: _mean([row[n] for row in kept]) for n in names}, "decisions": len(kept)}
+    return {**{n: mean_or_none([row[n] for row in kept]) for n in names}, "decisions": len(kept)}
 
 
-def picture(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:
+def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:
     """(truth, rendering, figures) of the trial's last decision on the held-out camera, uint8 (H, W, 3)."""
     found: list[tuple[NDArray[np.uint8], NDArray[np.uint8], Row]] = []
 
@@ -177,17 +159,16 @@ def picture(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[
 def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeployment:
     scenario = trial.scenario()
     stage = _stage(json.dumps(trial.stage), trial, folders)
-    deployment = build_deployment(
-        scenario, trial.terms(), field=_field(trial), cameras=stage.cameras, data=folders.data,
+    return build_deployment(
+        scenario, trial.run_settings(), field=_field(trial), cameras=stage.cameras, data=folders.data,
         on_published=on_published, truth=stage.truth,
     )  # fmt: skip
-    return deployment
 
 
 def _finish(deployment: VirtualDeployment, trial: Trial) -> None:
-    """Run until the last decision has been published, however long its policy waits."""
+    """Run until the last decision is published, however long its policy waits."""
     wanted = trial.settle + trial.decisions
-    # Up to just before the decision after the first, or an update would be made that nobody looks at.
+    # Stop just before the second decision, whose update may not be needed.
     deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
     for _ in range(4 * wanted + 16):
         if len(deployment.publications) >= wanted:
@@ -210,7 +191,7 @@ def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
     }
 
 
-# A process keeps a few stages: trials come grouped by their pictures.
+# A process keeps a few stages, because trials come grouped by their images.
 _STAGES: dict[tuple[str, Folders, bool], Stage] = {}
 _FIELDS: dict[str, Any] = {}
 
@@ -224,12 +205,14 @@ def _stage(key: str, trial: Trial, folders: Folders) -> Stage:
         lpips = open_lpips(folders.lpips)[0] if trial.lpips else None
         edge = read_config(scenario)
         truth = build_truth(scenario, source_config(scenario), edge, Scorer(lpips), folders.data)
-        _STAGES[at] = Stage(training_cameras(scenario, folders.data), truth and KnownTruth(truth))
+        if isinstance(truth, ExactTruth):  # every trial scores against the same images
+            truth = dataclasses.replace(truth, image=lru_cache(_TRUTHS_KEPT)(truth.image))
+        _STAGES[at] = Stage(training_cameras(scenario, folders.data), truth)
     return _STAGES[at]
 
 
 def _field(trial: Trial) -> Any:
-    """A field as new, of the trial's settings and seed: made once a process, for its kernels and memory."""
+    """A new field with the trial's settings; the object is reused within a process, for its memory."""
     from edge_server.fields.registry import make_field
 
     key = json.dumps([trial.field, trial.field_options], sort_keys=True)
@@ -250,8 +233,3 @@ def _shown(
     image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)
     color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
     return image, np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

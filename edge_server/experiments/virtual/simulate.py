@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import hashlib
 import json
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -17,10 +16,11 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
-from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
+from edge_server.fidelity.lpips_weights import Network, open_lpips
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
@@ -49,8 +49,7 @@ _PROGRESS_EVERY_S = 1.0
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    lpips = weights_folder(args.lpips, base)
+    folders = folders_of(args)
     try:
         scenario = _scenario(args)
         config = read_config(scenario)
@@ -64,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         metric, missing = None, None
         if config.lpips != "none":
-            metric, missing = open_lpips(lpips, cast(Network, config.lpips))
+            metric, missing = open_lpips(folders.lpips, cast(Network, config.lpips))
         scorer = Scorer(metric, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         decisions: DecisionLog | None = None
 
@@ -72,7 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if decisions is not None:
                 decisions.record(deployment.updates.policy, publication.number)
 
-        deployment = build_deployment(scenario, settings, scorer=scorer, data=base, on_published=published)
+        deployment = build_deployment(
+            scenario, settings, scorer=scorer, data=folders.data, on_published=published
+        )
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         if config.deadline_ms is not None:
@@ -206,8 +207,7 @@ def _compute(text: str) -> ComputeConfig:
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server simulate", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("simulate", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
     add("--seconds", type=float, default=10.0, metavar="S", help="of virtual time [%(default)g]")
@@ -218,9 +218,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
     add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
     add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
-    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--lpips", type=Path, metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+    add_folders(parser)
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
     add("--json", action="store_true", help="everything, as one JSON object")

@@ -1,23 +1,23 @@
-"""Equation 5.8: what the weight of timeliness does to the best threshold and the best wait."""
+"""Equation 5.8: the best threshold and the best wait against the weight of timeliness."""
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from edge_server.experiments.studies.age.max_age import GAMMAS, QUICK_GAMMAS, RECORDED, trial_of
-from edge_server.experiments.studies.statistics import Interval, move_of_optimum, optimum
+from edge_server.experiments.common.statistics import Interval, move_of_optimum, optimum
+from edge_server.experiments.studies.age.max_age import GAMMAS, QUICK_GAMMAS
 from edge_server.experiments.studies.study import (
-    Ask,
     Curve,
     Point,
     Row,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
-    with_data,
+    policy_points,
+    scenes_of,
+    trial_of,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
@@ -25,7 +25,7 @@ from edge_server.report.style import CYCLE, figure, label_lines
 LAMBDAS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
 QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
-# Whose ages count: as (5.8) is printed, those of all cameras at the edge; or of the used views, as (6.35).
+# Ages that count: those of all cameras at the edge, as (5.8) is printed, or of the used views, as (6.35).
 SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
 CLAIM = "a larger lambda buys freshness: the best omega falls (5.8)."
 
@@ -34,25 +34,25 @@ class Weighing:
     name = "lambda"
     title = "The weight of timeliness in the objective (equation 5.8)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room",), RECORDED.get):
-            for seed in ask.repeats(10, 40):
-                # The thresholds are the very trials of ``mat``: where that has been run, they are known.
-                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"})
+        for scene in scenes_of(request, ("room",)):
+            for seed in request.repeats(10, 40):
+                # The thresholds are the trials of ``mat`` and known where that study has been run.
+                base = trial_of(
+                    request, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"}
+                )
                 found.append(Point({"scene": scene, "policy": "all"}, base))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
-                for policy, values in (
-                    ("threshold", QUICK_GAMMAS if ask.quick else GAMMAS),
-                    ("wait", QUICK_WAITS if ask.quick else WAITS),
-                ):
-                    for omega in values:
-                        trial = dataclasses.replace(base, policy=policy, value=omega)
-                        found.append(Point({"scene": scene, "policy": policy, "omega_ms": omega}, trial))
+                values = {
+                    "threshold": QUICK_GAMMAS if request.quick else GAMMAS,
+                    "wait": QUICK_WAITS if request.quick else WAITS,
+                }
+                found += policy_points(base, {"scene": scene}, "omega_ms", values)
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         for row in table.rows:
             row["used_age_sum_ms"] = row["aaoi_ms"] * row["views"]
         verdicts = []
@@ -77,7 +77,7 @@ class Weighing:
                                 by_bool(_falls(move)),
                             )
                         )
-            with figure(ask.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
                 at = axes[0, 0]
                 for k, ((policy, label), xs) in enumerate(best.items()):
                     at.plot(
@@ -92,7 +92,7 @@ class Weighing:
 
 
 def _falls(move: Interval) -> bool | None:
-    """Whether the best omega falls: yes, no (it stays or rises), or the seeds do not tell."""
+    """Whether the best omega falls: yes, no (it stays or rises), or undecided."""
     if move.high < 0.0:
         return True
     return False if move.low >= 0.0 else None

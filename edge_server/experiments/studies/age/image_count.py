@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
+from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.studies.drawing import draw_metrics
-from edge_server.experiments.studies.statistics import interval, negated, paired
 from edge_server.experiments.studies.study import (
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
     number,
-    with_data,
+    scenes_of,
+    trial_of,
 )
 
 COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
@@ -33,28 +33,28 @@ class Images:
     name = "images"
     title = "Perceptual distance and age against the number of images (figures 6.5, 6.6)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, tuple(SCENES), RECORDED.get):
-            field = SCENES[scene][0] if scene in SCENES and not ask.quick else "splat"
-            for seed in ask.repeats(6, 40):
-                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5"}, field=field)
+        for scene in scenes_of(request, tuple(SCENES)):
+            field = SCENES[scene][0] if scene in SCENES and not request.quick else "splat"
+            for seed in request.repeats(6, 40):
+                base = trial_of(request, scene, seed=seed, channel={"preset": "ch5"}, field=field)
                 cameras = len(base.scenario().training)
                 found.append(Point({"scene": scene, "field": field, "policy": "all"}, base))
                 ideal = dataclasses.replace(base, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "field": field, "policy": "no delay"}, ideal))
-                for count in [c for c in (QUICK_COUNTS if ask.quick else COUNTS) if c <= cameras]:
+                for count in [c for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]:
                     trial = dataclasses.replace(base, policy="freshest-k", value=float(count))
                     found.append(Point({"scene": scene, "field": field, "images": count}, trial))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             field = table.where(scene=scene)[0]["field"]
             _, way, thesis = SCENES.get(scene, ("", "", "the same"))
             draw_metrics(
-                ask.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
+                request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
                 [(field, {"scene": scene})], f"{scene}, cameras {way}",
             )  # fmt: skip
             for metric, rises in (
@@ -76,8 +76,7 @@ class Images:
                         f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
                         f"from {xs[0]:g} to {xs[-1]:g} images {number(first, digits)} "
                         f"to {number(last, digits)}, "
-                        f"change {number(change.mean, digits)} [{number(change.low, digits)}, "
-                        f"{number(change.high, digits)}]; {no_delay_gain(table, metric, scene=scene)}.",
+                        f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}.",
                         by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
                     )
                 )

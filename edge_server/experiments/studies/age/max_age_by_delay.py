@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
+from edge_server.experiments.common.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
-    Curve,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
-    with_data,
+    policy_points,
+    scenes_of,
+    trial_of,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
 DELAYS_MS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0)
 QUICK_DELAYS_MS = (20.0, 60.0, 180.0)
-# The same thresholds at every delay: a grid that grows with the delay would make any best grow with it.
+# The same thresholds at every delay: in a grid that grows with the delay, any optimum would grow with it.
 GAMMAS = (30.0, 45.0, 60.0, 75.0, 90.0, 120.0, 165.0, 240.0, 330.0, 480.0, 700.0, 1000.0)
 QUICK_GAMMAS = (45.0, 75.0, 120.0, 180.0, 300.0, 500.0, 900.0)
 CLAIM = "the best threshold grows with the mean delay (5.8)."
@@ -34,23 +32,22 @@ class MatDelay:
     name = "mat-delay"
     title = "The best maximum age against the mean delay (figure 5.8)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room",), RECORDED.get):
-            for seed in ask.repeats(8, 40):
-                for delay in QUICK_DELAYS_MS if ask.quick else DELAYS_MS:
+        for scene in scenes_of(request, ("room",)):
+            for seed in request.repeats(8, 40):
+                for delay in QUICK_DELAYS_MS if request.quick else DELAYS_MS:
                     channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": delay}}
-                    base = trial_of(ask, scene, seed=seed, channel=channel, every_ms=1500.0)
+                    base = trial_of(request, scene, seed=seed, channel=channel, every_ms=1500.0)
                     labels = {"scene": scene, "delay_ms": delay}
                     found.append(Point({**labels, "policy": "all"}, base))
-                    for gamma in QUICK_GAMMAS if ask.quick else GAMMAS:
-                        trial = dataclasses.replace(base, policy="threshold", value=gamma)
-                        found.append(Point({**labels, "policy": "threshold", "gamma_ms": gamma}, trial))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"}, every_ms=1500.0)
+                    gammas = QUICK_GAMMAS if request.quick else GAMMAS
+                    found += policy_points(base, labels, "gamma_ms", {"threshold": gammas})
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"}, every_ms=1500.0)
                 found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             best: dict[str, dict[float, Optimum]] = {}
@@ -62,7 +59,7 @@ class MatDelay:
                         best[metric][delay] = optimum(curve, METRICS[metric][1])
                 if len(best[metric]) > 1:
                     verdicts.append(self._judge(table, scene, metric, best[metric]))
-            self._draw(ask, table, scene, best)
+            self._draw(request, table, scene, best)
         return verdicts
 
     def _judge(self, table: Table, scene: str, metric: str, best: dict[float, Optimum]) -> Verdict:
@@ -74,8 +71,8 @@ class MatDelay:
         inside = {d: o.interior(LEAST[metric]) for d, o in best.items()}
         without = [f"{d:g}" for d, yes in inside.items() if yes is not True]
         text = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
-        # On one grid for all delays, fidelity that only rises or only falls has its best at the same end of
-        # it at every delay: no slope, no claim.
+        # Fidelity that only rises or only falls has its best at the same end of the grid at every delay, so
+        # the slope is zero.
         none = f"; that it falls on both sides is not shown at {', '.join(without)} ms" if without else ""
         return Verdict(
             f"{scene}, {METRICS[metric][0]}",
@@ -85,8 +82,10 @@ class MatDelay:
             by_bool(slope.above(0.0)),
         )
 
-    def _draw(self, ask: Ask, table: Table, scene: str, best: dict[str, dict[float, Optimum]]) -> None:
-        with figure(ask.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
+    def _draw(
+        self, request: StudyRequest, table: Table, scene: str, best: dict[str, dict[float, Optimum]]
+    ) -> None:
+        with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
             top, bottom = axes[:, 0]
             for k, (metric, found) in enumerate(best.items()):
                 xs = [d * (1 + 0.02 * (k - 1.5)) for d in found]
@@ -96,8 +95,6 @@ class MatDelay:
                              label=METRICS[metric][0])  # fmt: skip
             label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
             for k, delay in enumerate(table.distinct("delay_ms")):
-                curve: Curve = table.curve(
-                    "gamma_ms", "psnr_moving_db", scene=scene, delay_ms=delay, policy="threshold"
-                )
-                draw_curve(bottom, curve, f"{delay:g} ms", k)
+                labels = {"scene": scene, "delay_ms": delay, "policy": "threshold"}
+                draw_curve(bottom, table.curve("gamma_ms", "psnr_moving_db", **labels), f"{delay:g} ms", k)
             label_lines(bottom, METRICS["psnr_moving_db"][0], "threshold (ms)")

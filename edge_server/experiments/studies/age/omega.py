@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import Any
 
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
-from edge_server.experiments.studies.drawing import Image, draw_metrics, draw_pictures
-from edge_server.experiments.studies.statistics import (
+from edge_server.experiments.common.statistics import (
     Interval,
     at_its_best,
     interval,
@@ -14,28 +12,30 @@ from edge_server.experiments.studies.statistics import (
     optimum,
     paired,
 )
+from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
+    RECORDED,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
-    number,
-    with_data,
+    policy_points,
+    scenes_of,
+    trial_of,
 )
-from edge_server.experiments.studies.trial import picture
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (15.0, 45.0, 75.0, 120.0, 240.0)
 # The thesis's two traffic states, and the optimum of threshold and the plateau of wait that it names (6.5).
 STATES = {"high": ("ch6-high", 50.0, 62.0), "low": ("ch6-low", 72.0, 105.0)}
 POLICIES = ("threshold", "wait", "wait-flush")
-PICTURED = (30.0, 60.0, 120.0)
+SHOWN = (30.0, 60.0, 120.0)
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "f_w")
-# A curve has reached its plateau where it is this near to its end.
+# A curve is on its plateau where it is this near to its best.
 _NEAR = {"psnr_db": 0.3, "psnr_moving_db": 0.3, "ssim": 0.01, "lpips": 0.01, "f_w": 0.05}
 
 
@@ -43,32 +43,30 @@ class Omega:
     name = "omega"
     title = "Threshold and wait against omega in two traffic states (figures 6.3, 6.4)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in with_data(ask, ("room", "kitchen", "people"), RECORDED.get):
+        for scene in scenes_of(request, ("room", "kitchen", "people")):
             ours = scene not in RECORDED
-            for seed in ask.repeats(6 if ours else 3, 40):
+            for seed in request.repeats(6 if ours else 3, 40):
                 for state, (preset, _, _) in STATES.items():
-                    if ask.quick and not ours and state == "low":
+                    if request.quick and not ours and state == "low":
                         continue
-                    base = trial_of(ask, scene, seed=seed, channel={"preset": preset}, every_ms=2400.0)
+                    base = trial_of(request, scene, seed=seed, channel={"preset": preset}, every_ms=2400.0)
                     labels = {"scene": scene, "state": state}
                     found.append(Point({**labels, "policy": "all", "omega_ms": None}, base))
-                    for policy in POLICIES:
-                        for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
-                            trial = dataclasses.replace(base, policy=policy, value=omega)
-                            found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
-                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                    omegas = QUICK_OMEGAS if request.quick else OMEGAS
+                    found += policy_points(base, labels, "omega_ms", dict.fromkeys(POLICIES, omegas))
+                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
                 found.append(Point({"scene": scene, "state": "-", "policy": "no delay"}, ideal))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             states = [s for s in STATES if table.where(scene=scene, state=s)]
             for state in states:
                 draw_metrics(
-                    ask.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
+                    request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
                     [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
                     f"{scene}, {state} traffic: from scratch, scored at the present",
                     [("use all", {"scene": scene, "state": state, "policy": "all"}),
@@ -78,7 +76,7 @@ class Omega:
                     verdicts += self._threshold(table, scene, state, metric)
                     for policy in POLICIES[1:]:
                         verdicts += self._wait(table, scene, state, metric, policy)
-        self._pictures(ask, table)
+        self._draw_instants(request, table)
         return verdicts
 
     def _threshold(self, table: Table, scene: str, state: str, metric: str) -> list[Verdict]:
@@ -87,14 +85,12 @@ class Omega:
             return []
         name, lower, digits = METRICS[metric]
         best = optimum(curve, lower)
-        loss = best.over_last
         return [
             Verdict(
                 f"{scene}, {state} traffic, threshold, {name}",
                 f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1).",
-                f"best at {best.x:g} ms{best.spread}, {number(loss.mean, digits)} "
-                f"[{number(loss.low, digits)}, {number(loss.high, digits)}] better than the largest omega; "
-                f"{no_delay_gain(table, metric, scene=scene, state=state)}.",
+                f"best at {best.x:g} ms{best.spread}, {best.over_last.text(digits)} better than the largest "
+                f"omega; {no_delay_gain(table, metric, scene=scene, state=state)}.",
                 by_bool(best.interior(LEAST[metric])),
             )
         ]
@@ -120,51 +116,44 @@ class Omega:
                 f"waiting longer never makes it worse by more than {_NEAR[metric]:g} "
                 f"(a plateau from {STATES[state][2]:g} ms on, 6.5.2)."
             )
-            # Not seen to fall is not enough: what it loses by the end must be known to be small.
+            # It is not enough that no fall is seen: the loss at the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))
         better = over.above(0.0) if not lower else negated(over.above(0.0))
         return [
             Verdict(
                 about,
                 claim,
-                f"best at {best.x:g} ms{best.spread}, {number(loss.mean, digits)} "
-                f"[{number(loss.low, digits)}, {number(loss.high, digits)}] better than the largest omega; "
+                f"best at {best.x:g} ms{best.spread}, {loss.text(digits)} better than the largest omega; "
                 f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on.",
                 by_bool(answer),
             ),
             Verdict(
                 about,
                 "better than threshold, each at its own best omega (6.5.2).",
-                f"difference {number(over.mean, digits)} "
-                f"[{number(over.low, digits)}, {number(over.high, digits)}].",
+                f"difference {over.text(digits)}.",
                 by_bool(better),
             ),
         ]
 
-    def _pictures(self, ask: Ask, table: Table) -> None:
+    def _draw_instants(self, request: StudyRequest, table: Table) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
-        rows = []
-        for scene in table.distinct("scene"):
-            for policy in ("threshold", "wait"):
-                shown: list[tuple[str, Image]] = []
-                for omega in PICTURED:
-                    trial = trial_of(
-                        ask, scene, seed=3, channel={"preset": "ch6-high"}, policy=policy, value=omega,
-                        lpips=False, every_ms=2400.0,
-                    )  # fmt: skip
-                    truth, rendering, row = picture(trial, ask.folders)
-                    if not shown:
-                        shown.append(("truth at the present", truth))
-                    label = f"{omega:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB"
-                    shown.append((label, rendering))
-                rows.append((f"{scene}, {policy}", shown))
-        if rows:
-            draw_pictures(ask.out / "omega-pictures.png", rows)
+        common: dict[str, Any] = {
+            "seed": 3,
+            "channel": {"preset": "ch6-high"},
+            "lpips": False,
+            "every_ms": 2400.0,
+        }
+        rows = [
+            (f"{s}, {p}", [trial_of(request, s, policy=p, value=v, **common) for v in SHOWN])
+            for s in table.distinct("scene")
+            for p in ("threshold", "wait")
+        ]
+        draw_trials(request.out / "omega-pictures.png", request, rows)
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:
-    """Best of ``policy`` minus best of threshold, paired by seed; each at the omega that is best for the
-    other seeds, so that neither is flattered by having been chosen."""
+    """Best of ``policy`` minus best of threshold, paired by seed, each at the omega that is best for the
+    other half of the seeds (see ``Optimum``)."""
     lower = METRICS[metric][1]
     ours, theirs = (
         at_its_best(table.curve("omega_ms", metric, policy=name, **labels), lower)

@@ -1,27 +1,28 @@
-"""Figure 6.7: is the trade the same whatever the representation?"""
+"""Figure 6.7: whether the trade-off is the same for every representation."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from edge_server.experiments.studies.age.max_age import trial_of
+from edge_server.experiments.common.statistics import optimum
 from edge_server.experiments.studies.drawing import draw_metrics
-from edge_server.experiments.studies.statistics import optimum
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
     number,
+    policy_points,
+    trial_of,
 )
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (30.0, 75.0, 120.0, 240.0)
-# Steps of one update: about as long as one of splat, on two cores.
+# Steps of one update that take about as long as one of splat on two cores.
 FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "voxel": 60, "tensorf": 150}
 QUICK_FIELDS = {"splat": 150, "ngp": 80, "voxel": 40}
 POLICIES = ("threshold", "wait")
@@ -32,30 +33,30 @@ class Representations:
     name = "representations"
     title = "Threshold and wait, by representation (figure 6.7)"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in ask.scenes or ("room",):
-            for field, steps in (QUICK_FIELDS if ask.quick else FIELDS).items():
-                for seed in ask.repeats(4, 20):
-                    base = trial_of(ask, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0)
+        for scene in request.scenes or ("room",):
+            for field, steps in (QUICK_FIELDS if request.quick else FIELDS).items():
+                for seed in request.repeats(4, 20):
+                    base = trial_of(
+                        request, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0
+                    )
                     base = dataclasses.replace(base, field=field, steps=steps)
                     ideal = dataclasses.replace(base, channel={"preset": "ideal"})
                     labels = {"scene": scene, "field": field}
                     found.append(Point({**labels, "policy": "all"}, base))
                     found.append(Point({**labels, "policy": "no delay"}, ideal))
-                    for policy in POLICIES:
-                        for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
-                            trial = dataclasses.replace(base, policy=policy, value=omega)
-                            found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
+                    omegas = QUICK_OMEGAS if request.quick else OMEGAS
+                    found += policy_points(base, labels, "omega_ms", dict.fromkeys(POLICIES, omegas))
         return found
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             fields = table.distinct("field")
             for policy in POLICIES:
                 draw_metrics(
-                    ask.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
+                    request.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
                     _METRICS,
                     [(f, {"scene": scene, "field": f, "policy": policy}) for f in fields],
                     f"{scene}, {policy}: from scratch",

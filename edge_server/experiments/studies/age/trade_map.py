@@ -1,7 +1,7 @@
-"""Where is there a trade at all? A map over speed, delay, memory of the field and cost of computing.
+"""Where the trade-off exists: a map over speed, delay, memory of the field and cost of computing.
 
-The thesis does not have it. Beside every policy stands the limit, no delay at all: where it is close to
-using everything, there is nothing to win, whatever a scheduler does.
+It is not in the thesis. The limit of every policy is no delay at all: where using all views is close to it,
+no scheduler can gain anything.
 """
 
 from __future__ import annotations
@@ -13,30 +13,31 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
-from edge_server.experiments.studies.statistics import Interval, at_its_best, optimum, paired, share_closed
+from edge_server.experiments.common.statistics import Interval, at_its_best, optimum, paired, share_closed
 from edge_server.experiments.studies.study import (
     DOES_NOT_HOLD,
     HOLDS,
     LEAST_DB,
+    RECORDED,
     UNDECIDED,
-    Ask,
     Point,
+    StudyRequest,
     Table,
     Verdict,
     number,
-    with_data,
+    scenes_of,
+    trial_of,
 )
 from edge_server.report.style import figure
 
-# What a step and an update of 18 new views cost: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
+# Cost of a step and of an update of 18 new views: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
 # and 4.0, 66 and 93).
 CHARGED = {"ms_per_step": 3.0, "ms_per_update": 70.0}
-# What treating a view of 64 x 64 takes there.
+# Time of treating a view of 64 x 64 there.
 COST_MS = {"mask": 0.5, "freshen": 4.0}
 PERIOD_MS = 30.0
 METRIC = "psnr_moving_db"
-# Thresholds and waits tried, in mean delays after one period.
+# Thresholds and waits, in mean delays after one period.
 THRESHOLDS, QUICK_THRESHOLDS = (0.5, 1.0, 2.0, 4.0), (0.75, 1.5, 3.0)
 WAITS, QUICK_WAITS = (0.5, 1.0, 2.0, 4.0), (1.0, 2.5)
 OWN = ("mask", "freshen")
@@ -44,7 +45,7 @@ OWN = ("mask", "freshen")
 
 @dataclass(frozen=True)
 class Cell:
-    """A place on the map."""
+    """A cell of the map."""
 
     scene: str
     speed: float | None
@@ -69,13 +70,13 @@ class Phase:
     name = "phase"
     title = "Where the trade between age and fidelity exists"
 
-    def points(self, ask: Ask) -> list[Point]:
+    def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for cell in self._cells(ask):
+        for cell in self._cells(request):
             ours = cell.scene not in RECORDED
-            for seed in ask.repeats(4 if ours else 3, 12):
-                base = self._trial(ask, cell, seed)
-                for policy, value in self._policies(ask, cell.delay_ms):
+            for seed in request.repeats(4 if ours else 3, 12):
+                base = self._trial(request, cell, seed)
+                for policy, value in self._policies(request, cell.delay_ms):
                     labels = {**cell.labels, "policy": policy, "omega_ms": value}
                     trial = dataclasses.replace(base, policy=policy, value=value)
                     if cell.compute == "charged" and policy in COST_MS:
@@ -86,9 +87,9 @@ class Phase:
                 found.append(Point({**cell.labels, "policy": "no delay", "omega_ms": None}, ideal))
         return found
 
-    def _cells(self, ask: Ask) -> Iterator[Cell]:
-        quick = ask.quick
-        for scene in with_data(ask, ("room", "kitchen", "people"), RECORDED.get):
+    def _cells(self, request: StudyRequest) -> Iterator[Cell]:
+        quick = request.quick
+        for scene in scenes_of(request, ("room", "kitchen", "people")):
             ours = scene not in RECORDED
             speeds: tuple[float | None, ...] = (None,)
             if ours:
@@ -98,7 +99,7 @@ class Phase:
                 delays = (60.0,)
             for speed in speeds:
                 for delay in delays:
-                    usual = delay == 60.0  # the thesis's mean; a quick pass looks at the others once
+                    usual = delay == 60.0  # the thesis's mean; a quick pass has one cell of the others
                     if usual or not quick:
                         yield Cell(scene, speed, delay, "scratch", "zero")
                     yield Cell(scene, speed, delay, "warm", "zero")
@@ -107,34 +108,29 @@ class Phase:
                     if not quick:
                         yield Cell(scene, speed, delay, "scratch", "charged")
 
-    def _trial(self, ask: Ask, cell: Cell, seed: int) -> Any:
+    def _trial(self, request: StudyRequest, cell: Cell, seed: int) -> Any:
         channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": cell.delay_ms}}
         more: dict[str, Any] = {"every_ms": 1500.0}
         if cell.scene not in RECORDED:
             more["speed_m_per_s"] = cell.speed
-        base = trial_of(ask, cell.scene, seed=seed, channel=channel, lpips=False, **more)
+        base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":
-            update: dict[str, Any] = {
-                "first_steps": 2 * base.steps,
-                "steps": base.steps // 3,
-                "settle": 2,
-                "decisions": 3,
-            }
-            base = dataclasses.replace(base, scratch=False, **update)
+            steps = {"first_steps": 2 * base.steps, "steps": base.steps // 3}
+            base = dataclasses.replace(base, scratch=False, settle=2, decisions=3, **steps)
         if cell.compute == "charged":
             base = dataclasses.replace(base, compute=CHARGED)
         return base
 
-    def _policies(self, ask: Ask, delay_ms: float) -> Iterator[tuple[str, float | None]]:
+    def _policies(self, request: StudyRequest, delay_ms: float) -> Iterator[tuple[str, float | None]]:
         yield "all", None
-        for share in QUICK_THRESHOLDS if ask.quick else THRESHOLDS:
+        for share in QUICK_THRESHOLDS if request.quick else THRESHOLDS:
             yield "threshold", PERIOD_MS + share * delay_ms
-        for share in QUICK_WAITS if ask.quick else WAITS:
+        for share in QUICK_WAITS if request.quick else WAITS:
             yield "wait", PERIOD_MS + share * delay_ms
         for name in OWN:
             yield name, None
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         cells = [Cell(*key) for key in dict.fromkeys(
             (r["scene"], r["speed_m_per_s"], r["delay_ms"], r["memory"], r["compute"]) for r in table.rows
         )]  # fmt: skip
@@ -142,7 +138,7 @@ class Phase:
         for cell in cells:
             for metric, name in (("psnr_moving_db", "moving pixels"), ("psnr_db", "whole image")):
                 verdicts += self._judge(table, cell, metric, name)
-        self._draw(ask, table, cells)
+        self._draw(request, table, cells)
         return verdicts
 
     def _judge(self, table: Table, cell: Cell, metric: str, name: str) -> list[Verdict]:
@@ -182,12 +178,12 @@ class Phase:
             )
         return found
 
-    def _draw(self, ask: Ask, table: Table, cells: list[Cell]) -> None:
-        """A map a scene: speed up, delay across; colour: gain of the best policy over use-all."""
+    def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:
+        """Draw speed against delay for each scene, coloured by the gain of the best policy over use-all."""
         for scene in table.distinct("scene"):
             mine = [c for c in cells if c.scene == scene]
             kinds = list(dict.fromkeys((c.memory, c.compute) for c in mine))
-            with figure(ask.out / f"phase-{scene}.png", len(kinds), 1, height_inch=2.2) as (_, axes):
+            with figure(request.out / f"phase-{scene}.png", len(kinds), 1, height_inch=2.2) as (_, axes):
                 for at, kind in zip(axes[:, 0], kinds):
                     shown = [c for c in mine if (c.memory, c.compute) == kind]
                     self._draw_map(at, table, shown, f"{scene}, {kind[0]}, compute {kind[1]}: moving pixels")
@@ -217,7 +213,7 @@ class Phase:
 
 
 def _best(table: Table, cell: Cell, metric: str, policy: str) -> tuple[float, dict[int, float]]:
-    """The policy's best omega over the seeds, and its values at its best as other seeds chose it."""
+    """Best omega of a policy over the seeds, and seed -> value at the omega that the other half chose."""
     curve = table.curve("omega_ms", metric, policy=policy, **cell.labels)
     if not curve:
         return float("nan"), {}

@@ -1,4 +1,4 @@
-"""The channel changes during use: how a fixed policy, a learnt one and one that is still learning take it."""
+"""The channel changes during use: rewards of a fixed policy, a trained one and one that keeps learning."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     RUNS,
     StudyTrainer,
@@ -17,15 +16,15 @@ from edge_server.experiments.studies.learning.setup import (
     TrainingStudy,
     better,
     room,
+    simple_policies,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
+from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.choices import choose, named
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.episode import DecisionPoint
-from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals
+from edge_server.experiments.training.scheduler.evaluation import PerSeed
 from edge_server.experiments.training.scheduler.report import smoothed
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, seeds
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
@@ -36,13 +35,13 @@ from edge_server.scheduler.learned.state import StateLayout
 from edge_server.scheduler.online.online_policy import OnlinePolicy, OnlineSettings
 
 EPISODES = {True: 40, False: 600}
-# Of one run, before and after the change.
+# Episodes of one run before and after the change.
 BEFORE, AFTER = 10, 60
-# Episodes whose rewards come back together: live, they come some seconds after the decisions.
-_TOGETHER = 5
+# Episodes whose rewards arrive together: live, rewards arrive some seconds after the decisions.
+_EPISODES_TOGETHER = 5
 AGE = -0.003
 PRICE = 0.003
-# The nearest to the camera that rewards.
+# The camera nearest to the one that rewards.
 DYING = "cam01"
 NOTHING_LOST, NOT_WITHIN = "nothing was lost", "not within the run"
 POLICIES = ("fixed", "learnt", "still learning", "learnt afterwards")
@@ -52,9 +51,12 @@ Rewards = dict[str, list[float]]
 
 @dataclass(frozen=True)
 class Change:
-    """The channel before and after, and a camera that is gone afterwards. price: what a view takes off the
-    reward; above 0, what is learnt selects views one by one instead of choosing a threshold of age: there,
-    which cameras there are is what a decision depends on."""
+    """The channel before and after.
+
+    gone: camera that sends nothing afterwards.
+    price: cost of a view in the reward. Above 0 the policy selects single views instead of a threshold of
+        age, so its decision depends on which cameras there are.
+    """
 
     before: dict[str, Any]
     after: dict[str, Any]
@@ -62,11 +64,11 @@ class Change:
     price: float = 0.0
 
     def settings(self) -> tuple[Setting, Setting]:
-        """What decisions are made in, before and after."""
+        """The settings of decisions before and after the change."""
         return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
 
     def config(self, trainer: StudyTrainer, episodes: int, training: int) -> TrainingConfig:
-        """What is learnt of either."""
+        """What is trained, before and after the change."""
         parts = StateLayout(("age", "pose"))
         if self.price:
             reward = dataclasses.replace(trainer.reward("set"), views=-self.price)
@@ -78,7 +80,7 @@ class Change:
 
 
 def changes() -> dict[str, Change]:
-    """By name."""
+    """The changes by name."""
     usual = {"preset": "ch5"}
     slow = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 200.0}}
     return {
@@ -94,40 +96,37 @@ class Drift(TrainingStudy):
     name = "drift"
     title = "The channel changes during use: fixed, learnt, and still learning"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
-        found: list[Verdict] = []
-        written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
-            known = changes()
-            for name in ask.chosen(list(known), list(known)[:1]):
-                trainings = RUNS[ask.quick]
-                each = max(1, len(ask.repeats(3, 9)) // trainings)
-                runs = [
-                    [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
-                    for training in range(trainings)
-                ]  # fmt: skip
-                found += judge(f"room, {name}", runs)
-                together = [run for of in runs for run in of]
-                _draw(ask, name, together)
-                written += [
-                    {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
-                    for r, run in enumerate(together) for policy, values in run.items()
-                    for k, value in enumerate(values)
-                ]  # fmt: skip
-        write_csv(ask.out / f"{self.name}.csv", written)
-        return found
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+        verdicts: list[Verdict] = []
+        rows: list[Row] = []
+        known = changes()
+        for name in request.chosen(list(known), list(known)[:1]):
+            trainings = RUNS[request.quick]
+            each = max(1, len(request.repeats(3, 9)) // trainings)
+            runs = [
+                [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
+                for training in range(trainings)
+            ]  # fmt: skip
+            verdicts += judge(f"room, {name}", runs)
+            all_runs = [run for of in runs for run in of]
+            _draw(request, name, all_runs)
+            rows += [
+                {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
+                for r, run in enumerate(all_runs) for policy, values in run.items()
+                for k, value in enumerate(values)
+            ]  # fmt: skip
+        return verdicts, rows
 
 
 def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, run: int) -> Rewards:
-    """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
+    """Rewards of every decision by policy, scored by the reporting cameras. All policies decide at the same
+    instants."""
     before, after = change.settings()
-    config = change.config(trainer, trainer.ask.training_episodes(EPISODES), training)
+    config = change.config(trainer, trainer.request.training_episodes(EPISODES), training)
     reward, priced = config.reward, "priced-" * bool(change.price)
     home = trainer.train_one(TrainingRun(f"drift-before-{priced}{training}", before, config))
     there = trainer.train_one(TrainingRun(f"drift-{name.replace(' ', '-')}-{training}", after, config))
-    thresholds = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random",))
-    chosen = trainer.evaluate(before, thresholds, reward, 6, seed=7)
+    chosen = trainer.evaluate(before, simple_policies("threshold", ("random",)), reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
     policies: dict[str, Policy] = {
@@ -138,7 +137,7 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
             fixed(rng),
             "still learning",
             rng,
-            OnlineSettings(warmup=0),  # as it is shipped, but for its first look at a deployment
+            OnlineSettings(warmup=0),  # the shipped settings without a warm-up
         ),
         "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
     }
@@ -146,8 +145,8 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
     number = 0
     for setting, count, first in ((before, BEFORE, 0), (after, AFTER, BEFORE)):
         numbers = seeds(run + 1, "test", count, first)
-        for start in range(0, count, _TOGETHER):
-            part = numbers[start : start + _TOGETHER]
+        for start in range(0, count, _EPISODES_TOGETHER):
+            part = numbers[start : start + _EPISODES_TOGETHER]
             moments = [m for episode in trainer.pool.draw(setting, part) for m in episode]
             for policy in POLICIES:
                 rewards[policy] += _decide(trainer, setting, policies[policy], moments, reward, number)
@@ -163,12 +162,12 @@ def _decide(
     reward: Reward,
     first: int,
 ) -> list[float]:
-    """Rewards of decisions that are numbered from ``first`` on, as the reporting cameras have them; one that
-    learns learns from those of the rewarding ones."""
-    asked = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
+    """Rewards of decisions, which are numbered from ``first`` on, scored by the reporting cameras. An online
+    policy learns from the scores of the rewarding ones."""
+    requests = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
 
     def totals(of: Setting) -> list[float | None]:
-        found = [reward.of(outcome) for outcome in trainer.pool.evaluate(of, asked)]
+        found = [reward.of(outcome) for outcome in trainer.pool.evaluate(of, requests)]
         return [r.total if r.complete else None for r in found]
 
     if isinstance(policy, OnlinePolicy):
@@ -179,8 +178,10 @@ def _decide(
 
 
 def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
-    """Over the second half of what follows the change, when there has been time to learn. runs: of each
-    training."""
+    """Verdicts over the second half of the decisions after the change, when there was time to learn.
+
+    runs: the runs of each training.
+    """
 
     def late(policy: str) -> list[PerSeed]:
         return [{r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :]))
@@ -200,9 +201,11 @@ def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
 
 
 def recovery(run: Rewards) -> int | str:
-    """Decisions after the change until the one that learns has made up half of what the change cost the
-    learnt one, beside one learnt on the new channel; or, in words, that it cost nothing or is not made up
-    within the run."""
+    """Number of decisions after the change until the online policy has recovered half of the loss.
+
+    The loss is the difference between the policy trained on the old channel and the one trained on the new.
+    Or a text: that nothing was lost, or that the run is too short.
+    """
     mine, old, new = (smoothed(_after(run[p]), 40) for p in ("still learning", "learnt", "learnt afterwards"))
     lost = float(np.nanmean(new - old))
     if not lost > 0.0:
@@ -215,8 +218,8 @@ def _after(values: list[float]) -> np.ndarray:
     return np.array(values[len(values) * BEFORE // (BEFORE + AFTER) :])
 
 
-def _draw(ask: Ask, name: str, runs: list[Rewards]) -> None:
-    with figure(ask.out / f"drift-{name.replace(' ', '-')}.png", 1, height_inch=3.2) as (_, axes):
+def _draw(request: StudyRequest, name: str, runs: list[Rewards]) -> None:
+    with figure(request.out / f"drift-{name.replace(' ', '-')}.png", 1, height_inch=3.2) as (_, axes):
         at = axes[0, 0]
         for k, policy in enumerate(POLICIES):
             mean = np.nanmean([run[policy] for run in runs], axis=0)

@@ -1,12 +1,11 @@
-"""Figure 5.9: single-step PPO that selects views (5.17-5.24), against everything that does not learn."""
+"""Figure 5.9: single-step PPO that selects views (5.17-5.24), against policies without learning."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
     Nearest,
@@ -20,43 +19,43 @@ from edge_server.experiments.studies.learning.setup import (
     paired_difference,
     room,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.statistics import interval
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.evaluation import (
+    BASELINE_POLICIES,
     HINDSIGHT,
+    Candidate,
     Evaluation,
     PerSeed,
-    rivals,
     rows,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
-# The thesis's gain (5.6.2), its first hundred episodes counted as random.
+# The thesis's gain (5.6.2) over its first hundred episodes, which it counts as random.
 THESIS_PERCENT = 16.7
-# 30 minutes on an RTX 4090 (5.6.2); what is asked of two cores.
+# Training time in the thesis, on an RTX 4090 (5.6.2), and the limit for two cores.
 THESIS_MINUTES, WANTED_MINUTES = 30, 15
-# Where the reward looks from: one camera, as in the thesis, or four all round, so that serving one viewpoint
-# is not all that there is to learn.
+# Cameras that reward: one, as in the thesis, or four all round, so that a policy cannot serve one viewpoint
+# alone.
 VIEWPOINTS = {"one viewpoint": ("cam00",), "four viewpoints": FOUR_VIEWPOINTS}
-# (PSNR of what, viewpoints, whether updates begin with nothing, what a view takes off the reward): the first
-# is the thesis's. Where views are free hardly any ever harms, so that using all is hard to beat.
+# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view): the first is the
+# thesis's. Without a cost hardly any view ever harms, so using all is hard to beat.
 CASES = (
     ("whole", "one viewpoint", True, 0.0), ("whole", "one viewpoint", False, 0.0),
     ("moving", "one viewpoint", False, 0.0), ("whole", "four viewpoints", False, 0.0),
     ("whole", "four viewpoints", False, 0.003),
 )  # fmt: skip
-# By whether updates begin with nothing.
+# Name of the field's start, by whether updates start from scratch.
 FIELDS = {True: "from nothing", False: "warm"}
-# So many cameras about the held-out one: is what is learnt more than from where the field is looked at?
+# Numbers of cameras nearest to the held-out ones: does a policy learn more than the viewpoint?
 NEAREST = (6, 9, 12)
-# Of one training; by whether it is a quick pass.
+# Episodes of one training, by whether it is a quick pass.
 EPISODES = {True: 120, False: 600}
 
 
@@ -64,47 +63,43 @@ class PpoSelect(TrainingStudy):
     name = "ppo-select"
     title = "A scheduler that learns which views to use (figure 5.9)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
         verdicts: list[Verdict] = []
-        written: list[dict[str, Any]] = []
-        count = len(ask.repeats(10, 100))
-        with StudyTrainer(ask) as trainer:
-            cases = {_called(*case): case for case in CASES}
-            for case in ask.chosen(list(cases), list(cases)):
-                on, viewpoints, scratch, price = cases[case]
-                held_out = VIEWPOINTS[viewpoints]
-                field = FIELDS[scratch]
-                setting = room("ch5", held_out=held_out, scratch=scratch)
-                reward, spec = trainer.reward("set", on), Spec("select", StateLayout(("age", "pose")))
-                reward = dataclasses.replace(reward, views=-price)
-                name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
-                trained = trainer.train_repeats(
-                    name, setting, TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
-                )
-                mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
-                evaluation = trainer.evaluate(setting, {**_rivals(setting), **mine}, reward, count)
-                verdicts += [*judge(about, evaluation), _time(about, trained)]
-                labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
-                written += rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
-                few = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all"))
-                same = trainer.evaluate_as_rewarded(setting, {**few, **mine}, reward, count)
-                verdicts += _as_rewarded(about, same)
-                written += rows(same, **labels, judged_from="the same")
-                level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
-                draw_curve(ask.out / f"{trained[0].run.name}.png", trained[0].rows, level)
-        write_csv(ask.out / f"{self.name}.csv", written)
-        return verdicts
+        found: list[Row] = []
+        count = len(request.repeats(10, 100))
+        cases = {_case_name(*case): case for case in CASES}
+        for case in request.chosen(list(cases), list(cases)):
+            on, viewpoints, scratch, price = cases[case]
+            held_out = VIEWPOINTS[viewpoints]
+            field = FIELDS[scratch]
+            setting = room("ch5", held_out=held_out, scratch=scratch)
+            reward, spec = trainer.reward("set", on), Spec("select", StateLayout(("age", "pose")))
+            reward = dataclasses.replace(reward, views=-price)
+            name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
+            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
+            trained = trainer.train_repeats(name, setting, config)
+            mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
+            evaluation = trainer.evaluate(setting, {**_baselines(setting), **mine}, reward, count)
+            verdicts += [*judge(about, evaluation), _time(about, trained)]
+            labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
+            found += rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
+            few = simple_policies("threshold")
+            same = trainer.evaluate_as_rewarded(setting, {**few, **mine}, reward, count)
+            verdicts += _as_rewarded(about, same)
+            found += rows(same, **labels, judged_from="the same")
+            level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
+            draw_curve(request.out / f"{trained[0].run.name}.png", trained[0].rows, level)
+        return verdicts, found
 
 
-def _called(on: str, viewpoints: str, scratch: bool, price: float) -> str:
+def _case_name(on: str, viewpoints: str, scratch: bool, price: float) -> str:
     return f"{on}, {viewpoints}, {FIELDS[scratch]}{f', priced, {price:g} a view' if price else ''}"
 
 
-def _rivals(setting: Setting) -> dict[str, Any]:
-    """Everything that does not learn; those that know the held-out viewpoint, too."""
+def _baselines(setting: Setting) -> dict[str, Candidate]:
+    """All policies without learning, and those that know the held-out viewpoint."""
     near = {f"nearest:{k}": _nearest(setting, k) for k in NEAREST}
-    return {**rivals(OMEGAS_MS["threshold"], ["threshold"]), **near}
+    return {**simple_policies("threshold", BASELINE_POLICIES), **near}
 
 
 def _nearest(setting: Setting, k: int) -> Maker:
@@ -113,10 +108,10 @@ def _nearest(setting: Setting, k: int) -> Maker:
 
 
 def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
-    """What the contest says of the thesis's claims and ours."""
+    """The verdicts on the thesis's claims and on ours."""
     mine, random = runs_of(evaluation, "learnt"), evaluation.rewards("random")
     best, best_name = evaluation.best_fixed("threshold")
-    varies = evaluation.varies("threshold")
+    best_values = evaluation.best_values("threshold")
     over_named = paired_difference(mine, evaluation.rewards(best_name))
     return [
         better(about, f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes "
@@ -130,15 +125,15 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
         _viewpoint(about, evaluation, mine),
         _share(about, evaluation, mine, best),
         Verdict(about, "the best threshold differs between decisions: who knew it beforehand would win.",
-                f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
-                f"{span(varies['gain'])} over the best fixed one, as another fit has it; "
+                f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+                f"{span(best_values['gain'])} over the best fixed one, as another fit has it; "
                 "whether the state tells it is another question.",
-                by_bool(varies["gain"].above(0.0))),
+                by_bool(best_values["gain"].above(0.0))),
     ]  # fmt: skip
 
 
 def others(evaluation: Evaluation) -> list[str]:
-    """Policies without learning, thresholds and random aside."""
+    """Names of the policies without learning, thresholds and random aside."""
     known = ("learnt", "threshold:", "nearest:")
     return [n for n in evaluation.outcomes if not n.startswith(known) and n != "random"]
 
@@ -152,8 +147,7 @@ def _viewpoint(about: str, evaluation: Evaluation, mine: Runs) -> Verdict:
 
 
 def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
-    """What was learnt from a viewpoint's reward, judged from the same viewpoint: what training itself could
-    see, beside what was asked for."""
+    """Verdicts on the trained policies, judged by the cameras that rewarded them."""
     mine, (best, name) = runs_of(evaluation, "learnt"), evaluation.best_fixed("threshold")
     random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
@@ -184,8 +178,8 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
         f"{span(share, 2)} of the way to hindsight ({top:.4f}, the best of all that was tried at each "
         "decision, chosen by one fit and measured by another); the best fixed threshold has "
         f"{span(theirs, 2)}{alone}.",
-        # Where the limit is no better than random there is no share; halfway is still well defined, and so is
-        # an interval over trainings.
+        # Where the limit is no better than random there is no share; half of the way is still defined, and so
+        # is an interval over trainings.
         by_bool(above.above(0.0)),
     )  # fmt: skip
 
@@ -196,7 +190,7 @@ def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
     if one.jobs != 2:
         text = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
         return Verdict(about, "training is quick on 2 cores.", text, by_bool(None))
-    if carried_out < fits / 2:  # known from another training: how long it would have taken is not measured
+    if carried_out < fits / 2:  # most fits are known from another training: their time is not measured
         return Verdict(about, "training is quick.", "most of its fits were known already.", by_bool(None))
     a_fit, a_decision = one.seconds / carried_out, fits / sum(row["decisions"] for row in one.rows)
     minutes = a_fit * a_decision * 2400 / 60.0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.common.statistics import Interval, crossed
 from edge_server.experiments.studies.learning.predictability import by_ages
 from edge_server.experiments.studies.learning.setup import (
     StudyTrainer,
@@ -17,31 +16,30 @@ from edge_server.experiments.studies.learning.setup import (
     paired_difference,
     room,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.statistics import Interval, crossed
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
-from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, seeds
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Action, Spec
 from edge_server.scheduler.learned.state import StateLayout
 
 KINDS: tuple[Action, ...] = ("wait", "threshold")
-# The thesis's weight of a millisecond of age, and a fifth of it: with its own (6.5) one young view beats any
-# number of views that are 30 ms older, and there is little left to decide.
+# The thesis's weight of a millisecond of age, and a fifth of it: with the thesis's (6.5) one young view beats
+# any number of views that are 30 ms older, so there is little to decide.
 THESIS_AGE, LESS_AGE = -0.015, -0.003
-# (channel, weight of age, pixels whose PSNR counts). ch6: a traffic state lasts 30 ms, less than a decision;
-# ch6-slow: 3 s, many; swing: 3 s too, and the states differ in what is best.
+# (channel, weight of age, pixels of the PSNR). A traffic state of ch6 lasts 30 ms, less than a decision; one
+# of ch6-slow and swing lasts 3 s, and the best omega differs between the states of swing.
 QUICK_CASES = (("swing", LESS_AGE, "whole"), ("ch6-slow", THESIS_AGE, "whole"))
 CASES = (
     *QUICK_CASES, ("swing", LESS_AGE, "moving"), ("ch6", THESIS_AGE, "whole"), ("swing", THESIS_AGE, "whole"),
     ("ch6-slow", LESS_AGE, "whole"), ("ch6", LESS_AGE, "whole"),
 )  # fmt: skip
-# What the thesis has by waiting over thresholds (6.5.3).
+# The thesis's gain of waiting over thresholds (6.5.3).
 THESIS_PERCENT = 6
-# Of one training; by whether it is a quick pass.
+# Episodes of one training, by whether it is a quick pass.
 EPISODES = {True: 90, False: 600}
 
 
@@ -49,49 +47,43 @@ class PpoWait(TrainingStudy):
     name = "ppo-wait"
     title = "A scheduler that learns how long to wait, or how old is too old (figure 6.8)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
         verdicts: list[Verdict] = []
-        written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
-            cases = {named(*case): case for case in CASES}
-            for case in ask.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
-                channel, age, pixels = cases[case]
-                setting, mark = room(channel), "-moving" if pixels == "moving" else ""
-                reward = dataclasses.replace(trainer.reward("corrected", pixels), age=age)
-                everybody: dict[str, Any] = {}
-                for kind in KINDS:
-                    spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
-                    config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
-                    trained = trainer.train_repeats(
-                        f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, config
-                    )
-                    everybody |= rivals(OMEGAS_MS[kind], [kind], ("random", "all"))
-                    everybody |= named_runs(f"learnt-{kind}", trained)
-                count = len(ask.repeats(16, 100))
-                evaluation = trainer.evaluate(setting, everybody, reward, count)
-                moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
-                verdicts += judge(case, channel, evaluation)
-                verdicts += [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
-                written += rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
-        write_csv(ask.out / f"{self.name}.csv", written)
-        return verdicts
+        found: list[Row] = []
+        cases = {named(*case): case for case in CASES}
+        for case in request.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
+            channel, age, pixels = cases[case]
+            setting, mark = room(channel), "-moving" if pixels == "moving" else ""
+            reward = dataclasses.replace(trainer.reward("corrected", pixels), age=age)
+            candidates: dict[str, Candidate] = {}
+            for kind in KINDS:
+                spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
+                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+                trained = trainer.train_repeats(f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, config)
+                candidates |= {**simple_policies(kind), **named_runs(f"learnt-{kind}", trained)}
+            count = len(request.repeats(16, 100))
+            evaluation = trainer.evaluate(setting, candidates, reward, count)
+            moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
+            verdicts += judge(case, channel, evaluation)
+            verdicts += [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
+            found += rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
+        return verdicts, found
 
 
 def named(channel: str, age: float, pixels: str) -> str:
-    """What a case is called."""
+    """Name of a case."""
     where = ", where it moves" if pixels == "moving" else ""
     return f"{channel}{where}, age {age:g}/ms"
 
 
 def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
-    """What a case's contest says of the thesis's claims and ours."""
+    """The verdicts of a case on the thesis's claims and on ours."""
     found = []
     trained = {kind: runs_of(evaluation, f"learnt-{kind}") for kind in KINDS}
     for kind in KINDS:
         about, mine = f"room, {case}, {kind}", trained[kind]
         best, name = evaluation.best_fixed(kind)
-        varies = evaluation.varies(kind)
+        best_values = evaluation.best_values(kind)
         same = paired_difference(mine, evaluation.rewards(name))
         text = (
             f"the best is {name}, over which it has {span(same)} where that is known from the very seeds it "
@@ -109,10 +101,10 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
         )  # fmt: skip
         found.append(
             Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
-                    f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
-                    f"{span(varies['gain'])} over the best fixed one, as another fit has it; learnt "
+                    f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+                    f"{span(best_values['gain'])} over the best fixed one, as another fit has it; learnt "
                     f"{span(crossed(mine))}.",
-                    by_bool(varies["gain"].above(0.0)))
+                    by_bool(best_values["gain"].above(0.0)))
         )  # fmt: skip
     wait, threshold = trained["wait"], trained["threshold"]
     found.append(
@@ -123,7 +115,7 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
 
 
 def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
-    """Whether there is anything to be learnt: gain as ``by_ages`` has it."""
+    """Whether there is anything to learn. gain: of ``by_ages``."""
     return Verdict(
         f"room, {case}, {kind}", "the ages tell which omega is best: there is something to learn.",
         f"a rule fitted to the rewards of every omega at every decision of the other seeds wins {span(gain)} "

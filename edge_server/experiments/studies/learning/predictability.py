@@ -1,8 +1,8 @@
-"""How much of what is best at a decision can be foreseen from the ages that are known there.
+"""Whether the ages at a decision predict its best omega.
 
-That the best omega differs between decisions is no promise: hindsight knows what was still to come. A rule
-fitted to the rewards of all values, decision by decision, says what going by the ages could win; where it
-wins nothing, no learner can be blamed for finding the best fixed value and no more.
+The best omega differs between decisions in hindsight, which knows what arrives later. A rule fitted to the
+rewards of all values at every decision shows what the ages alone can gain. Where it gains nothing, a learner
+cannot do better than the best fixed value.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.studies.statistics import Interval, interval
+from edge_server.experiments.common.statistics import Interval, interval
 from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.evaluation import Evaluation
 
-# Of the cameras' ages, as a state has them: what a rule sees.
+# Percentiles of the cameras' ages that the rule uses.
 _QUANTILES = (0, 10, 25, 50, 75, 90, 100)
 _SCALE_MS = 100.0
 _RIDGE = 30.0
@@ -24,8 +24,8 @@ _RIDGE = 30.0
 
 def by_ages(evaluation: Evaluation, kind: str, moments: Sequence[DecisionPoint]) -> Interval:
     """Reward of a rule that chooses the value of ``kind`` (wait, threshold) by the ages, minus that of the
-    best fixed value, paired over seeds. Rule and fixed value are fitted to all seeds but the one that they
-    are measured on, to all rewards at every decision: many more than a learner is ever told of."""
+    best fixed value, paired over seeds. Both are fitted to all seeds but the one that they are measured on,
+    with the rewards of all values at every decision."""
     names = [name for name in evaluation.outcomes if name.startswith(f"{kind}:")]
     values = {name: evaluation.decisions(name) for name in names}
     known = [
@@ -55,8 +55,8 @@ def _features(moments: Sequence[DecisionPoint]) -> NDArray[np.float64]:
 
 
 def _rule(x: NDArray[np.float64], rewards: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The number of the value that promises most at each row of ``at``, by ridge regression of how much
-    better each value does than their mean."""
+    """Index of the value with the highest predicted reward at each row of ``at``, by ridge regression of the
+    rewards relative to their mean."""
     better = rewards - rewards.mean(axis=1, keepdims=True)
     usual = better.mean(axis=0)
     weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ (better - usual))

@@ -1,12 +1,10 @@
-"""How much the weights of a reward matter (6.36-6.38): policies learnt by each, judged by every one."""
+"""How much the weights of a reward matter (6.36-6.38): policies trained with each are judged by all."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     StudyTrainer,
     TrainingStudy,
@@ -15,12 +13,13 @@ from edge_server.experiments.studies.learning.setup import (
     paired_difference,
     room,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
 from edge_server.experiments.training.scheduler.report import span
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.state import StateLayout
@@ -32,29 +31,26 @@ class Weights(TrainingStudy):
     name = "weights"
     title = "Sensitivity to the weights of the reward (6.36-6.38)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
         setting, spec = room("swing"), Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
-        with StudyTrainer(ask) as trainer:
-            rewards = variants(trainer)
-            everybody: dict[str, Any] = {**rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all"))}
-            for name, reward in rewards.items():
-                config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
-                trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
-                everybody |= named_runs(f"learnt {name}", trained)
-            evaluation = trainer.evaluate(setting, everybody, rewards["corrected"], len(ask.repeats(8, 100)))
-        found, written = [], []
+        rewards, candidates = variants(trainer), simple_policies("wait")
+        for name, reward in rewards.items():
+            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+            trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
+            candidates |= named_runs(f"learnt {name}", trained)
+        count = len(request.repeats(8, 100))
+        evaluation = trainer.evaluate(setting, candidates, rewards["corrected"], count)
+        verdicts, found = [], []
         for name, reward in rewards.items():
             evaluation.reward = reward
-            written += rows(evaluation, judged_by=name)
-            found += judge(evaluation, name, list(rewards))
-        write_csv(ask.out / f"{self.name}.csv", written)
-        return found
+            found += rows(evaluation, judged_by=name)
+            verdicts += judge(evaluation, name, list(rewards))
+        return verdicts, found
 
 
 def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdict]:
-    """What was learnt by the reward ``name``, and by the others of ``names``, judged by ``name``, which is
-    the contest's reward."""
+    """Verdicts on the policies trained with the reward ``name`` and with the others of ``names``, all judged
+    by ``name``, which is the evaluation's reward."""
     mine, about = runs_of(evaluation, f"learnt {name}"), f"room, swing, {name}"
     best, fixed = evaluation.best_fixed("wait")
     losses = {o: paired_difference(mine, runs_of(evaluation, f"learnt {o}")) for o in names if o != name}
@@ -70,7 +66,7 @@ def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdi
 
 
 def variants(trainer: StudyTrainer) -> dict[str, Reward]:
-    """Rewards by name: the thesis's, ours with the sign put right, and ages that count less."""
+    """Rewards by name: the thesis's, ours with the corrected sign, and ages that count less."""
     corrected = trainer.reward("corrected")
     return {
         "thesis": trainer.reward("thesis"),

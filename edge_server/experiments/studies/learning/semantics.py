@@ -1,5 +1,5 @@
-"""Does it help to look at the pictures where something important moves in one part of the view, and does it
-cost nothing where nothing does?"""
+"""Do embeddings of the images help where something important moves in one part of the scene, and do they cost
+nothing where nothing moves?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.engine import StudyError
 from edge_server.experiments.studies.learning.setup import (
     StudyTrainer,
@@ -18,26 +18,25 @@ from edge_server.experiments.studies.learning.setup import (
     named_runs,
     no_worse,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.learning.visibility import Sees, Sight, telling
+from edge_server.experiments.studies.learning.visibility import SeesMotion, VisibleMotion, embedding_areas
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
-from edge_server.experiments.studies.statistics import interval
-from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import RIVALS, Evaluation, rivals, rows
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import span
-from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.training.scheduler.setting import layout_of, seeds
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 300, False: 1200}
-# scene -> (speed, PSNR of what). A person walks on one of four sides of the workshop, or stands there.
+# scene -> (speed, pixels of the PSNR). A person walks on one of four sides of the workshop, or stands there.
 SCENES = {"somebody moves": (1.0, "moving"), "nothing moves": (0.0, "whole")}
-# So many cameras are used by those that know which of them see what moves.
+# Numbers of cameras that the oracle uses, which knows which of them see what moves.
 KNOWING = (1, 2, 3, 4)
 
-# In the figure: name of a family of policies -> how their names begin.
+# In the figure: label of a family of policies -> prefix of their names.
 LEARNT = ("with-", "without-")
 FAMILIES = {
     "learnt with semantics": LEARNT[0], "learnt without": LEARNT[1], "knows who sees it": "sees:",
@@ -49,46 +48,41 @@ class Semantics(TrainingStudy):
     name = "semantics"
     title = "Where semantics help, and whether they cost anything where they do not (6.31-6.33)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
+    def report(self, request: StudyRequest, table: Table | None) -> list[Verdict]:
         if missing := embeddings_missing():
             raise StudyError(f"{self.name}: {missing}")
-        found: list[Verdict] = []
-        written: list[dict[str, Any]] = []
-        with StudyTrainer(ask) as trainer:
-            for scene in ask.chosen(list(SCENES), list(SCENES)):
-                speed, on = SCENES[scene]
-                setting = workshop(speed)
-                reward = priced(trainer, on)
-                mine: dict[str, Any] = {}
-                for name, layout in (
-                    ("with", layout_of(setting, PARTS)),
-                    ("without", layout_of(setting, PARTS[1:])),
-                ):
-                    config = TrainingConfig(Spec("select", layout), reward, ask.training_episodes(EPISODES))
-                    lesson = f"{self.name}-{scene.replace(' ', '-')}-{name}"
-                    mine |= named_runs(name, trainer.train_repeats(lesson, setting, config))
-                everybody: dict[str, Any] = {
-                    **rivals(OMEGAS_MS["threshold"], ["threshold"], RIVALS), **mine
-                }  # fmt: skip
-                count = len(ask.repeats(10, 100))
-                sight = Sight(setting)
-                if speed:
-                    everybody |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
-                evaluation = trainer.evaluate(setting, everybody, reward, count)
-                written += rows(evaluation, scene=scene)
-                found += judge(scene, evaluation, on == "moving")
-                if speed:
-                    moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
-                    found += why(scene, evaluation, telling(sight, moments))
-        write_csv(ask.out / f"{self.name}.csv", written)
-        draw(ask.out / f"{self.name}.png", written)
-        return found
+        return super().report(request, table)
+
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+        verdicts: list[Verdict] = []
+        found: list[Row] = []
+        for scene in request.chosen(list(SCENES), list(SCENES)):
+            speed, on = SCENES[scene]
+            setting = workshop(speed)
+            reward = priced(trainer, on)
+            candidates = simple_policies("threshold", BASELINE_POLICIES)
+            for name, parts in (("with", PARTS), ("without", PARTS[1:])):
+                spec = Spec("select", layout_of(setting, parts))
+                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
+                run_name = f"{self.name}-{scene.replace(' ', '-')}-{name}"
+                candidates |= named_runs(name, trainer.train_repeats(run_name, setting, config))
+            count = len(request.repeats(10, 100))
+            visible = VisibleMotion(setting)
+            if speed:
+                candidates |= {f"sees:{k}": SeesMotion(visible, k) for k in KNOWING}
+            evaluation = trainer.evaluate(setting, candidates, reward, count)
+            found += rows(evaluation, scene=scene)
+            verdicts += judge(scene, evaluation, on == "moving")
+            if speed:
+                moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
+                verdicts += why(scene, evaluation, embedding_areas(visible, moments))
+        draw(request.out / f"{self.name}.png", found)
+        return verdicts, found
 
 
 def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
-    """Whether who looks at the pictures does better than who does not; or, where nothing moves, no worse.
-    And whether either is better than the best of what does not learn."""
+    """Verdicts: policies with semantics are better than those without or, where nothing moves, no worse; and
+    both are better than the best policy without learning."""
     about, seeing, blind = f"tower, ch5, {scene}", runs_of(evaluation, "with"), runs_of(evaluation, "without")
     text = ""
     for name, runs in (("with", seeing), ("without", blind)):
@@ -109,10 +103,12 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
     ]  # fmt: skip
 
 
-def why(scene: str, evaluation: Evaluation, text: tuple[float, float]) -> list[Verdict]:
-    """Whether the embedding tells what is to be known, and whether who knows it could use it. told: as
-    ``telling`` has it."""
-    about, (embedding, camera) = f"tower, ch5, {scene}", text
+def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[Verdict]:
+    """Verdicts: the embedding shows which cameras see what moves, and knowing it would help.
+
+    areas: of ``embedding_areas``.
+    """
+    about, (embedding, camera) = f"tower, ch5, {scene}", areas
     knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
     best = max(knowing, key=lambda n: interval(list(evaluation.rewards(n).values())).mean)
     return [
@@ -125,14 +121,16 @@ def why(scene: str, evaluation: Evaluation, text: tuple[float, float]) -> list[V
     ]  # fmt: skip
 
 
-def draw(path: Path, written: Sequence[Mapping[str, Any]]) -> None:
-    """Mean reward against views used, a panel a scene: families of policies as lines, what was learnt as
-    diamonds. No intervals: what counts are paired differences, which the verdicts have. written: rows of the
-    contests, as the table has them."""
-    scenes = list(dict.fromkeys(row["scene"] for row in written))
+def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the mean reward against the used views, a panel a scene: families of policies as lines, trained
+    policies as diamonds. Without intervals, because the verdicts have those of the paired differences.
+
+    rows: of the table.
+    """
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
     with figure(path, 1, len(scenes), height_inch=3.4) as (_, axes):
         for at, scene in zip(axes[0], scenes):
-            known = [row for row in written if row["scene"] == scene and row.get("views")]
+            known = [row for row in rows if row["scene"] == scene and row.get("views")]
             for k, (label, prefix) in enumerate(FAMILIES.items()):
                 some = sorted(
                     (float(row["views"]), float(row["reward"]))

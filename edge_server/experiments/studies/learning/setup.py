@@ -17,20 +17,21 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.config import WorldConfig, source_config
-from edge_server.experiments.studies.engine import source_digest
-from edge_server.experiments.studies.statistics import Interval, crossed, interval
-from edge_server.experiments.studies.study import Ask, Point, Verdict, by_bool
+from edge_server.experiments.common.source_digest import source_digest
+from edge_server.experiments.common.statistics import Interval, crossed, interval
+from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.studies.trial import Trial
-from edge_server.experiments.training.scheduler.command import reward_of
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     Candidate,
     Evaluation,
     PerSeed,
+    baseline_policies,
     evaluate_policies,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, span
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, read_log, train
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.experiments.virtual.from_scenario import exact_scene
@@ -43,21 +44,35 @@ FIELD = "splat"
 FIELD_OPTIONS = {"effort": "low"}
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
-# From here what was learnt is judged; no reward has come from here and no update has seen it.
+# Cameras that judge trained policies: they give no reward and no update uses them.
 REPORT = ("cam05", "cam08")
-# Trainings per lesson; their spread is part of the interval.
+# Repeated trainings, by whether it is a quick pass; their spread is part of the interval.
 RUNS = {True: 1, False: 3}
 
 Runs = Sequence[PerSeed]
-"""Rewards by seed of each of several trainings of the same lesson."""
+"""Rewards by seed of each of several trainings that differ in their random seed only."""
 
 
 class TrainingStudy:
-    """Base of studies that train policies; they have no independent trials."""
+    """Base of the studies that train policies; they have no independent trials."""
 
-    def points(self, ask: Ask) -> list[Point]:
+    name: str
+    title: str
+
+    def points(self, request: StudyRequest) -> list[Point]:
         """An empty list."""
         return []
+
+    def report(self, request: StudyRequest, table: Table | None) -> list[Verdict]:
+        """Train, evaluate, write OUT/NAME.csv and return the verdicts. table: not used."""
+        with StudyTrainer(request) as trainer:
+            verdicts, rows = self.run(trainer, request)
+        write_csv(request.out / f"{self.name}.csv", rows)
+        return verdicts
+
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+        """The verdicts and the rows of the table."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -71,8 +86,13 @@ class TrainingRun:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """actor: what was learnt. rows: of its log. seconds: of training, wall clock, when it was trained, by
-    ``jobs`` processes. folder: with its policy.npz."""
+    """A finished training.
+
+    actor: the trained policy.
+    rows: of its log.
+    seconds: wall-clock time of the training, by ``jobs`` processes, when it was carried out.
+    folder: holds policy.npz.
+    """
 
     run: TrainingRun
     actor: Actor
@@ -89,12 +109,15 @@ def room(
     speed_m_per_s: float = 1.0,
     held_out: tuple[str, ...] = ("cam00",),
     report: tuple[str, ...] = REPORT,
-    embedding: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Setting:
-    """The usual setting: a world at 64 x 64, nineteen cameras, of which ``held_out`` reward and ``report``
-    report, and a splat field that is warm. more: of ``Setting``; ``scratch`` is the thesis's. channel: a
-    preset or a section. embedding: the section ``edge.embedding``."""
+    """The usual setting: a world at 64 x 64, nineteen cameras and a warm splat field.
+
+    channel: a preset, or a section of a scenario.
+    held_out: cameras that reward.
+    report: cameras that judge.
+    more: fields of ``Setting``; ``scratch`` is the thesis's.
+    """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     trial = Trial(
         scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s
@@ -102,9 +125,12 @@ def room(
     scenario = trial.scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *report})
     scenario = dataclasses.replace(scenario, held_out=apart)
-    if embedding is not None:
-        scenario = dataclasses.replace(scenario, edge={**scenario.edge, "embedding": dict(embedding)})
     return Setting(scenario, report=report, **{"steps": 50 if more.get("scratch") else 20, **more})
+
+
+def simple_policies(kind: str, others: Sequence[str] = ("random", "all")) -> dict[str, Candidate]:
+    """All fixed values of ``kind`` (threshold, wait) and ``others``, by name."""
+    return dict(baseline_policies(OMEGAS_MS[kind], [kind], others))
 
 
 class Nearest(Policy):
@@ -135,14 +161,14 @@ class Nearest(Policy):
 class StudyTrainer:
     """Trains and evaluates policies for one study; a context manager that owns the worker pool."""
 
-    ask: Ask
+    request: StudyRequest
     pool: WorkerPool = field(init=False)
-    _told: bool = False
+    _printed_missing: bool = False
 
     def __post_init__(self) -> None:
-        self.folder = self.ask.out / "training"
+        self.folder = self.request.out / "training"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.pool = WorkerPool(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
+        self.pool = WorkerPool(self.request.folders, self.request.jobs, self.folder / "evaluations.jsonl")
 
     def __enter__(self) -> StudyTrainer:
         return self
@@ -151,59 +177,51 @@ class StudyTrainer:
         self.pool.__exit__(*error)
 
     def reward(self, name: str, on: str = "whole") -> Reward:
-        """A reward of the presets; said once where its LPIPS term has to be left out."""
-        reward, missing = reward_of(name, on, self.ask.folders.lpips)
-        if missing and not self._told:
+        """A preset reward; prints once if its LPIPS term has to be left out."""
+        reward, missing = reward_of(name, on, self.request.folders.lpips)
+        if missing and not self._printed_missing:
             print(f"  {missing}")
-            self._told = True
+            self._printed_missing = True
         return reward
 
     def train_one(self, run: TrainingRun) -> TrainedPolicy:
-        """The lesson's learner, trained now or kept; its curve is drawn to OUT/LESSON.png."""
+        """Carry out a training, or read it if it is finished; its curve is drawn to OUT/NAME.png."""
         folder = self.folder / f"{run.name}-{_digest(run)}"
-        by = folder / "jobs.json"
+        jobs_file = folder / "jobs.json"
         learner = train(
             run.setting, run.config, self.pool, folder,
             lambda line: print(f"  {run.name}: {line}", flush=True),
         )  # fmt: skip
         rows = read_log(folder)
-        draw_curve(self.ask.out / f"{run.name}.png", rows)
-        if not by.exists():
-            write_json(by, self.ask.jobs)
+        draw_curve(self.request.out / f"{run.name}.png", rows)
+        if not jobs_file.exists():
+            write_json(jobs_file, self.request.jobs)
         seconds = sum(row["seconds"] for row in rows)
-        return TrainedPolicy(run, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
+        return TrainedPolicy(
+            run, learner.actor, rows, seconds, int(json.loads(jobs_file.read_text())), folder
+        )
 
     def train_repeats(self, name: str, setting: Setting, config: TrainingConfig) -> list[TrainedPolicy]:
-        """Train the lesson the requested number of times, with different episodes and initial values."""
-        runs = range(RUNS[self.ask.quick])
+        """Repeat a training ``RUNS`` times, with different episodes and initial values."""
+        runs = range(RUNS[self.request.quick])
         return [
             self.train_one(TrainingRun(f"{name}-{run}", setting, dataclasses.replace(config, seed=run)))
             for run in runs
         ]  # fmt: skip
 
     def evaluate(
-        self,
-        setting: Setting,
-        everybody: Mapping[str, Candidate],
-        reward: Reward,
-        count: int,
-        seed: int = 0,
+        self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
-        """All of ``everybody`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
-        none of what they are asked is what was rewarded."""
-        return self.evaluate_as_rewarded(setting.judged, everybody, reward, count, seed)
+        """Evaluate candidates on ``count`` seeds that were never trained on, scored by the cameras that
+        report, which never reward."""
+        return self.evaluate_as_rewarded(setting.judged, candidates, reward, count, seed)
 
     def evaluate_as_rewarded(
-        self,
-        setting: Setting,
-        everybody: Mapping[str, Candidate],
-        reward: Reward,
-        count: int,
-        seed: int = 0,
+        self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
-        """Also evaluate with the reward cameras; this supplements the other evaluation, never replaces it."""
+        """As ``evaluate``, scored by the cameras that reward; it supplements the other evaluation."""
         return evaluate_policies(
-            setting, self.pool, seeds(seed, "test", count), everybody, reward,
+            setting, self.pool, seeds(seed, "test", count), candidates, reward,
             lambda line: print(f"  contest: {line}", flush=True),
         )  # fmt: skip
 
@@ -220,14 +238,14 @@ def embeddings_missing() -> str | None:
 
 
 def fixed_of(evaluation: Evaluation, kind: str) -> str:
-    """The best fixed policy of a kind, in words."""
+    """Name and reward of the best fixed policy of a kind, as text."""
     values, name = evaluation.best_fixed(kind)
     return f"{name} {span(interval(list(values.values())))}"
 
 
 def mean_of(runs: Runs) -> PerSeed:
-    """Mean reward over several trainings of the same lesson, by seed of testing; for what is told, never for
-    an interval, which would not know how differently the same lesson is learnt."""
+    """Mean reward of repeated trainings, by test seed. For texts only: an interval of it would ignore how
+    much the trainings differ."""
     found: PerSeed = {}
     for s in runs[0]:
         values = [v for run in runs if (v := run[s]) is not None]
@@ -236,7 +254,7 @@ def mean_of(runs: Runs) -> PerSeed:
 
 
 def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str, Actor]:
-    """The actors of several trainings of one lesson as a contest takes them."""
+    """The actors of repeated trainings as candidates ``NAME-0``, ``NAME-1``, ..."""
     return {
         f"{name}-{run}": one.actor if isinstance(one, TrainedPolicy) else one
         for run, one in enumerate(trained)
@@ -244,14 +262,14 @@ def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str,
 
 
 def runs_of(evaluation: Evaluation, name: str) -> Runs:
-    """Rewards of each of the trainings that ``named_runs`` called ``name``."""
+    """Rewards of each of the trainings that ``named_runs`` calls ``name``."""
     of = [n for n in evaluation.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
     return [evaluation.rewards(n) for n in of]
 
 
 def paired_difference(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
-    """Paired difference, over seeds and, where they are of several trainings, over those: run r of the one
-    with run r of the other, which saw the same episodes."""
+    """Paired difference over seeds and, for repeated trainings, over those: run r of one is paired with run r
+    of the other, which saw the same episodes."""
     ours, theirs = _runs(mine), _runs(other)
     if len(theirs) == 1:
         theirs = list(theirs) * len(ours)
@@ -269,14 +287,14 @@ def _runs(values: PerSeed | Runs) -> Runs:
 
 
 def _describe_difference(found: Interval, runs: int) -> str:
-    """The difference for people, and what its interval is over."""
+    """The difference as text, with what its interval is over."""
     trainings = f"{runs} trainings and " if runs > 1 else ""
     alone = "" if runs > 1 else " of a single training"
     return f"difference {span(found)} over {trainings}{found.count} seeds{alone}"
 
 
 def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, found: str = "") -> Verdict:
-    """Whether ``mine`` is better than ``other``: the paired interval says."""
+    """The verdict whether ``mine`` is better than ``other``, by the paired interval."""
     difference = paired_difference(mine, other)
     text = _describe_difference(difference, len(_runs(mine)))
     if difference.low == difference.high == 0.0:
@@ -292,9 +310,9 @@ def no_worse(
     evaluation: Evaluation,
     share: float = 0.01,
 ) -> Verdict:
-    """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward, and what part
-    that is of all that could be won in the contest: a reward's zero is arbitrary, its differences are not.
-    No answer where the reward is too near its zero for a percentage."""
+    """The verdict whether ``mine`` loses at most ``share`` of the size of ``other``'s mean reward. The text
+    also gives the loss relative to the way from random to hindsight, because the zero of a reward is
+    arbitrary. Undecided where the reward is too near its zero for a percentage."""
     difference, base = paired_difference(mine, other), crossed(_runs(other))
     text = f"{_describe_difference(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
     if base.low <= 0.0 <= base.high:
@@ -307,7 +325,6 @@ def no_worse(
 
 
 def _digest(run: TrainingRun) -> str:
-    """Lessons of one name and other settings stand beside each other, and so do those of other code: what
-    an earlier learner learnt must not pass for what this one does."""
+    """Trainings with other settings or of other code get folders of their own."""
     text = source_digest() + run.setting.key + repr(dataclasses.asdict(run.config))
     return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
     StudyTrainer,
@@ -16,11 +14,12 @@ from edge_server.experiments.studies.learning.setup import (
     named_runs,
     room,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.studies.study import StudyRequest, Verdict
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
+from edge_server.experiments.training.scheduler.setting import layout_of
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 100, False: 600}
@@ -35,37 +34,28 @@ class Ablation(TrainingStudy):
     name = "ablation"
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
         variants = dict(VARIANTS)
         if missing := embeddings_missing():
             print(f"  semantics are left out: {missing}")
             variants = {name: parts for name, parts in variants.items() if "semantics" not in parts}
-        # All see the same decisions, drawn with all that any of them looks at.
+        # All variants see the same decisions, drawn with all parts that any of them uses.
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
-        with StudyTrainer(ask) as trainer:
-            reward = trainer.reward("set", "moving")
-            mine: dict[str, Any] = {}
-            for name, used in variants.items():
-                spec = Spec("select", layout_of(setting, used))
-                config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
-                trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
-                mine |= named_runs(f"learnt {name}", trained)
-            everybody: dict[str, Any] = {
-                **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
-            }  # fmt: skip
-            evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(10, 100)))
-        write_csv(ask.out / f"{self.name}.csv", rows(evaluation))
-        return judge(evaluation, list(variants))
+        reward, candidates = trainer.reward("set", "moving"), simple_policies("threshold")
+        for name, used in variants.items():
+            spec = Spec("select", layout_of(setting, used))
+            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
+            trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
+            candidates |= named_runs(f"learnt {name}", trained)
+        evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
+        return judge(evaluation, list(variants)), rows(evaluation)
 
 
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
-    """What each variant of the state is worth, by the contest of what was learnt with them."""
-    about, trained = (
-        "room, ch5, moving, four viewpoints",
-        {n: runs_of(evaluation, f"learnt {n}") for n in variants},
-    )
+    """Verdicts on the policies trained with each variant of the state."""
+    about = "room, ch5, moving, four viewpoints"
+    trained = {n: runs_of(evaluation, f"learnt {n}") for n in variants}
     best, text = evaluation.best_fixed("threshold")[0], fixed_of(evaluation, "threshold")
     found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
                     f"against {text}; ") for name, runs in trained.items()]  # fmt: skip

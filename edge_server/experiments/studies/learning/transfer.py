@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     StudyTrainer,
     TrainingStudy,
@@ -15,12 +13,12 @@ from edge_server.experiments.studies.learning.setup import (
     no_worse,
     room,
     runs_of,
+    simple_policies,
 )
-from edge_server.experiments.studies.study import Ask, Table, Verdict
-from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
-from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
+from edge_server.experiments.studies.study import StudyRequest, Verdict
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -30,7 +28,7 @@ AGE = -0.003
 
 
 def settings(quick: bool) -> dict[str, Setting]:
-    """Where policies are used; they are trained in each, and that of ``HOME`` is used in all."""
+    """Settings by name: a policy is trained in each, and that of ``HOME`` is used in all."""
     found = {HOME: room("swing"), "tower, swing": room("swing", scene="tower")}
     more = {"room at 3 m/s, swing": room("swing", speed_m_per_s=3.0), "room, ch6-slow": room("ch6-slow")}
     return found if quick else found | more
@@ -40,37 +38,31 @@ class Transfer(TrainingStudy):
     name = "transfer"
     title = "Trained on one scene and channel, used on another"
 
-    def report(self, ask: Ask, table: Table) -> list[Verdict]:
-        del table
-        found: list[Verdict] = []
-        written: list[dict[str, Any]] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+        verdicts: list[Verdict] = []
+        found: list[Row] = []
         spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
-        with StudyTrainer(ask) as trainer:
-            reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
-            places = settings(ask.quick)
-            config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
-            trained = {
-                place: trainer.train_repeats(
-                    f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
-                    setting, config,
-                )
-                for place, setting in places.items()
-            }  # fmt: skip
-            for place, setting in places.items():
-                everybody: dict[str, Any] = {
-                    **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
-                    **named_runs("learnt at home", trained[HOME]),
-                    **named_runs("learnt here", trained[place]),
-                }  # fmt: skip
-                evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(8, 100)))
-                written += rows(evaluation, place=place)
-                found += judge(place, evaluation)
-        write_csv(ask.out / f"{self.name}.csv", written)
-        return found
+        reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
+        places = settings(request.quick)
+        config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+        trained = {}
+        for place, setting in places.items():
+            name = f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}"
+            trained[place] = trainer.train_repeats(name, setting, config)
+        for place, setting in places.items():
+            candidates = {
+                **simple_policies("wait"),
+                **named_runs("learnt at home", trained[HOME]),
+                **named_runs("learnt here", trained[place]),
+            }
+            evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(8, 100)))
+            found += rows(evaluation, place=place)
+            verdicts += judge(place, evaluation)
+        return verdicts, found
 
 
 def judge(place: str, evaluation: Evaluation) -> list[Verdict]:
-    """How what was learnt at home does at a place, beside what was learnt there."""
+    """Verdicts on the policies trained at ``HOME``, used at a place, against those trained there."""
     home, here = runs_of(evaluation, "learnt at home"), runs_of(evaluation, "learnt here")
     best, text = evaluation.best_fixed("wait")[0], fixed_of(evaluation, "wait")
     found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,

@@ -1,8 +1,7 @@
-"""What cameras really see of what moves: for rivals that know it, and for whether an embedding tells it.
+"""What each camera sees of the moving things: for an oracle policy, and to test whether embeddings show it.
 
-Known from the scene itself, which no policy has. A study holds it beside what was learnt to say why looking
-helps or does not: because the embedding does not tell, because nobody could use it, or because it was not
-learnt.
+It is computed from the scene itself, which no policy has. A study uses it to find out why embeddings help or
+do not: they do not show it, it would not help, or it was not learned.
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from edge_server.experiments.training.scheduler.episode import Choice, DecisionP
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.virtual.from_scenario import exact_scene
 
-# A pixel shows something that moves where it differs by more, of 255, from the scene without it.
+# A pixel shows a moving thing if it differs by more than this, of 255, from the scene without moving things.
 _DIFFERS = 12
-# A camera sees it where so much of its picture does.
+# A camera sees motion if this share of its pixels shows a moving thing.
 SEES = 0.01
-# How fast a view loses its worth: an age over which it falls to a third.
+# Time constant with which the oracle discounts the age of a view.
 _FRESH_MS = 100.0
 
 
-class Sight:
-    """setting: of a world. Pictures are rendered anew, with and without what moves."""
+class VisibleMotion:
+    """Renders each image with and without the moving things. setting: of a world."""
 
     def __init__(self, setting: Setting) -> None:
         self._setting = setting
         self._known: dict[tuple[int, int], dict[str, float]] = {}
 
     def shares(self, moment: DecisionPoint) -> dict[str, float]:
-        """Camera -> the share of its newest frame at a decision that shows something that moves, of those
-        that have one."""
+        """Camera -> share of the pixels of its newest frame at a decision that show a moving thing; without
+        cameras that have no frame."""
         at = moment.seed, moment.number
         if at not in self._known:
             self._known[at] = self._look(moment)
@@ -54,14 +53,14 @@ class Sight:
         return found
 
 
-class Sees:
-    """Chooses the ``k`` cameras that show most of what moves, young ones before old ones."""
+class SeesMotion:
+    """An oracle policy: the ``k`` cameras that show most of the moving things, discounted by age."""
 
-    def __init__(self, sight: Sight, k: int) -> None:
-        self._sight, self._k = sight, k
+    def __init__(self, visible: VisibleMotion, k: int) -> None:
+        self._sight, self._k = visible, k
 
     def choice(self, moment: DecisionPoint) -> Choice:
-        """At the instant of the decision; of none that has reported, nothing."""
+        """The choice at the instant of the decision; empty if no camera has reported."""
         shares, newest = self._sight.shares(moment), moment.newest(moment.now_ns)
         age_ms = {c: (moment.now_ns - a.generated_ns) / 1e6 for c, a in newest.items()}
         worth = {c: shares[c] * float(np.exp(-age_ms[c] / _FRESH_MS)) for c in newest}
@@ -69,15 +68,15 @@ class Sees:
         return Choice(tuple(c for c in newest if c in best), moment.now_ns)
 
 
-def telling(sight: Sight, moments: Sequence[DecisionPoint]) -> tuple[float, float]:
-    """How well embeddings tell a camera that sees something move from one that does not, and how well it is
-    told by which camera it is: areas under the curve of linear rules, fitted to every other episode and
-    measured on the rest. NaN where all see it, or none."""
+def embedding_areas(visible: VisibleMotion, moments: Sequence[DecisionPoint]) -> tuple[float, float]:
+    """How well a linear rule tells whether a camera sees motion, from the embedding of its frame and from the
+    identity of the camera: areas under the ROC curve. The rules are fitted to every other episode and
+    measured on the rest; NaN where all cameras see motion, or none."""
     rows, names, seen, episodes = [], [], [], []
     for moment in moments:
         embeddings = moment.state.embeddings
         assert embeddings is not None
-        for camera, share in sight.shares(moment).items():
+        for camera, share in visible.shares(moment).items():
             rows.append(embeddings[moment.cameras.index(camera)].astype(np.float64))
             names.append(moment.cameras.index(camera))
             seen.append(share > SEES)
@@ -90,7 +89,10 @@ def telling(sight: Sight, moments: Sequence[DecisionPoint]) -> tuple[float, floa
 
 
 def _area_of_rule(x: NDArray[np.float64], labels: NDArray[np.bool_], fitted: NDArray[np.bool_]) -> float:
-    """Of the ridge-regressed linear rule; x (rows, features), labels (rows,), fitted (rows,): to which."""
+    """Area under the ROC curve of a linear rule by ridge regression.
+
+    x: (rows, features). labels: (rows,). fitted: (rows,), rows that it is fitted to; the others measure it.
+    """
     spread = np.maximum(x[fitted].std(axis=0), 1e-6)
     scaled = np.hstack([(x - x[fitted].mean(axis=0)) / spread, np.ones((len(x), 1))])
     a, b = scaled[fitted], labels[fitted] - 0.5
@@ -99,8 +101,8 @@ def _area_of_rule(x: NDArray[np.float64], labels: NDArray[np.bool_], fitted: NDA
 
 
 def area(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
-    """Area under the receiver's curve: how often a true one has the higher score, ties counting half. scores
-    and labels (rows,); NaN where all labels are the same."""
+    """Area under the ROC curve: how often a true row has a higher score than a false one; ties count half.
+    scores, labels: (rows,). NaN where all labels are the same."""
     true, false = scores[labels], scores[~labels]
     if not (len(true) and len(false)):
         return float("nan")

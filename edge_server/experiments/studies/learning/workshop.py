@@ -19,8 +19,8 @@ STEPS, REFRESH_MS = 40, 900.0
 
 
 def priced(trainer: StudyTrainer, on: str) -> Reward:
-    """Of ``moving`` pixels, PSNR alone: SSIM and the distance are of the whole image, which hardly shows who
-    walks in a corner of it, so that with them whatever serves the rest of the scene is rewarded."""
+    """The reward with a cost per view. On ``moving`` pixels only the PSNR counts: SSIM and distance are of
+    the whole image, which hardly shows a person in a corner of it."""
     reward = dataclasses.replace(trainer.reward("set", on), views=-PRICE)
     return dataclasses.replace(reward, ssim=0.0, distance=0.0) if on == "moving" else reward
 

@@ -2,5 +2,5 @@
 
 ``scenes`` varies the shipped worlds and knows exact boxes, ``dataset`` renders and keeps them, ``network``
 and ``loss`` are of the YOLOv8 family, ``training`` runs, ``export`` writes ONNX in float32 and 8 bits,
-``quality`` measures average precision. ``perceptual`` fits a perceptual distance on the same backbone.
+``average_precision`` measures quality. ``perceptual`` fits a perceptual distance on the same backbone.
 """

@@ -1,4 +1,4 @@
-"""How good a detector is: average precision as COCO defines it, of anything that gives YOLO's output."""
+"""Average precision of a detector as COCO defines it, for any model with YOLO's output."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.training.detector.dataset import Pictures
+from edge_server.experiments.training.detector.dataset import LabeledImages, network_inputs
 from edge_server.experiments.training.detector.scenes import KINDS
 
 Array = NDArray[np.float64]
@@ -17,20 +17,20 @@ Array = NDArray[np.float64]
 IOUS = np.arange(0.5, 0.96, 0.05)
 RECALLS = np.linspace(0.0, 1.0, 101)
 MIN_SCORE, NMS_IOU, MAX_DETECTIONS = 0.001, 0.6, 100
+_BATCH = 32
 
 Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Images (n, 3, H, W) in [0, 1] -> output0 (n, 4 + kinds, cells)."""
 
 
-def measure(run: Run, pictures: Pictures, batch: int = 32) -> dict[str, Any]:
-    """{map50, map50_95, by_kind: {kind: {ap50, ap50_95, true}}, images} over ``pictures``."""
+def measure(run: Run, dataset: LabeledImages) -> dict[str, Any]:
+    """{map50, map50_95, by_kind: {kind: {ap50, ap50_95, true}}, images} over ``dataset``."""
     found: list[Array] = []
-    for first in range(0, len(pictures), batch):
-        part = pictures.images[first : first + batch].transpose(0, 3, 1, 2).astype(np.float32) / 255.0
-        found += [detections(out) for out in run(np.ascontiguousarray(part))]
+    for part in network_inputs(dataset.images, _BATCH):
+        found += [detections(out) for out in run(part)]
     by_kind = {}
     for k, kind in enumerate(KINDS):
-        true = [b[b[:, 4] == k, :4].astype(np.float64) for b in pictures.boxes]
+        true = [b[b[:, 4] == k, :4].astype(np.float64) for b in dataset.boxes]
         of_kind = [d[d[:, 5] == k, :5] for d in found]
         if total := sum(map(len, true)):
             ap = average_precision(of_kind, true)
@@ -39,7 +39,7 @@ def measure(run: Run, pictures: Pictures, batch: int = 32) -> dict[str, Any]:
         "map50": float(np.mean([row["ap50"] for row in by_kind.values()])),
         "map50_95": float(np.mean([row["ap50_95"] for row in by_kind.values()])),
         "by_kind": by_kind,
-        "images": len(pictures),
+        "images": len(dataset),
     }
 
 
@@ -60,9 +60,11 @@ def detections(output: NDArray[np.float32]) -> Array:
 
 
 def average_precision(found: Sequence[Array], true: Sequence[Array], ious: Array = IOUS) -> Array:
-    """Average precision (len(ious),) of one kind: found (n, 5) with scores and true (m, 4) boxes of each
-    image. Interpolated at 101 recalls; the better of two detections of one thing counts, the other is false.
-    NaN where nothing is true."""
+    """Average precision (len(ious),) of one kind, interpolated at 101 recalls; NaN without a true box.
+
+    found: (n, 5) of each image, boxes with scores. true: (m, 4) of each image, boxes. Of two detections of
+    one thing the better counts and the other is false.
+    """
     total = sum(map(len, true))
     if not total:
         return np.full(len(ious), np.nan)

@@ -10,6 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from edge_server.experiments.common.arguments import at_least, command_parser, run_command
+
 DESCRIPTION = """\
 Train the small detector whose backbone gives the default embeddings, on variations of our own scenes.
 
@@ -41,16 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     from edge_server.experiments.training.detector.training import CheckpointError
 
-    try:
-        told = run(args)
-    except (CheckpointError, FloatingPointError) as error:
-        print(f"edge-server train-detector: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; the same command goes on with what is in {args.out}", flush=True)
-        return 130
-    print(json.dumps(told) if args.json else show(told))
-    return 0
+    def work() -> None:
+        results = run(args)
+        print(json.dumps(results) if args.json else show(results))
+
+    stopped = f"the same command goes on with what is in {args.out}"
+    return run_command("train-detector", work, (CheckpointError, FloatingPointError), stopped)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -83,7 +81,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         sets = {"unseen worlds": unseen, **{f"own rig of {name}": p for name, p in rigs.items()}}
         quality[path.stem] = {name: measure(detect, p) for name, p in sets.items()}
         quality[path.stem]["bytes"] = path.stat().st_size
-    told = {
+    results = {
         "settings": asdict(settings), "kinds": KINDS, "parameters": parameters(model),
         "pictures": {"train": len(known), "held_out": len(unseen)}, "boxes": sum(map(len, known.boxes)),
         "quality": quality, "projection_variance": spread,
@@ -91,8 +89,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "trained_s": round(sum(row["seconds"] for row in log), 1),
         "machine": machine(), "versions": versions(),
     }  # fmt: skip
-    write_json(args.out / "detector.json", told, indent=1)
-    return told
+    write_json(args.out / "detector.json", results, indent=1)
+    return results
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
@@ -107,56 +105,45 @@ def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
     return {"cosine_mean": round(float(cosine.mean()), 4), "cosine_min": round(float(cosine.min()), 4)}
 
 
-def show(told: dict[str, Any]) -> str:
-    """The outcome for people."""
-    lines = [f"{told['parameters']} parameters, {told['pictures']['train']} pictures, {told['boxes']} boxes"]
-    for name, sets in told["quality"].items():
+def show(results: dict[str, Any]) -> str:
+    """The results as text."""
+    pictures, agreement = results["pictures"]["train"], results["int8_agreement"]["cosine_mean"]
+    lines = [f"{results['parameters']} parameters, {pictures} pictures, {results['boxes']} boxes"]
+    for name, sets in results["quality"].items():
         lines.append(f"{name}: {sets['bytes'] / 1e3:.0f} kB")
         for where, found in sets.items():
             if isinstance(found, dict):
                 lines.append(f"  {where:20} mAP@.5 {found['map50']:.3f}  mAP@.5:.95 {found['map50_95']:.3f}")
-    lines.append(f"embedding of int8 against fp32: mean cosine {told['int8_agreement']['cosine_mean']:.4f}")
+    lines.append(f"embedding of int8 against fp32: mean cosine {agreement:.4f}")
     return "\n".join(lines)
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "edge-server train-detector", description=DESCRIPTION, formatter_class=raw
-    )
+    parser = command_parser("train-detector", DESCRIPTION)
     add = parser.add_argument
     add("--out", type=Path, default=Path("runs/detector"), metavar="DIR", help="[%(default)s]")
     add("--seed", type=int, default=0, help="[%(default)s]")
     add(
         "--worlds",
-        type=_at_least(20),
+        type=at_least(20),
         default=400,
         metavar="N",
         help="to train on, 8 pictures each [%(default)s]",
     )
-    add("--epochs", type=_at_least(1), default=18, metavar="N", help="[%(default)s]")
+    add("--epochs", type=at_least(1), default=18, metavar="N", help="[%(default)s]")
     add("--side", type=_side, default=128, metavar="PX", help="of the pictures [%(default)s]")
     add("--rate", type=float, default=2e-3, help="of learning [%(default)s]")
     add(
         "--threads",
-        type=_at_least(1),
+        type=at_least(1),
         default=1,
         metavar="N",
         help="that train; they decide the weights too [%(default)s]",
     )
-    add("--workers", type=_at_least(1), default=2, metavar="N", help="processes that render [%(default)s]")
+    add("--workers", type=at_least(1), default=2, metavar="N", help="processes that render [%(default)s]")
     add("--quick", action="store_true", help="20 worlds, 2 epochs: to try it out")
     add("--json", action="store_true", help="print detector.json instead of a summary")
     return parser
-
-
-def _at_least(least: int) -> Any:
-    def read(text: str) -> int:
-        if not text.isdigit() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from {least}")
-        return int(text)
-
-    return read
 
 
 def _side(text: str) -> int:

@@ -1,11 +1,13 @@
-"""Renders the detector's pictures once, in shards that are kept, so that an interrupted run goes on."""
+"""Renders the images of the detector once, in files that are kept, so that an interrupted run continues."""
 
 from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ RIG_INSTANTS_S = (0.0, 0.7, 1.6, 2.5)
 
 
 @dataclass(frozen=True)
-class Pictures:
+class LabeledImages:
     """images (n, side, side, 3) uint8; boxes: of each image (m, 5), see scenes.Boxes."""
 
     images: NDArray[np.uint8]
@@ -33,27 +35,26 @@ class Pictures:
         return len(self.images)
 
 
-def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers: int) -> Pictures:
-    """``INSTANTS`` pictures of each of ``shots`` variations, from ``folder`` where they are there already."""
+def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np.float32]]:
+    """Images (n, H, W, 3) in batches (batch, 3, H, W), in [0, 1]."""
+    for first in range(0, len(images), batch):
+        part = images[first : first + batch].transpose(0, 3, 1, 2).astype(np.float32)
+        yield np.ascontiguousarray(part) / np.float32(255.0)
+
+
+def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers: int) -> LabeledImages:
+    """``INSTANTS`` images of each of ``shots`` variations, read from ``folder`` where they are rendered
+    already."""
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [
-        (
-            purpose,
-            seed,
-            first,
-            min(SHARD_SHOTS, shots - first),
-            side,
-            _shard(folder, purpose, seed, first, side),
-        )
-        for first in range(0, shots, SHARD_SHOTS)
-    ]
+    jobs = []
+    for first in range(0, shots, SHARD_SHOTS):
+        path = folder / f"{purpose}-{side}-{seed}-{first:04d}.npz"
+        jobs.append((purpose, seed, first, min(SHARD_SHOTS, shots - first), side, path))
     missing = [job for job in jobs if _load(job[-1]) is None]
     if missing:
         progress = Progress(len(missing))
         # Spawned, because torch's threads do not survive a fork.
-        import multiprocessing
-
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
             for job, _ in zip(missing, pool.map(_render_shard, missing)):
                 progress.advance(1)
                 progress.report(f"{purpose} pictures", f"{job[2] + job[3]} of {shots} worlds", "rendered")
@@ -62,26 +63,22 @@ def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers
 
 
 def scenes_of(purpose: str, shots: int, seed: int) -> list[str]:
-    """The shipped scene that each picture of ``render`` is a variation of."""
+    """The shipped scene that each image of ``render`` is a variation of."""
     return [scene_of(_seed(seed, k), purpose) for k in range(shots) for _ in range(INSTANTS)]
 
 
-def of_own_rigs(side: int) -> dict[str, Pictures]:
-    """The shipped scenes through some of their own cameras."""
+def of_own_rigs(side: int) -> dict[str, LabeledImages]:
+    """Images of the shipped scenes by some of their own cameras."""
     return {
-        name: joined([Pictures(*own_rig(name, c, side).take(instants)) for c in RIG_CAMERAS])
+        name: joined([LabeledImages(*own_rig(name, c, side).take(instants)) for c in RIG_CAMERAS])
         for name in ("room", "tower", "tile")
         for instants in [RIG_INSTANTS_S if make_scene(name, {"count": 1}).moving else RIG_INSTANTS_S[:1]]
     }
 
 
-def joined(parts: list[Pictures]) -> Pictures:
-    """Several sets as one."""
-    return Pictures(np.concatenate([p.images for p in parts]), [b for p in parts for b in p.boxes])
-
-
-def _shard(folder: Path, purpose: str, seed: int, first: int, side: int) -> Path:
-    return folder / f"{purpose}-{side}-{seed}-{first:04d}.npz"
+def joined(parts: list[LabeledImages]) -> LabeledImages:
+    """Join several sets."""
+    return LabeledImages(np.concatenate([p.images for p in parts]), [b for p in parts for b in p.boxes])
 
 
 def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
@@ -89,7 +86,7 @@ def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
     parts = []
     for k in range(first, first + shots):
         shot, rng = variation(_seed(seed, k), purpose, side)
-        parts.append(Pictures(*shot.take(list(rng.uniform(0.0, 12.0, INSTANTS)))))
+        parts.append(LabeledImages(*shot.take(list(rng.uniform(0.0, 12.0, INSTANTS)))))
     whole = joined(parts)
     counts = [len(b) for b in whole.boxes]
     part = path.with_suffix(f".{os.getpid()}.part")
@@ -99,14 +96,14 @@ def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
 
 
 def _seed(seed: int, number: int) -> int:
-    """Of a set's variation of this number."""
+    """Seed of the variation with this number."""
     return seed * 1_000_003 + number
 
 
-def _load(path: Path) -> Pictures | None:
+def _load(path: Path) -> LabeledImages | None:
     try:
         with np.load(path, allow_pickle=False) as archive:
             ends = np.cumsum(archive["counts"])[:-1]
-            return Pictures(archive["images"], list(np.split(archive["boxes"], ends)))
+            return LabeledImages(archive["images"], list(np.split(archive["boxes"], ends)))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

@@ -1,4 +1,4 @@
-"""What goes wrong with pictures in a system like this one, at random strength: for fitting a distance."""
+"""Typical image errors of this system at random strength, for fitting a perceptual distance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Distort = Callable[[Image, Image, np.random.Generator], NDArray]
-"""(picture, the same view at another instant, rng) -> what is shown instead, uint8 or floating 0..255."""
+"""(image, the same view at another instant, rng) -> the distorted image, uint8 or floating 0..255."""
 
 
 def _blur(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
@@ -35,7 +35,7 @@ def _stale(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 
 
 def _ghost(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
-    """Two instants fused, or a copy beside the thing itself."""
+    """A blend of two instants, or of an image with a shifted one."""
     dx, dy = rng.uniform(-8, 8, 2) * (rng.random() < 0.5)
     moved = cv2.warpAffine(other, np.array([[1, 0, dx], [0, 1, dy]]), other.shape[1::-1],
                            borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
@@ -44,7 +44,7 @@ def _ghost(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 
 
 def _coarse(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
-    """What a field of too few cells shows."""
+    """The rendering of a field with too few cells."""
     h, w = image.shape[:2]
     k = rng.uniform(1.3, 7.0)
     small = cv2.resize(image, (max(1, int(w / k)), max(1, int(h / k))), interpolation=cv2.INTER_AREA)
@@ -52,14 +52,14 @@ def _coarse(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 
 
 def _displaced(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
-    """A camera that is not where it was said to be."""
+    """A camera with a wrong pose."""
     turn = cv2.getRotationMatrix2D((image.shape[1] / 2, image.shape[0] / 2), rng.normal(0, 1.5), 1.0)
     turn = np.column_stack([turn[:, :2], turn[:, 2] + rng.normal(0.0, 2.0, 2)])
     return np.asarray(cv2.warpAffine(image, turn, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE))
 
 
 def _floaters(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
-    """Soft blobs of stray density before the scene."""
+    """Soft blobs of stray density in front of the scene."""
     h, w = image.shape[:2]
     y, x = np.mgrid[0:h, 0:w]
     out = image.astype(np.float64)
@@ -71,7 +71,7 @@ def _floaters(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 
 
 def _warped(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
-    """Geometry that wobbles: a smooth random displacement of every pixel."""
+    """Wrong geometry: a smooth random displacement of every pixel."""
     h, w = image.shape[:2]
     coarse = rng.normal(0.0, 2.5 * rng.random(), (2, 6, 6)).astype(np.float32)
     dx, dy = (cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC) for c in coarse)
@@ -86,7 +86,7 @@ DISTORTIONS: dict[str, Distort] = {
 
 
 def distorted(image: Image, other: Image, rng: np.random.Generator) -> tuple[Image, str]:
-    """One distortion, in three cases of ten a second one upon it; and their names."""
+    """An image with one random distortion, or with two in three cases of ten; and their names."""
     names = rng.choice(list(DISTORTIONS), 2 if rng.random() < 0.3 else 1, replace=False)
     out = image
     for name in names:

@@ -27,15 +27,17 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from edge_server.embed.backbone import OUTPUT, PROJECTION_KEY, load_backbone, pack_projection
 from edge_server.experiments.training.detector.average_precision import Run
+from edge_server.experiments.training.detector.dataset import network_inputs
 from edge_server.experiments.training.detector.network import Detector
 from edge_server.experiments.training.detector.scenes import KINDS
 
 OPSET = 17
 INPUT = "images"
 CALIBRATION_IMAGES = 128
-# Axes of the learnt projection: the most that embeddings may ask for.
+_BATCH = 32
+# Axes of the learned projection: the largest dimension of an embedding.
 AXES = 64
-# Scaling an axis to unit variance must not blow up one that carries nothing: relative to the first.
+# Smallest spread of an axis, relative to the first, so that scaling does not amplify one without information.
 _LEAST_SPREAD = 1e-3
 
 
@@ -97,7 +99,7 @@ def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """The quantiser talks to the root logger of every node it passes."""
+    """Silence the quantiser, which logs every node to the root logger."""
     root = logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)
@@ -124,34 +126,29 @@ def add_projection(path: Path, features: NDArray[np.float32]) -> dict[str, float
     return {str(k): round(float(share[k - 1]), 4) for k in (8, 16, 32, 64) if k <= len(share)}
 
 
-def runner(path: Path, threads: int = 1) -> Run:
+def runner(path: Path) -> Run:
     """The whole detector through ONNX Runtime."""
-    session = _session(str(path), threads)
+    session = _session(str(path))
     return lambda images: np.asarray(session.run(None, {INPUT: images})[0])
 
 
-def pooled_features(path: Path, images: NDArray[np.uint8], batch: int = 32) -> NDArray[np.float32]:
-    """What embeddings are projected from: features (n, C) of ``images``, by the path that embeddings take."""
+def pooled_features(path: Path, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Features (n, C) of ``images`` that embeddings are projected from, computed as embeddings compute
+    them."""
     side = images.shape[1]
     backbone = load_backbone(path, size=side)
-    session = _session(backbone.model, 1)
+    session = _session(backbone.model)
     out = []
-    for part in _parts(images, batch):
+    for part in network_inputs(images, _BATCH):
         out.append(np.asarray(session.run([OUTPUT], {backbone.input: part})[0]))
     return np.concatenate(out)
 
 
-def _session(model: str | bytes, threads: int) -> ort.InferenceSession:
+def _session(model: str | bytes) -> ort.InferenceSession:
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = 1
     options.log_severity_level = 3
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
-def _parts(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np.float32]]:
-    for first in range(0, len(images), batch):
-        part = images[first : first + batch].transpose(0, 3, 1, 2).astype(np.float32)
-        yield np.ascontiguousarray(part) / np.float32(255.0)
 
 
 def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any]) -> None:
@@ -169,7 +166,7 @@ def _set_metadata(model: onnx.ModelProto, values: dict[str, str]) -> None:
 
 class _Calibration(CalibrationDataReader):  # type: ignore[misc]
     def __init__(self, images: NDArray[np.uint8]) -> None:
-        self._parts = ({INPUT: part} for part in _parts(images, 8))
+        self._parts = ({INPUT: part} for part in network_inputs(images, 8))
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:
         return next(self._parts, None)

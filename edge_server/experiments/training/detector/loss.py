@@ -1,7 +1,7 @@
-"""What the detector is trained for: task-aligned assignment (TOOD, Feng et al. 2021) as YOLOv8 uses it.
+"""Loss of the detector: task-aligned assignment (TOOD, Feng et al. 2021) as YOLOv8 uses it.
 
-Each true box takes the cells whose prediction is best for it by score^a * overlap^b among those inside it;
-these learn the box (generalised overlap) and, as score, how well they are aligned.
+Each true box is assigned the cells inside it whose prediction has the highest score^a * overlap^b. They learn
+the box (generalised IoU) and, as score, their alignment.
 """
 
 from __future__ import annotations
@@ -29,21 +29,23 @@ def overlaps(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def assign(boxes: Tensor, scores: Tensor, cells: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of one image: (cells that hold something (P,), which true box each has (P,), its score target (P,)).
+    """Assign true boxes to the cells of one image.
 
-    boxes (A, 4) and scores (A, kinds) are predictions, cells (A, 3), truth (G, 5).
+    boxes: (A, 4), predicted. scores: (A, kinds), predicted. cells: (A, 3). truth: (G, 5).
+
+    Returns the assigned cells (P,), the index of each one's true box (P,) and its score target (P,).
     """
     if not len(truth):
         none = torch.zeros(0, dtype=torch.long)
         return none, none, torch.zeros(0)
     true = truth[:, None, :4]
     centre = cells[None, :, :2]
-    # Small things contain few cell centres: half a stride around them counts as inside.
+    # Half a stride around a box counts as inside, because small boxes contain few cell centres.
     reach = cells[None, :, 2] * 0.5
     inside = ((centre - true[..., :2]).amin(-1) > -reach) & ((true[..., 2:] - centre).amin(-1) > -reach)
     iou = overlaps(boxes[None], true)[0]
     metric = scores[:, truth[:, 4].long()].T ** SCORE_POWER * iou**OVERLAP_POWER
-    # Before anything is learnt every overlap is nil: then the nearest cells of the nearest stride have it.
+    # At the start of training all overlaps are zero: the nearest cells of the nearest stride are assigned.
     size = (truth[:, 2:4] - truth[:, :2]).amax(1, keepdim=True)
     near = (centre - (true[..., :2] + true[..., 2:]) / 2).norm(dim=-1) / size
     fit = (torch.log2(size / (cells[None, :, 2] * 4.0))).abs()
@@ -51,7 +53,7 @@ def assign(boxes: Tensor, scores: Tensor, cells: Tensor, truth: Tensor) -> tuple
     best = metric.topk(min(TOP_CELLS, metric.shape[1]), dim=1)
     taken = torch.zeros_like(metric).scatter_(1, best.indices, (best.values > 0).float()) > 0
     aligned = torch.where(taken, metric, torch.zeros(()))
-    # A cell that several want goes to the one that it overlaps most, among equals to the smallest.
+    # A cell of several boxes goes to the one with the largest overlap, among equals to the smallest.
     claim = torch.where(taken, iou + 1e-3 / size, torch.full_like(iou, -1.0))
     owner = claim.argmax(0)
     holds = (claim.amax(0) > 0).nonzero()[:, 0]

@@ -29,7 +29,8 @@ class Conv(nn.Module):
 
 
 class C2f(nn.Module):
-    """Cross-stage block: half of the channels pass by ``n`` residual pairs, and all stages are joined."""
+    """Cross-stage block: half of the channels bypass ``n`` residual pairs, and all stages are
+    concatenated."""
 
     def __init__(self, c_in: int, c_out: int, n: int = 1, residual: bool = True) -> None:
         super().__init__()
@@ -50,7 +51,7 @@ class C2f(nn.Module):
 
 
 class SPPF(nn.Module):
-    """Three poolings of 5 x 5 in a row beside the map itself: context from far away for little."""
+    """Spatial pyramid pooling: the map and three poolings of 5 x 5 in a row."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -65,7 +66,8 @@ class SPPF(nn.Module):
 
 
 class Head(nn.Module):
-    """Of one map: scores of the kinds as logits, and distances to the box's four sides in strides."""
+    """Head of one map: scores of the kinds as logits, and distances to the four sides of the box in
+    strides."""
 
     def __init__(self, channels: int, kinds: int) -> None:
         super().__init__()
@@ -129,5 +131,5 @@ def _cells(feature: Tensor, stride: int) -> Tensor:
 
 
 def parameters(model: nn.Module) -> int:
-    """How many numbers a network learns."""
+    """Number of learned parameters of a network."""
     return sum(p.numel() for p in model.parameters())

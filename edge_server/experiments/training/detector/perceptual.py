@@ -1,4 +1,5 @@
-"""``edge-server train-perceptual``: fits the stand-in for LPIPS to real LPIPS; says how well it follows."""
+"""``edge-server train-perceptual``: fits the stand-in for LPIPS to real LPIPS and measures the
+correlation."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import MODELS, EmbeddingError
+from edge_server.experiments.common.arguments import command_parser, run_command
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, Layers, Perceptual, save_coefficients
 
@@ -32,35 +34,33 @@ and on what a field of ours renders of the shipped scenes while it learns. All o
 tile; for a scene of another kind look at what is found with one scene left out of the fit altogether. Needs
 the weights of LPIPS; whoever uses the distance does not. In OUT: perceptual.npz and perceptual.json.
 """
-# The power's range, and where its search starts.
+# Range of the power, and the start of its search.
 POWERS, _START = (0.3, 2.0), 0.7
-# Added to distances within the fit, whose logarithm is taken: a thousandth of the smallest that matter.
+# Added to distances before their logarithm is taken in the fit: a thousandth of the smallest that matter.
 _NEAR = 1e-6
-TRIES = 5  # distortions of each picture
+TRIES = 5  # distortions of each image
 UNSEEN = "unseen variations"
-_PART = 32
-_TOLD_EVERY = 20  # parts
+_BATCH = 32
+_REPORT_EVERY = 20  # batches
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
+
+    def work() -> None:
+        results = run(args)
+        print(json.dumps(results) if args.json else show(results))
+
+    stopped = f"the same command goes on with the pictures in {args.out}"
     try:
-        told = run(args)
-    except (EmbeddingError, FitFailed) as error:
-        print(f"edge-server train-perceptual: {error}", file=sys.stderr)
-        return 2
+        return run_command("train-perceptual", work, (EmbeddingError, FitFailed), stopped)
     except ModuleNotFoundError as error:
         print(
             f"edge-server train-perceptual needs {error.name}: pip install 'freshfield[edge,embed]'",
             file=sys.stderr,
         )
         return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; the same command goes on with the pictures in {args.out}", flush=True)
-        return 130
-    print(json.dumps(told) if args.json else show(told))
-    return 0
 
 
 class FitFailed(ValueError):
@@ -70,7 +70,12 @@ class FitFailed(ValueError):
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Render, distort, fit, measure, write; returns what perceptual.json holds."""
     from edge_server.experiments.common.progress import Progress
-    from edge_server.experiments.training.detector.dataset import Pictures, of_own_rigs, render, scenes_of
+    from edge_server.experiments.training.detector.dataset import (
+        LabeledImages,
+        of_own_rigs,
+        render,
+        scenes_of,
+    )
     from edge_server.experiments.training.detector.network import LAYERS
     from edge_server.experiments.training.detector.renderings import field_renderings
     from freshfield.files import write_json
@@ -82,19 +87,19 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     layers = Layers(args.detector, tuple(f"model.{k}" for k in LAYERS))
     worlds, held = (8, 3) if args.quick else (args.worlds, 20)
 
-    def distort(pictures: Pictures, purpose: str) -> tuple[NDArray[np.uint8], list[str]]:
-        return pairs_of(pictures.images, np.random.default_rng([args.seed, *purpose.encode()]))
+    def distort(dataset: LabeledImages, purpose: str) -> tuple[NDArray[np.uint8], list[str]]:
+        return pairs_of(dataset.images, np.random.default_rng([args.seed, *purpose.encode()]))
 
     def compare(pairs: NDArray[np.uint8], name: str) -> tuple[Array, Array]:
         """Differences (n, D) and LPIPS (n,)."""
         progress = Progress(len(pairs))
         x, y = [], []
-        for first in range(0, len(pairs), _PART):
-            shown, truth = (p[first : first + _PART] / 255.0 for p in (pairs[:, 0], pairs[:, 1]))
+        for first in range(0, len(pairs), _BATCH):
+            shown, truth = (p[first : first + _BATCH] / 255.0 for p in (pairs[:, 0], pairs[:, 1]))
             x.append(layers.differences(shown, truth))
             y.append(lpips.batch(shown, truth))
             progress.advance(len(shown))
-            if first // _PART % _TOLD_EVERY == _TOLD_EVERY - 1:
+            if first // _BATCH % _REPORT_EVERY == _REPORT_EVERY - 1:
                 progress.report(name, f"{first + len(shown)} of {len(pairs)} pairs", "compared")
         return np.concatenate(x), np.concatenate(y)
 
@@ -104,8 +109,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     weights, power = fit(x, y)
     unseen = render("perceptual-held-out", held, args.side, args.seed, folder, args.workers)
     tests = {UNSEEN: distort(unseen, "unseen worlds")}
-    for name, pictures in of_own_rigs(args.side).items():
-        tests[f"own rig of {name}"] = distort(pictures, name)
+    for name, dataset in of_own_rigs(args.side).items():
+        tests[f"own rig of {name}"] = distort(dataset, name)
     tests["field renderings"] = field_renderings(args.side, args.seed)
     rank, by_scene = {}, [Compared(x, y, scenes_of("perceptual", worlds, args.seed))]
     for name, (pairs, names) in tests.items():
@@ -117,7 +122,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     taps = tuple(layers.taps)
     Perceptual(layers, split, power)  # what is written can be read
     save_coefficients(args.out / COEFFICIENTS, taps, split, power)
-    told = {
+    results = {
         "fitted_to": f"LPIPS-{lpips.network}", "pairs": len(y), "power": power, "seed": args.seed,
         "share_by_layer": {
             tap: round(float((x[:, part] @ weights[part]).sum() / (x @ weights).sum()), 3)
@@ -126,13 +131,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
         "scene_left_out_of_the_fit": left_out(by_scene),
     }  # fmt: skip
-    write_json(args.out / "perceptual.json", told, indent=1)
-    return told
+    write_json(args.out / "perceptual.json", results, indent=1)
+    return results
 
 
 def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[str]]:
-    """(n, 2, H, W, 3): what is shown and what is true, and how each was distorted. Neighbours in ``images``
-    are other instants of the same view."""
+    """Pairs (n, 2, H, W, 3) of a distorted and a true image, and the name of each distortion. Neighbours in
+    ``images`` are other instants of the same view."""
     from edge_server.experiments.training.detector.distortions import distorted
 
     pairs, names = [], []
@@ -146,8 +151,8 @@ def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArr
 
 
 def fit(x: Array, y: Array) -> tuple[Array, float]:
-    """Weights (D,), not negative, and the power for which (x @ weights)^power is nearest to y (n,): least
-    squares of the roots, so that small distances are told apart as well as large ones."""
+    """Non-negative weights (D,) and the power for which (x @ weights)^power is nearest to y (n,), by least
+    squares of the roots, so that small distances count as much as large ones."""
     from scipy.optimize import minimize
 
     scale = x.mean(axis=0) + 1e-9
@@ -170,7 +175,7 @@ def fit(x: Array, y: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Differences (n, D), LPIPS (n,), and the scene of each picture, of which there are ``TRIES`` pairs."""
+    """Differences (n, D), LPIPS (n,), and the scene of each image, which has ``TRIES`` pairs."""
 
     x: Array
     y: Array
@@ -183,9 +188,8 @@ class Compared:
 
 
 def left_out(known: Sequence[Compared]) -> dict[str, Any]:
-    """``correlation`` on all pairs of each scene, with weights and power fitted to the others' of the first
-    set: what to expect of a scene that is no variation of those fitted to. (The backbone has seen variations
-    of all of them.)"""
+    """``correlation`` on all pairs of each scene, with weights and power fitted to the other scenes of the
+    first set: what to expect of a new scene. (The backbone was trained on variations of all of them.)"""
     found = {}
     for scene in sorted(set(known[0].scenes)):
         x, y = known[0].of(scene, others=True)
@@ -216,11 +220,11 @@ def correlation(found: Array, true: Array, names: Sequence[str]) -> dict[str, An
     }
 
 
-def show(told: dict[str, Any]) -> str:
-    """The outcome for people."""
-    lines = [f"fitted to {told['fitted_to']} on {told['pairs']} pairs, power {told['power']:.2f}"]
-    left = {f"{name} not fitted to": row for name, row in told["scene_left_out_of_the_fit"].items()}
-    for name, found in (told["unseen"] | left).items():
+def show(results: dict[str, Any]) -> str:
+    """The results as text."""
+    lines = [f"fitted to {results['fitted_to']} on {results['pairs']} pairs, power {results['power']:.2f}"]
+    left = {f"{name} not fitted to": row for name, row in results["scene_left_out_of_the_fit"].items()}
+    for name, found in (results["unseen"] | left).items():
         lines.append(
             f"  {name:20} Spearman {found['spearman']:.3f}  Pearson {found['pearson']:.3f}  "
             f"mean error {found['mean_absolute_error']:.3f}  ({found['pairs']} pairs)"
@@ -234,10 +238,7 @@ def _slices(widths: Sequence[int]) -> list[slice]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "edge-server train-perceptual", description=DESCRIPTION, formatter_class=raw
-    )
+    parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--detector", type=Path, default=MODELS / DETECTOR, metavar="FILE", help="[the shipped one]")

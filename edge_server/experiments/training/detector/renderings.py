@@ -1,4 +1,4 @@
-"""What fields of ours really show, half-fitted and well-fitted: the pictures that a distance is for."""
+"""Renderings of half-fitted and well-fitted fields, on which a perceptual distance is tested."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 
 FIELD = "voxel"
-# Optimiser steps between pictures: from fog to as good as it gets.
+# Optimiser steps between renderings.
 STEPS = (15, 25, 60, 150, 250)
 INSTANT_S = 0.4
 

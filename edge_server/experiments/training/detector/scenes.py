@@ -1,9 +1,9 @@
-"""What the detector learns from: variations of our own worlds, and exact boxes of what is in them.
+"""Training scenes of the detector: variations of the shipped worlds, with exact bounding boxes.
 
-A seed makes one variation: a shipped scene without some of its furniture, with people, carts, balls and
-drums on paths of their own, seen by one camera. What a thing is follows from its shape: a figure is a
-person, a sphere a ball, a cylinder of stout proportions a drum, whether it moves or not. Its box encloses
-the pixels whose ray meets it first, so it is exact and tells of what can be seen, not of what is hidden.
+A seed makes one variation: a shipped scene without some of its furniture, with people, carts, balls and drums
+on random paths, seen by one camera. The kind of a thing follows from its shape, whether it moves or not: a
+figure is a person, a sphere a ball, a cylinder of drum-like proportions a drum. Its box encloses the pixels
+whose ray meets it first: the visible part.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from camera_node.synthetic.shapes import Cylinder, Quad, Shape, Sphere
 from freshfield.geometry import Array, Pinhole, look_at, world_rays
 
 KINDS = ("person", "cart", "ball", "drum")
-# The least that counts as seen: a side and an area of visible pixels.
+# Smallest side and area, in visible pixels, of a box.
 MIN_SIDE_PX, MIN_PIXELS = 5, 20
-# Height over width of a cylinder that is still a drum, not a pole or a coin.
-_STOUT = (0.4, 3.0)
+# Height over width of a cylinder that is a drum, not a pole or a coin.
+_DRUM_PROPORTIONS = (0.4, 3.0)
 _PRESENT = 0.75  # share of the furniture that a variation keeps
 _SHARES = {"room": 0.45, "tower": 0.35, "tile": 0.20}
 
@@ -68,17 +68,21 @@ class Shot:
 
 
 def kind_of(shape: Shape, matrix: Array) -> int | None:
-    """The kind that a part that stands alone is, by its shape; None for furniture."""
+    """Number of the kind of a single part, by its shape; None for furniture."""
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
     if isinstance(shape, Sphere) and np.ptp(stretch) < 0.05 * stretch.max():
         return KINDS.index("ball")
-    if isinstance(shape, Cylinder) and _STOUT[0] <= shape.half_height / shape.radius <= _STOUT[1]:
+    if (
+        isinstance(shape, Cylinder)
+        and _DRUM_PROPORTIONS[0] <= shape.half_height / shape.radius <= _DRUM_PROPORTIONS[1]
+    ):
         return KINDS.index("drum")
     return None
 
 
 def boxes_of(owner: NDArray[np.int64], kinds: Sequence[int | None]) -> Boxes:
-    """Boxes of the things that own pixels: owner (H, W), numbers into ``kinds``, -1 for nobody."""
+    """Boxes of the visible things. owner: (H, W), the index into ``kinds`` of the thing that each pixel
+    shows, -1 for none."""
     found = []
     for thing in np.unique(owner):
         kind = kinds[thing] if thing >= 0 else None
@@ -100,18 +104,18 @@ def own_rig(name: str, camera: str, side: int) -> Shot:
 
 def scene_of(seed: int, purpose: str) -> str:
     """Name of the shipped scene that ``variation`` begins with."""
-    return _begun(seed, purpose)[0]
+    return _base_scene(seed, purpose)[0]
 
 
-def _begun(seed: int, purpose: str) -> tuple[str, np.random.Generator]:
+def _base_scene(seed: int, purpose: str) -> tuple[str, np.random.Generator]:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *purpose.encode()]))
     return str(rng.choice(list(_SHARES), p=list(_SHARES.values()))), rng
 
 
 def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Generator]:
-    """The shot that a seed makes, and the generator to draw its instants from. ``purpose`` keeps training and
-    held-out worlds apart whatever their seeds."""
-    name, rng = _begun(seed, purpose)
+    """The shot of a seed, and the generator to draw its instants from. ``purpose`` separates training and
+    held-out worlds of equal seeds."""
+    name, rng = _base_scene(seed, purpose)
     scene = make_scene(name, {"count": 1, "width": side, "height": side})
     statics = tuple(
         p for p in scene.world.static_parts if isinstance(p.shape, Quad) or rng.random() < _PRESENT
@@ -205,7 +209,7 @@ def _moved(mover: MovingBody, matrix: Array) -> MovingBody:
 
 
 def _viewpoint(rng: np.random.Generator, name: str, scene: Scene, movers: Sequence[MovingBody]) -> Array:
-    """Where cameras of the scene may stand; half of them look towards something that moves."""
+    """A random camera pose of the scene; half of them look towards something that moves."""
     target = np.asarray(scene.target, dtype=np.float64)
     if name == "tile":
         aim = target + rng.uniform((-0.12, -0.1, -0.02), (0.12, 0.1, 0.02))

@@ -1,4 +1,4 @@
-"""Trains the detector; an epoch is the unit that is kept, and that Ctrl-C and a resumed run agree on."""
+"""Trains the detector. Every epoch writes a checkpoint, from which a stopped run continues."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.training.detector.dataset import Pictures
+from edge_server.experiments.training.detector.dataset import LabeledImages
 from edge_server.experiments.training.detector.loss import detection_loss
 from edge_server.experiments.training.detector.network import Detector
 from edge_server.experiments.training.detector.scenes import KINDS, MIN_SIDE_PX, Boxes
@@ -33,7 +33,7 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the weights, bit for bit, threads included: they split sums."""
+    """Settings that decide the weights bit for bit; threads too, because they split sums."""
 
     seed: int = 0
     side: int = 128
@@ -43,8 +43,11 @@ class Settings:
     threads: int = 1
 
 
-def train(pictures: Pictures, settings: Settings, checkpoint: Path) -> tuple[Detector, list[dict[str, Any]]]:
-    """(the averaged detector in eval mode, a row an epoch). Goes on from ``checkpoint`` if it is there."""
+def train(
+    dataset: LabeledImages, settings: Settings, checkpoint: Path
+) -> tuple[Detector, list[dict[str, Any]]]:
+    """Train and return (the averaged detector in eval mode, a row an epoch). Continues from
+    ``checkpoint``."""
     torch.set_num_threads(settings.threads)
     torch.use_deterministic_algorithms(True)
     torch.manual_seed(settings.seed)
@@ -55,12 +58,12 @@ def train(pictures: Pictures, settings: Settings, checkpoint: Path) -> tuple[Det
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
     log = _resume(checkpoint, settings, model, averaged, optimizer)
-    per_epoch = len(pictures) // BATCH
+    per_epoch = len(dataset) // BATCH
     progress = Progress(settings.epochs - len(log))
     for epoch in range(len(log), settings.epochs):
         began, sums = time.perf_counter(), np.zeros(2)
         model.train()
-        for k, (images, truths) in enumerate(_batches(pictures, settings, epoch)):
+        for k, (images, truths) in enumerate(_batches(dataset, settings, epoch)):
             step = epoch * per_epoch + k
             for group in optimizer.param_groups:
                 group["lr"] = settings.rate * _schedule(step, settings.epochs * per_epoch)
@@ -78,8 +81,8 @@ def train(pictures: Pictures, settings: Settings, checkpoint: Path) -> tuple[Det
         log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
         _save(checkpoint, settings, model, averaged, optimizer, log)
         progress.advance(1)
-        told = f"loss {score_loss:.3f} + {box_loss:.3f}"
-        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", told)
+        losses = f"loss {score_loss:.3f} + {box_loss:.3f}"
+        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", losses)
     return averaged, log
 
 
@@ -140,14 +143,14 @@ def _save(
     part.replace(checkpoint)
 
 
-def _batches(pictures: Pictures, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
+def _batches(dataset: LabeledImages, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
     """Augmented batches of one epoch, a function of seed and epoch alone."""
-    order = np.random.default_rng([settings.seed, epoch]).permutation(len(pictures))
-    for first in range(0, len(pictures) - BATCH + 1, BATCH):
+    order = np.random.default_rng([settings.seed, epoch]).permutation(len(dataset))
+    for first in range(0, len(dataset) - BATCH + 1, BATCH):
         images, truths = [], []
         for i in order[first : first + BATCH]:
             rng = np.random.default_rng([settings.seed, epoch, int(i)])
-            image, boxes = augmented(pictures.images[i], pictures.boxes[i], rng)
+            image, boxes = augmented(dataset.images[i], dataset.boxes[i], rng)
             images.append(image)
             truths.append(torch.from_numpy(boxes))
         yield torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), truths
@@ -156,8 +159,8 @@ def _batches(pictures: Pictures, settings: Settings, epoch: int) -> Iterator[tup
 def augmented(
     image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], Boxes]:
-    """A picture (side, side, 3) as another camera might have taken it, in [0, 1], and its boxes: mirrored,
-    scaled, shifted, with another exposure and tint, now and then blurred or noisy."""
+    """A randomly augmented image (side, side, 3) in [0, 1] and its boxes: mirrored, scaled, shifted, with
+    another exposure and tint, sometimes blurred or noisy."""
     side = image.shape[0]
     boxes = boxes.copy()
     if rng.random() < 0.5:
@@ -173,7 +176,7 @@ def augmented(
         boxes[:, :4] = boxes[:, :4] * scale + np.tile(shift, 2)
         boxes[:, :4] = boxes[:, :4].clip(0, side)
         size = boxes[:, 2:4] - boxes[:, :2]
-        # What is cut down to a sliver cannot be told any more.
+        # Boxes that are mostly cut off are dropped.
         kept = (size.min(axis=1, initial=float(side)) >= MIN_SIDE_PX) & (
             size.prod(axis=1) > 0.25 * before * scale**2
         )

@@ -42,7 +42,8 @@ def choice_of_action(spec: Spec, action: Any, moment: DecisionPoint) -> Choice:
         return choose(make_policy(spec.action, omega_ms, np.random.default_rng(0)), moment)
     cameras = tuple(c for c, chosen in zip(moment.cameras, action) if chosen)
     # Without a reported frame there is nothing to select: use the first frame that arrives.
-    return Choice(cameras, moment.now_ns) if cameras else choose(_use_all(), moment)
+    use_all = make_policy("all", None, np.random.default_rng(0))
+    return Choice(cameras, moment.now_ns) if cameras else choose(use_all, moment)
 
 
 def choices(make: Maker, moments: Sequence[DecisionPoint], purpose: int = 0) -> list[Choice]:
@@ -56,10 +57,6 @@ def named(name: str) -> Maker:
     """Maker of a policy from ``make_policy``'s name and value, such as ``threshold:120``."""
     kind, _, value = (name, "", "") if name.startswith(BANDIT) else name.partition(":")
     return lambda rng: make_policy(kind, float(value) if value else None, rng)
-
-
-def _use_all() -> Policy:
-    return make_policy("all", None, np.random.default_rng(0))
 
 
 def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:

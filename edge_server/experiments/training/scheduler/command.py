@@ -5,21 +5,30 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import open_embedder, read_config
+from edge_server.config import read_config
+from edge_server.experiments.common.arguments import (
+    add_folders,
+    command_parser,
+    folders_of,
+    run_command,
+)
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import write_csv
-from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, evaluate_policies, rivals
+from edge_server.experiments.training.scheduler.evaluation import (
+    Evaluation,
+    baseline_policies,
+    evaluate_policies,
+)
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import (
     REPORTS,
     TrainingConfig,
@@ -28,13 +37,11 @@ from edge_server.experiments.training.scheduler.trainer import (
     train,
 )
 from edge_server.experiments.training.scheduler.workers import WorkerPool
-from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
-from edge_server.scheduler.learned.rewards import REWARDS, Reward, make_reward, without_missing_lpips
-from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.learned.rewards import REWARDS
 from freshfield.files import write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -68,38 +75,33 @@ OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with e
 apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. After Ctrl-C the same
 command goes on, bit for bit; so it does whatever --jobs is.
 """
-OMEGAS_MS = {
-    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
-    "wait": (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0),
-}
 LEARNT = "learnt"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    folders = Folders(base, weights_folder(args.lpips, base))
+    folders = folders_of(args)
     try:
         setting = setting_of(args, load(args.scenario))
-        config = _course(args, setting, folders)
+        config = _config(args, setting, folders)
         _check(args, config)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server train-scheduler: {error}", file=sys.stderr)
         return 2
-    try:
-        with WorkerPool(folders, args.jobs, _made(args.out) / "evaluations.jsonl") as pool:
-            _go(args, setting, config, pool)
-    except (ScenarioError, DatasetError, TrainingError) as error:
-        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; what is finished is in {args.out}: the same command goes on", flush=True)
-        return 130
-    return 0
+
+    def work() -> None:
+        args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        with WorkerPool(folders, args.jobs, args.out / "evaluations.jsonl") as pool:
+            _train_and_evaluate(args, setting, config, pool)
+
+    stopped = f"what is finished is in {args.out}: the same command goes on"
+    return run_command("train-scheduler", work, (ScenarioError, DatasetError, TrainingError), stopped)
 
 
-def _go(args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool) -> None:
+def _train_and_evaluate(
+    args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool
+) -> None:
     print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
     if config.reward.fidelity == "whole" and not config.reward.age:
         print("  the reward is of the whole image and has no term of age: where little moves it teaches to "
@@ -107,25 +109,25 @@ def _go(args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
     learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
-    # They are about an earlier call; one that was refused has left them alone.
+    # Reports of an earlier call; a call that was refused keeps them.
     for name in REPORTS:
         (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
-    spent = sum(row["seconds"] for row in rows)
+    spent_s = sum(row["seconds"] for row in rows)
     write_csv(args.out / "training.csv", rows)
-    print(f"  {config.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
+    print(f"  {config.episodes} episodes; trained for {spent_s:.0f} s in all", flush=True)
     if not args.test:
         draw_curve(args.out / "training.png", rows)
         return
     kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
-    everybody: dict[str, Maker | Actor] = {**rivals(omegas, kinds), LEARNT: learner.actor}
+    candidates: dict[str, Maker | Actor] = {**baseline_policies(omegas, kinds), LEARNT: learner.actor}
     evaluation = evaluate_policies(
-        setting.judged, pool, seeds(config.seed, "test", args.test), everybody, config.reward,
+        setting.judged, pool, seeds(config.seed, "test", args.test), candidates, config.reward,
         lambda line: print(f"  on unseen seeds: {line}", flush=True),
     )  # fmt: skip
     about = {
-        "reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent, 1),
+        "reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent_s, 1),
         "rewarded_from": setting.rewarding, "judged_from": setting.judged.scoring,
         "motions": setting.draws_motions,
     }  # fmt: skip
@@ -139,7 +141,7 @@ def _report(
     found = summary(evaluation, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
     levels = {label: found["rewards"][name][0] for label, name in names.items()}
-    # From another camera a reward has another zero, which the course of the training does not share.
+    # The zero of a reward depends on the cameras: levels of other cameras cannot be drawn beside the curve.
     shown = {} if about["rewarded_from"] != about["judged_from"] else levels
     draw_curve(out / "training.png", rows, {k: v for k, v in shown.items() if v is not None})
     write_json(out / "summary.json", {**found, **about}, indent=1)
@@ -199,37 +201,7 @@ def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
     return (scenario.training[len(scenario.training) // 2],)
 
 
-def reward_of(
-    name: str, on: str, lpips_folder: Path | None, network: str = "alex", distance: str = "lpips"
-) -> tuple[Reward, str | None]:
-    """The reward of a name, on the whole image or its moving pixels. network: the scenario's edge.lpips.
-    distance: lpips, perceptual (its stand-in) or none. Where LPIPS is asked for and cannot be had its term
-    is left out, and the second value says so."""
-    reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
-    if distance == "none":
-        return dataclasses.replace(reward, distance=0.0), None
-    if distance == "perceptual":
-        return dataclasses.replace(reward, distance_is="perceptual"), None
-    missing: str | None = "the scenario's edge.lpips is none"
-    if network != "none":
-        _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
-    found = without_missing_lpips(reward, missing)
-    return found, None if found == reward else f"the reward has no term of distance: {missing}"
-
-
-def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
-    """What a network sees of the state: ``parts``, embedded as the setting's scenario says. ValueError where
-    nothing can embed here."""
-    if "semantics" not in parts:
-        return StateLayout(parts)
-    from edge_server.embed import EmbeddingConfig
-
-    embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
-    assert embedder is not None
-    return StateLayout(parts, embedder.dim, embedding=embedder.name)
-
-
-def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
+def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
     name = args.reward or ("set" if args.kind == "select" else "corrected")
     network = read_config(setting.scenario).lpips
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
@@ -239,20 +211,19 @@ def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
-    given = _omegas(args)
     spec = Spec(
         args.kind,
         layout_of(setting, setting.parts),
-        () if args.kind == "select" else given or OMEGAS_MS[args.kind],
+        _omegas(args),
         network=args.network,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
 
 
-def _omegas(args: argparse.Namespace) -> tuple[float, ...] | None:
+def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
     if args.omegas is None:
-        return None
+        return OMEGAS_MS.get(args.kind, ())
     if args.kind == "select":
         raise ValueError("--omegas: --kind select chooses cameras, not an omega")
     try:
@@ -278,17 +249,8 @@ def _check(args: argparse.Namespace, config: TrainingConfig) -> None:
     seeds(config.seed, "train", config.episodes)
 
 
-def _made(out: Path) -> Path:
-    out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-    return out
-
-
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "edge-server train-scheduler", description=DESCRIPTION, formatter_class=raw
-    )
-    cores = usable_cores()
+    parser = command_parser("train-scheduler", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one; it must hold a camera out")
     add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")
@@ -325,9 +287,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--field", default="splat", metavar="NAME", help="representation, '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")
     add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
-    add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
-    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--lpips", type=Path, metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+    add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")
+    add_folders(parser)
     add("--out", type=Path, required=True, metavar="DIR", help="where everything is written")
     return parser

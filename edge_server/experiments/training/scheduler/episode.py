@@ -22,7 +22,7 @@ from camera_node.capture import Camera
 from camera_node.config import WorldConfig, source_config
 from camera_node.synthetic.effects import NO_EFFECTS
 from edge_server.config import read_config
-from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.training.scheduler.setting import GRID_MS, Setting
 from edge_server.experiments.virtual.from_scenario import (
     build_deployment,

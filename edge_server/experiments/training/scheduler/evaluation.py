@@ -1,23 +1,23 @@
-"""What was learnt against everything else, on seeds that nobody trained on, decision by decision.
+"""Compares policies on seeds that were never trained on, decision by decision.
 
-All policies decide at the same instants on the same deliveries, and every update starts from the same field:
-differences are paired. The unit that repeats is the episode's seed.
+All policies decide at the same instants on the same deliveries, and every update starts from the same field,
+so differences are paired. Intervals are over the episodes' seeds.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
 
-from edge_server.experiments.studies.statistics import Interval, at_its_best, interval, paired, share_closed
+from edge_server.experiments.common.statistics import Interval, at_its_best, interval, paired, share_closed
 from edge_server.experiments.training.scheduler.choices import Maker, choice_of_action, choices, named
 from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.workers import Asked, WorkerPool
+from edge_server.experiments.training.scheduler.workers import Request, WorkerPool
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 
@@ -25,54 +25,56 @@ PerSeed = dict[int, float | None]
 At = tuple[int, int]
 """Seed of an episode and number of a decision."""
 
-# What there is without learning, thresholds and waits aside.
-RIVALS = (
+# Policies without learning, thresholds and waits aside.
+BASELINE_POLICIES = (
     "random", "all", "periodic:500", "round-robin:6", "freshest-k:4", "freshest-k:6", "freshest-k:9",
     "freshest-k:12", "age-driven", "mask", "freshen",
 )  # fmt: skip
 HINDSIGHT = "hindsight"
-_ASKED_AT_ONCE = 400
+_REQUESTS_AT_ONCE = 400
 
 
 @dataclass
 class Evaluation:
-    """Outcomes by policy and decision. reward: by which they are judged; another one costs nothing. again:
-    the same choices carried out once more, with other luck: what looked best at a decision is measured where
-    it was not chosen, since the best of many lucky fits is better than any of them."""
+    """Outcomes by policy and decision.
+
+    reward: judges the outcomes; it may be replaced at no cost.
+    repeated: outcomes of the same choices with fields of other seeds. The choice that looks best in one
+        outcome is measured in the other, because the maximum of noisy fits is biased upwards.
+    """
 
     reward: Reward
     outcomes: dict[str, dict[At, Outcome]] = field(default_factory=dict)
-    again: dict[str, dict[At, Outcome]] = field(default_factory=dict)
+    repeated: dict[str, dict[At, Outcome]] = field(default_factory=dict)
 
     def value(self, outcome: Outcome) -> float | None:
-        """Its reward; None where a term is missing: it could not be compared."""
+        """Reward of an outcome; None where a term is missing."""
         found = self.reward.of(outcome)
         return found.total if found.complete else None
 
     def rewards(self, name: str) -> PerSeed:
-        """seed -> mean reward of its decisions. ``hindsight``: at every decision what was the best of all
-        that was tried there, which none can know: chosen by one fit and measured by another."""
-        if name == HINDSIGHT:
-            return _by_seed(self._top(list(self.outcomes))[0], self._nobodys())
-        return _by_seed(self._values(name), self._nobodys())
+        """seed -> mean reward of its decisions. ``hindsight``: of the best choice of all policies at each
+        decision, chosen by one fit and measured by another."""
+        values = self._hindsight(list(self.outcomes))[0] if name == HINDSIGHT else self.decisions(name)
+        return _by_seed(values, self._unscored())
 
     def decisions(self, name: str) -> dict[At, float | None]:
-        """Reward at every decision, mean of its fits; None where a term is missing."""
-        return self._values(name)
+        """Reward of every decision, mean of its fits; None where a term is missing."""
+        return {at: _mean([self.value(o) for o in self._fits(name, at)]) for at in self.outcomes[name]}
 
     def seeds(self, name: str) -> tuple[int, int]:
-        """How many seeds there are, and how many have a value."""
+        """Number of seeds, and of those with a value."""
         found = self.rewards(name)
         return len(found), sum(v is not None for v in found.values())
 
     def term(self, name: str, term: str) -> Interval:
-        """Mean of one term of the outcomes over seeds."""
+        """Mean of one field of the outcomes, over seeds."""
         found = {at: _mean([getattr(o, term) for o in self._fits(name, at)]) for at in self.outcomes[name]}
         return interval(list(_by_seed(found).values()))
 
     def best_fixed(self, kind: str) -> tuple[PerSeed, str]:
         """Rewards of ``kind`` (threshold, wait) at its best value, chosen on one half of the seeds and
-        measured on the other; and the name of the best over all."""
+        measured on the other; and the name of the best value over all seeds."""
         curve = {
             float(name.partition(":")[2]): self.rewards(name)
             for name in self.outcomes if name.startswith(f"{kind}:")
@@ -81,41 +83,37 @@ class Evaluation:
         best = max(means, key=lambda x: means[x])
         return dict(at_its_best(curve)), f"{kind}:{best:g}"
 
-    def against(self, name: str, other: PerSeed) -> Interval:
-        """Paired difference in reward, over seeds."""
-        return paired(self.rewards(name), other)
-
     def share(self, values: PerSeed) -> Interval:
-        """(r - random) / (hindsight - random): the share of what could be won."""
+        """(r - random) / (hindsight - random): the share of the possible gain."""
         return share_closed(values, self.rewards("random"), self.rewards(HINDSIGHT))
 
-    def varies(self, kind: str) -> dict[str, Any]:
-        """How far the best value of ``kind`` differs between decisions, and what knowing it would be worth:
-        hindsight among these values alone minus the best fixed one, paired over seeds. Nothing is known of
-        either where every choice was carried out only once."""
+    def best_values(self, kind: str) -> dict[str, Any]:
+        """How much the best value of ``kind`` varies between decisions: its ``quartiles``, and the ``gain``
+        of knowing it: hindsight among these values minus the best fixed one, paired over seeds. Both are
+        unknown where every choice was carried out only once."""
         names = [name for name in self.outcomes if name.startswith(f"{kind}:")]
-        top, best = self._top(names)
-        gain = paired(_by_seed(top, self._nobodys()), self.best_fixed(kind)[0])
+        rewards, best = self._hindsight(names)
+        gain = paired(_by_seed(rewards, self._unscored()), self.best_fixed(kind)[0])
         values = [float(names[k].partition(":")[2]) for k in best]
         quartiles = np.percentile(values, [25, 50, 75]).tolist() if values else [None] * 3
         return {"quartiles": quartiles, "gain": gain}
 
-    def _nobodys(self) -> set[At]:
-        """Decisions at which nobody's outcome has a value: nothing moves where the cameras look that judge,
-        say. That is in what was looked at, not in what was chosen."""
+    def _unscored(self) -> set[At]:
+        """Decisions at which no policy has a reward, for example because nothing moves in the images that
+        score. They are left out for all policies."""
         known = {at for of in self.outcomes.values() for at, o in of.items() if self.value(o) is not None}
         return {at for of in self.outcomes.values() for at in of} - known
 
     def _fits(self, name: str, at: At) -> list[Outcome]:
-        second = self.again.get(name, {}).get(at)
+        second = self.repeated.get(name, {}).get(at)
         return [self.outcomes[name][at], *([second] if second is not None else [])]
 
-    def _values(self, name: str) -> dict[At, float | None]:
-        return {at: _mean([self.value(o) for o in self._fits(name, at)]) for at in self.outcomes[name]}
+    def _hindsight(self, names: Sequence[str]) -> tuple[dict[At, float | None], list[int]]:
+        """Decision -> reward of the best of ``names`` there, and the indices of all best ones.
 
-    def _top(self, names: Sequence[str]) -> tuple[dict[At, float | None], list[int]]:
-        """Decision -> the reward of what was the best of ``names``: chosen by each of two fits and measured
-        by the other, of those that have both; None where none has. And the number of each best one."""
+        Chosen by each of two fits and measured by the other, among the policies that have both; None where
+        none has.
+        """
         found: dict[At, float | None] = {}
         best: list[int] = []
         for at in self.outcomes[names[0]] if names else ():
@@ -133,7 +131,7 @@ class Evaluation:
 
 
 class OracleCandidate(Protocol):
-    """A rival that may look at more of a decision than a policy sees."""
+    """A candidate that may look at more of a decision than a policy sees."""
 
     def choice(self, moment: DecisionPoint) -> Choice: ...
 
@@ -145,52 +143,53 @@ def evaluate_policies(
     setting: Setting,
     pool: WorkerPool,
     seeds: Sequence[int],
-    rivals: Mapping[str, Candidate],
+    candidates: Mapping[str, Candidate],
     reward: Reward,
-    say: Any = None,
+    say: Callable[[str], None] | None = None,
 ) -> Evaluation:
-    """Carry out what each of ``rivals`` chooses at every decision of every seed, twice, with fields of other
-    seeds. Give it ``Setting.judged``: what rewarded does not judge."""
-    evaluation = Evaluation(reward, {name: {} for name in rivals}, {name: {} for name in rivals})
-    episodes = pool.draw(setting, seeds)
-    asked: list[tuple[str, Asked]] = []
-    # All that is asked of one episode stands together: its pictures and its field are at hand once.
-    for moments in episodes:
-        for place, (name, rival) in enumerate(rivals.items()):
-            if isinstance(rival, Actor):
-                acts, _ = rival.act([m.state for m in moments])
-                chosen = [choice_of_action(rival.spec, a, m) for a, m in zip(acts, moments)]
-            elif callable(rival):
-                chosen = choices(rival, moments, place)
+    """Carry out the choice of every candidate at every decision of every seed, twice, with fields of other
+    seeds.
+
+    setting: ``Setting.judged``, because the cameras that reward must not judge.
+    say: called with lines of progress.
+    """
+    evaluation = Evaluation(reward, {name: {} for name in candidates}, {name: {} for name in candidates})
+    requests: list[tuple[str, Request]] = []
+    # All requests of one episode stand together, so that its images and its field are made once.
+    for moments in pool.draw(setting, seeds):
+        for place, (name, candidate) in enumerate(candidates.items()):
+            if isinstance(candidate, Actor):
+                actions, _ = candidate.act([m.state for m in moments])
+                chosen = [choice_of_action(candidate.spec, a, m) for a, m in zip(actions, moments)]
+            elif callable(candidate):
+                chosen = choices(candidate, moments, place)
             else:
-                chosen = [rival.choice(m) for m in moments]
-            asked += [(name, (m.seed, m.number, c)) for m, c in zip(moments, chosen)]
-    fits = [
-        (evaluation.outcomes, setting),
-        (evaluation.again, dataclasses.replace(setting, repeat=setting.repeat + 1)),
-    ]
+                chosen = [candidate.choice(m) for m in moments]
+            requests += [(name, (m.seed, m.number, c)) for m, c in zip(moments, chosen)]
+    other_seeds = dataclasses.replace(setting, repeat=setting.repeat + 1)
+    fits = [(evaluation.outcomes, setting), (evaluation.repeated, other_seeds)]
     for turn, (into, where) in enumerate(fits):
-        for first in range(0, len(asked), _ASKED_AT_ONCE):
-            part = asked[first : first + _ASKED_AT_ONCE]
-            found = pool.evaluate(where, [a for _, a in part])
+        for first in range(0, len(requests), _REQUESTS_AT_ONCE):
+            part = requests[first : first + _REQUESTS_AT_ONCE]
+            found = pool.evaluate(where, [request for _, request in part])
             for (name, (seed, number, _)), outcome in zip(part, found):
                 into[name][seed, number] = outcome
             if say is not None:
-                say(f"{turn * len(asked) + first + len(part)}/{2 * len(asked)} evaluations")
+                say(f"{turn * len(requests) + first + len(part)}/{2 * len(requests)} evaluations")
     return evaluation
 
 
-def rivals(
-    omegas_ms: Sequence[float], kinds: Sequence[str], others: Sequence[str] = RIVALS
+def baseline_policies(
+    omegas_ms: Sequence[float], kinds: Sequence[str], others: Sequence[str] = BASELINE_POLICIES
 ) -> dict[str, Maker]:
-    """The policies without learning that are tried, by name."""
+    """The policies without learning that are evaluated, by name."""
     fixed = [f"{kind}:{omega:g}" for kind in kinds for omega in omegas_ms]
     return {name: named(name) for name in (*others, *fixed)}
 
 
 def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
-    """A row for each policy: its reward, how much that is over random, its share, and the outcomes' terms;
-    intervals over seeds. labels: put before all of them."""
+    """A table row for each policy: its reward, its gain over random, its share and the fields of its
+    outcomes; intervals over seeds. labels: first columns of every row."""
     terms = [f.name for f in fields(Outcome)]
     found = []
     for name in [*evaluation.outcomes, HINDSIGHT]:
@@ -209,13 +208,13 @@ def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
     return found
 
 
-def _by_seed(values: Mapping[At, float | None], nobodys: Container[At] = ()) -> PerSeed:
-    """Mean over each seed's decisions; None where one of them has no value, lest seeds be compared that
-    lack different ones. nobodys: decisions that are left out; None where all of a seed's are."""
+def _by_seed(values: Mapping[At, float | None], left_out: Container[At] = ()) -> PerSeed:
+    """Mean over each seed's decisions, those ``left_out`` aside. None where one of them has no value, because
+    seeds that lack different decisions cannot be compared, and where all are left out."""
     found: dict[int, list[float | None]] = {}
     for (seed, number), value in values.items():
         mine = found.setdefault(seed, [])
-        if (seed, number) not in nobodys:
+        if (seed, number) not in left_out:
             mine.append(value)
     return {
         seed: float(np.mean(np.array(mine, float))) if mine and None not in mine else None
@@ -224,6 +223,6 @@ def _by_seed(values: Mapping[At, float | None], nobodys: Container[At] = ()) -> 
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """None where one is missing."""
+    """None where a value is missing."""
     known = [v for v in values if v is not None]
     return sum(known) / len(known) if known and len(known) == len(values) else None

@@ -61,9 +61,9 @@ class FitDecision:
 
     def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
         """Reward of a real fit, NaN if a term is missing, and its terms."""
-        of, moment = self.problem, self.moment
-        choice = choice_of_action(of.spec, action, moment)
-        (outcome,) = of.pool.evaluate(of.setting, [(moment.seed, moment.number, choice)])
-        found = of.reward.of(outcome)
+        problem, moment = self.problem, self.moment
+        choice = choice_of_action(problem.spec, action, moment)
+        (outcome,) = problem.pool.evaluate(problem.setting, [(moment.seed, moment.number, choice)])
+        found = problem.reward.of(outcome)
         total = found.total if found.complete else None
         return (math.nan if total is None else total), found.terms

@@ -1,4 +1,4 @@
-"""What a training came to: its curve, and in words how it did against everything else."""
+"""Reports of a training: its learning curve, and its evaluation against all other policies."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.studies.statistics import Interval, interval, paired
+from edge_server.experiments.common.statistics import Interval, interval, paired
 from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation, PerSeed
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
@@ -17,8 +17,12 @@ _SMOOTH = 9
 
 
 def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, float] | None = None) -> None:
-    """The learning curve (figures 5.9, 6.8), every term of the reward beside it. levels: label -> reward of
-    policies that do not learn, on seeds of testing."""
+    """Draw the learning curve (figures 5.9, 6.8) and the terms of the reward.
+
+    path: of the PNG.
+    rows: of the log, one a batch.
+    levels: label -> reward of a policy without learning, on the test seeds.
+    """
     terms = [name for name in rows[0] if name.startswith("term_")]
     episodes = [row["episodes"] for row in rows]
     with figure(path, 2, height_inch=2.6, sharex=True) as (_, axes):
@@ -31,44 +35,48 @@ def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, flo
         label_lines(top, "reward", None, "Learning, explored actions included")
         for k, term in enumerate(terms):
             values = smoothed(_numbers(rows, term))
-            # What terms are worth has an arbitrary zero: their change is what can be compared.
+            # The zero of a term is arbitrary; its change can be compared.
             bottom.plot(episodes, values - values[:1], color=CYCLE[k], label=term.removeprefix("term_"))
         label_lines(bottom, "terms of the reward,\nchange since the start", "episodes")
 
 
 def smoothed(values: np.ndarray, count: int = _SMOOTH) -> np.ndarray:
-    """Mean of the last ``count`` values at each (fewer at the beginning); NaN counts for nothing."""
+    """Moving average over the last ``count`` values, fewer at the beginning, NaN left out."""
     parts = [values[max(0, i + 1 - count) : i + 1] for i in range(len(values))]
     return np.array([np.nan if np.isnan(p).all() else np.nanmean(p) for p in parts])
 
 
 def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
-    """Figures of a contest as JSON takes them: rewards, paired differences and shares, each with its 95 %
-    interval over seeds. fixed: the kind whose best value is the one to beat, threshold or wait."""
+    """Results of an evaluation for JSON: rewards, paired differences and shares, each as mean and ends of the
+    95 % interval over seeds.
+
+    trained: name of the trained policy.
+    fixed: kind of the baseline, threshold or wait, of which the best value is compared.
+    """
     mine = evaluation.rewards(trained)
     best, name = evaluation.best_fixed(fixed)
-    varies = evaluation.varies(fixed)
+    best_values = evaluation.best_values(fixed)
     return {
         "seeds": evaluation.seeds(trained)[1],
         "seeds_without_value": evaluation.seeds(trained)[0] - evaluation.seeds(trained)[1],
-        "reward": _told(interval(list(mine.values()))),
-        "rewards": {n: _told(interval(list(evaluation.rewards(n).values())))
+        "reward": _as_list(interval(list(mine.values()))),
+        "rewards": {n: _as_list(interval(list(evaluation.rewards(n).values())))
                     for n in (*evaluation.outcomes, HINDSIGHT)},
-        "over_random": _told(paired(mine, evaluation.rewards("random"))),
-        "over_best_fixed": _told(paired(mine, best)),
+        "over_random": _as_list(paired(mine, evaluation.rewards("random"))),
+        "over_best_fixed": _as_list(paired(mine, best)),
         "best_fixed": name,
-        "share": _told(evaluation.share(mine)),
-        "best_fixed_share": _told(evaluation.share(best)),
-        "best_value_by_decision": varies["quartiles"],
-        "knowing_it_is_worth": _told(varies["gain"]),
+        "share": _as_list(evaluation.share(mine)),
+        "best_fixed_share": _as_list(evaluation.share(best)),
+        "best_value_by_decision": best_values["quartiles"],
+        "knowing_it_is_worth": _as_list(best_values["gain"]),
     }  # fmt: skip
 
 
 def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:
-    """The same for people."""
+    """``summary`` as lines of text."""
     mine, random = evaluation.rewards(trained), evaluation.rewards("random")
     best, name = evaluation.best_fixed(fixed)
-    varies = evaluation.varies(fixed)
+    best_values = evaluation.best_values(fixed)
     drawn, known = evaluation.seeds(trained)
     lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
     return [
@@ -77,20 +85,20 @@ def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:
         f"{span(paired(mine, best))}",
         f"share of what could be won: {span(evaluation.share(mine), 2)}; the best fixed {fixed} has "
         f"{span(evaluation.share(best), 2)}",
-        f"the best {fixed} of a decision is {quartiles(varies)}; to know it would be worth "
-        f"{span(varies['gain'])} over the best fixed one",
+        f"the best {fixed} of a decision is {quartiles(best_values)}; to know it would be worth "
+        f"{span(best_values['gain'])} over the best fixed one",
     ]
 
 
-def quartiles(varies: dict[str, Any]) -> str:
-    """``contest.varies`` for people."""
-    low, middle, high = varies["quartiles"]
+def quartiles(best_values: dict[str, Any]) -> str:
+    """The quartiles of ``Evaluation.best_values`` as text."""
+    low, middle, high = best_values["quartiles"]
     return "not known" if middle is None else f"{middle:g} ms (quartiles {low:g} to {high:g})"
 
 
 def percent(values: PerSeed, base: PerSeed) -> str:
-    """Gain in mean reward over ``base``, in per cent of its size, as the thesis tells it. Where the reward's
-    zero, which is arbitrary, lies near ``base`` or between the two, there is no such figure."""
+    """Gain in mean reward over ``base`` in percent of its size, as in the thesis. The text says that there is
+    none where the arbitrary zero of the reward lies near ``base`` or between the two."""
     a, b = interval(list(values.values())), interval(list(base.values()))
     if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
         return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"
@@ -104,7 +112,7 @@ def span(i: Interval, digits: int = 4) -> str:
     return f"{i.mean:.{digits}f} [{i.low:.{digits}f}, {i.high:.{digits}f}]"
 
 
-def _told(i: Interval) -> list[float | None]:
+def _as_list(i: Interval) -> list[float | None]:
     return [None if np.isnan(v) else round(v, 6) for v in (i.mean, i.low, i.high)]
 
 

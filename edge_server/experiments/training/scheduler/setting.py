@@ -7,11 +7,15 @@ import hashlib
 import json
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edge_server.config import ComputeConfig
+from edge_server.config import ComputeConfig, open_embedder, read_config
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.scheduler.learned.rewards import Reward, make_reward, without_missing_lpips
+from edge_server.scheduler.learned.state import StateLayout
 from freshfield.scenario import Scenario, ScenarioError
 
 # Rendering a truth costs ten times a score. Instants lie on a grid that contains the lags of moving pixels
@@ -21,6 +25,11 @@ GRID_MS = 10
 PURPOSES = ("train", "choose", "test")
 SEEDS_A_PURPOSE = 10**6
 _SEEDS_A_RUN = 10**7
+# Values that thresholds and waits are chosen from, in milliseconds.
+OMEGAS_MS = {
+    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
+    "wait": (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0),
+}
 
 
 @dataclass(frozen=True)
@@ -127,3 +136,38 @@ def seeds(run: int, purpose: str, count: int, first: int = 0) -> range:
         raise ValueError(f"seed: expected 0 to 999999999, and at most {SEEDS_A_PURPOSE} episodes")
     start = run * _SEEDS_A_RUN + PURPOSES.index(purpose) * SEEDS_A_PURPOSE + first
     return range(start, start + count)
+
+
+def reward_of(
+    name: str, on: str, lpips_folder: Path | None, network: str = "alex", distance: str = "lpips"
+) -> tuple[Reward, str | None]:
+    """A preset reward, and why it has no LPIPS term (None if it has what was requested).
+
+    name: of the preset.
+    on: whole or moving, the pixels of the PSNR.
+    lpips_folder: weights of LPIPS.
+    network: the scenario's edge.lpips.
+    distance: lpips, perceptual (its stand-in) or none.
+    """
+    reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
+    if distance == "none":
+        return dataclasses.replace(reward, distance=0.0), None
+    if distance == "perceptual":
+        return dataclasses.replace(reward, distance_is="perceptual"), None
+    missing: str | None = "the scenario's edge.lpips is none"
+    if network != "none":
+        _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
+    found = without_missing_lpips(reward, missing)
+    return found, None if found == reward else f"the reward has no term of distance: {missing}"
+
+
+def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
+    """The layout of a network's input: ``parts`` of the state, with the embedding of the setting's scenario.
+    ValueError where no embedder is available."""
+    if "semantics" not in parts:
+        return StateLayout(parts)
+    from edge_server.embed import EmbeddingConfig
+
+    embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
+    assert embedder is not None
+    return StateLayout(parts, embedder.dim, embedding=embedder.name)

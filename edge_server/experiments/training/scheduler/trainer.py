@@ -1,8 +1,11 @@
-"""A learner learns from decisions that are drawn, acted on, carried out and rewarded, batch by batch.
+"""Trains a learner: draw decisions, draw actions, evaluate them by field fits, update the weights.
 
-Everything follows from the seed: episodes from their numbers, actions from the learner's own stream, rewards
-from the field fits, whoever makes them. Between two batches the learner is all there is, so that a run that
-was stopped goes on bit for bit from its last checkpoint.
+Several actions are tried at every decision. The baseline of a try is the mean reward of the other tries of
+its decision (``subtract_sibling_baseline``), which reduces the variance of the policy gradient.
+
+The seed decides everything: episodes by their numbers, actions by the learner's own stream, rewards by the
+field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from its
+last checkpoint.
 """
 
 from __future__ import annotations
@@ -31,8 +34,8 @@ if TYPE_CHECKING:
     from edge_server.scheduler.learned.ppo import Learner
 
 Row = dict[str, Any]
-_TELL_EVERY_S = 5.0
-# What train-scheduler tells of a finished training, beside it.
+_PROGRESS_EVERY_S = 5.0
+# What train-scheduler writes of a finished training beside it.
 REPORTS = ("summary.json", "contest.csv")
 
 
@@ -42,11 +45,18 @@ class TrainingError(ValueError):
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How a learner is taught. episodes: in all; batch: of one update of the weights. tries: actions drawn
-    and carried out at every decision. Of more than one, each is rewarded by how much better it did than the
-    others of the same decision: their mean is an estimate of V(s) (5.24) that knows this very scene and
-    channel, which no function of the state does. seed: of episodes and of the learner. checkpoint_every:
-    batches. stages: numbers of batches after which what has been learnt until then is kept, too.
+    """How a learner is trained.
+
+    spec: the learner.
+    reward: of an outcome.
+    episodes: number of episodes in all.
+    batch: episodes of one update of the weights.
+    tries: actions that are evaluated at every decision. With more than one, the baseline of each is the mean
+        reward of the others: an estimate of V(s) (5.24) for this scene and channel, which a function of the
+        state cannot know.
+    seed: of the episodes and of the learner.
+    checkpoint_every: number of batches between checkpoints.
+    stages: numbers of batches after which the policy is kept, too (``stage_file``).
     """
 
     spec: Spec
@@ -69,7 +79,7 @@ class TrainingConfig:
         return -(-self.episodes // self.batch)
 
     def seeds(self, number: int) -> range:
-        """Of the episodes of a batch."""
+        """Seeds of the episodes of a batch."""
         first = number * self.batch
         return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
 
@@ -77,48 +87,56 @@ class TrainingConfig:
 def train(
     setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]
 ) -> Learner:
-    """Teach until the course is over; what is in ``out`` of the same course is gone on with. Writes
-    OUT/training.jsonl (a line a batch), OUT/training.json, ``stage_file`` of each of the course's stages and,
-    at its end, OUT/policy.npz. TrainingError where ``out`` holds another course, or where no reward can be
-    had; KeyboardInterrupt leaves the last checkpoint there."""
+    """Train for all episodes; a training with the same settings in ``out`` is continued.
+
+    Writes OUT/training.jsonl (a line a batch), OUT/training.json, the ``stage_file`` of each stage and, at
+    the end, OUT/policy.npz. KeyboardInterrupt leaves the last checkpoint there.
+
+    setting: where decisions come from.
+    pool: draws and evaluates them.
+    say: called with lines of progress.
+
+    Returns the trained learner. Raises TrainingError where ``out`` holds a training with other settings, or
+    where the first batch has no reward.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    kept = _Checkpoint(out, _key(setting, config))
-    learner, rows = kept.load()
+    checkpoint = _Checkpoint(out, _settings_key(setting, config))
+    learner, rows = checkpoint.load()
     began, first = time.monotonic(), len(rows)
     if first and first < config.batches:
         say(f"going on after {first} of {config.batches} batches")
     if learner is None:
-        # What an earlier course left must not pass for what this one teaches.
+        # The policy and reports of an earlier training must not be taken for those of this one.
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
         learner = _new_learner(setting, config, pool)
     learner.reward_fields = dataclasses.asdict(config.reward)
     for number in range(first, config.batches):
-        at = time.monotonic()
-        row = _one_batch(setting, config, pool, learner, number, say)
-        rows.append({**row, "seconds": round(time.monotonic() - at, 3)})
+        batch_began = time.monotonic()
+        row = _train_batch(setting, config, pool, learner, number, say)
+        rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
         if (number + 1) % config.checkpoint_every == 0 or number + 1 == config.batches:
-            kept.save(learner, rows)
+            checkpoint.save(learner, rows)
         if number + 1 in config.stages:
             learner.save(stage_file(out, number + 1))
         spent = time.monotonic() - began
         left = spent / (number + 1 - first) * (config.batches - number - 1)
-        say(f"{_told(config, row)}; {left:.0f} s left")
+        say(f"{_progress_text(config, row)}; {left:.0f} s left")
     learner.save(out / "policy.npz")
     return learner
 
 
 def stage_file(out: Path, batches: int) -> Path:
-    """Where a training in ``out`` keeps what had been learnt after so many batches."""
+    """File in which a training in ``out`` keeps its policy after so many batches."""
     return out / f"after-{batches:05d}.npz"
 
 
 def read_log(out: Path) -> list[Row]:
-    """The lines of a training so far, one a batch."""
+    """The log of a training so far, one row a batch."""
     return [json.loads(line) for line in (out / "training.jsonl").read_text().splitlines()]
 
 
-def _one_batch(
+def _train_batch(
     setting: Setting,
     config: TrainingConfig,
     pool: WorkerPool,
@@ -126,27 +144,29 @@ def _one_batch(
     number: int,
     say: Callable[[str], None],
 ) -> Row:
-    """Draw, act, carry out, learn. TrainingError where the first batch has not a single reward."""
-    chosen = config.seeds(number)
-    moments = [m for episode in pool.draw(setting, chosen) for m in episode]
-    pool.forget(setting, chosen)
+    """One update of the weights; returns its row of the log. TrainingError where the first batch has no
+    reward."""
+    episode_seeds = config.seeds(number)
+    moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
+    pool.forget(setting, episode_seeds)
     # The tries of one decision stand together.
     each = [m for m in moments for _ in range(config.tries)]
     states = [m.state for m in each]
     actions, logps = learner.act(states)
-    asked = [(m.seed, m.number, choice_of_action(config.spec, a, m)) for m, a in zip(each, actions)]
+    requests = [(m.seed, m.number, choice_of_action(config.spec, a, m)) for m, a in zip(each, actions)]
     before = pool.evaluated
-    outcomes = pool.evaluate(setting, asked, periodic_progress(say, f"fits of batch {number + 1}"))
+    outcomes = pool.evaluate(setting, requests, periodic_progress(say, f"fits of batch {number + 1}"))
     found = [config.reward.of(outcome) for outcome in outcomes]
-    # A reward that lacks a term is not comparable with one that does not.
+    # Rewards that lack a term cannot be compared with others.
     rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
     if number == 0 and not np.isfinite(rewards).any():
-        raise TrainingError(_why_not(outcomes, found))
-    update = learner.update(learner.batch(states, actions, logps, baseline_rewards(rewards, config.tries)))
+        raise TrainingError(_missing_reward_reason(outcomes, found))
+    advantages = subtract_sibling_baseline(rewards, config.tries)
+    update = learner.update(learner.batch(states, actions, logps, advantages))
     row: Row = {
-        "batch": number, "episodes": chosen[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
+        "batch": number, "episodes": episode_seeds[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
         "decisions": len(moments), "fits": len(each), "carried_out": pool.evaluated - before,
-        "processor_seconds": pool.cost_s(setting, asked),
+        "processor_seconds": pool.cost_s(setting, requests),
     }  # fmt: skip
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
@@ -156,20 +176,20 @@ def _one_batch(
 
 
 def periodic_progress(say: Callable[[str], None], what: str) -> Progress:
-    """Progress for people, where it takes long."""
+    """Progress of evaluations that prints a line every few seconds."""
     last_s = time.monotonic()
 
     def progress(done: int, count: int) -> None:
         nonlocal last_s
-        if time.monotonic() - last_s >= _TELL_EVERY_S:
+        if time.monotonic() - last_s >= _PROGRESS_EVERY_S:
             last_s = time.monotonic()
             say(f"{done}/{count} {what}")
 
     return progress
 
 
-def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
-    """Why not one of these has a reward, and what to do."""
+def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
+    """Why none of these outcomes has a reward, and what to change."""
     if not any(outcome.views for outcome in outcomes):
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
     missing = list(dict.fromkeys(name for r in found for name in r.missing))
@@ -183,10 +203,15 @@ def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
     )
 
 
-def baseline_rewards(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
-    """Rewards (B,) as they are learnt from, ``tries`` of every decision together: each less the mean of the
-    others of its decision, so that it does not count itself; of a single try, as it is. NaN where it, or
-    all others, are NaN."""
+def subtract_sibling_baseline(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
+    """Subtract from each reward the mean reward of its siblings, the other tries of the same decision
+    (leave-one-out baseline): it reduces the variance of the gradient without a bias.
+
+    rewards: (B,), the tries of one decision next to each other; NaN where there is none.
+    tries: number of tries of a decision; with one there are no siblings and the rewards are returned.
+
+    Returns (B,); NaN where the reward or those of all siblings are NaN.
+    """
     if tries == 1:
         return rewards
     table = rewards.reshape(-1, tries)
@@ -210,14 +235,14 @@ def _new_learner(setting: Setting, config: TrainingConfig, pool: WorkerPool) -> 
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    """A course's checkpoint: weights under a name of their own, then the file that names them, so that
-    what stands there is whole whenever it is stopped."""
+    """Checkpoint of a training: first the weights under a new name, then the file that names them, so it is
+    complete whenever the process is stopped."""
 
     out: Path
     key: str
 
     def load(self) -> tuple[Learner | None, list[Row]]:
-        """The learner and the rows of its log, if a course was begun here."""
+        """The learner and the rows of its log; (None, []) if there is no training here."""
         from edge_server.scheduler.learned.ppo import Learner
 
         path = self.out / "training.json"
@@ -250,14 +275,14 @@ class _Checkpoint:
                 old.unlink(missing_ok=True)
 
 
-def _key(setting: Setting, config: TrainingConfig) -> str:
-    taught = dataclasses.asdict(config)
-    taught.pop("checkpoint_every")  # decides when the disk is written, not what is learnt
-    text = json.dumps([setting.key, taught], sort_keys=True, default=str)
+def _settings_key(setting: Setting, config: TrainingConfig) -> str:
+    settings = dataclasses.asdict(config)
+    settings.pop("checkpoint_every")  # decides when the disk is written, not what is learned
+    text = json.dumps([setting.key, settings], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def _told(config: TrainingConfig, row: Row) -> str:
+def _progress_text(config: TrainingConfig, row: Row) -> str:
     omega = f", omega {row['omega_ms']:.0f} ms" if row.get("omega_ms") is not None else ""
     reward = "-" if row["reward"] is None else f"{row['reward']:.4f}"
     return f"{row['episodes']}/{config.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"

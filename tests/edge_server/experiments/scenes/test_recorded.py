@@ -59,8 +59,7 @@ def test_of_several_files_the_first_whose_images_exist_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("holdout", "message"),
-    [("nobody", "no image or camera 'nobody'"), ("1", "none is left to train on")],
+    ("holdout", "message"), [("nobody", "no image or camera 'nobody'"), ("1", "none is left to train on")]
 )
 def test_a_holdout_that_cannot_work_is_said(tmp_path, holdout, message):
     write_photos(tmp_path, 3)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import engine as engine_module
 from edge_server.experiments.studies.engine import Engine, StudyError, content_key, run_task
-from edge_server.experiments.studies.trial import Folders, Trial, picture, run_trial
+from edge_server.experiments.studies.trial import Trial, last_images, run_trial
 from freshfield.scenario import ScenarioError
 
 TINY = {"gaussians": 256, "start": 256}
@@ -112,18 +113,10 @@ def test_what_is_known_is_not_run_again_and_a_stop_loses_only_what_runs(tmp_path
     monkeypatch.setattr(engine_module, "run_task", run_task)
     said: list[str] = []
     results = Engine(tmp_path, say=said.append).run(trials())
+    assert json.loads((tmp_path / "results.jsonl").read_text().splitlines()[0])["trial"]["seed"] == 1
     assert said[0] == f"study: {len(trials()) - 2} trials to run, 2 known"
     monkeypatch.setattr(engine_module, "run_task", counting)
     assert Engine(tmp_path, say=quiet).run(trials()) == results, "nothing left to run"
-
-
-def test_a_torn_result_is_run_again(tmp_path: Path):
-    engine = Engine(tmp_path, say=quiet)
-    expected = engine.run([TRIAL])
-    path = tmp_path / "results.jsonl"
-    assert json.loads(path.read_text())["trial"]["seed"] == 1
-    path.write_text(path.read_text()[:40])
-    assert Engine(tmp_path, say=quiet).run([TRIAL]) == expected
 
 
 def test_the_key_is_of_all_that_decides(tmp_path: Path):
@@ -133,7 +126,7 @@ def test_the_key_is_of_all_that_decides(tmp_path: Path):
 
 
 def test_pictures_are_of_the_trial(tmp_path: Path):
-    truth, shown, row = picture(TRIAL, NO_DATA)
+    truth, shown, row = last_images(TRIAL, NO_DATA)
     assert truth.shape == shown.shape == (24, 24, 3)
     assert row["psnr_db"] == run_trial(TRIAL, NO_DATA)["psnr_db"]
 

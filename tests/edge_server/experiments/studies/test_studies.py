@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies.age import omega, trade_map
 from edge_server.experiments.studies.command import LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
-from edge_server.experiments.studies.study import Ask, Point, Table, run_study
-from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.studies.study import Point, StudyRequest, Table, run_study
 from edge_server.scheduler import make_policy
 
 NAMES = [n for n in STUDIES if n not in ("metrics", *LEARNING)]
 
 
-def ask(tmp_path: Path, **more: Any) -> Ask:
-    return Ask(True, tmp_path, Folders(), **more)
+def request(tmp_path: Path, **more: Any) -> StudyRequest:
+    return StudyRequest(True, tmp_path, Folders(), **more)
 
 
 class Invented(Engine):
@@ -55,7 +55,7 @@ def noise(seed: int, value: float | None) -> float:
 @pytest.mark.parametrize("quick", [True, False])
 def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
     study = make_study(name)
-    points = study.points(Ask(quick, tmp_path, Folders(), seeds=1))
+    points = study.points(StudyRequest(quick, tmp_path, Folders(), seeds=1))
     assert points and len({(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}) == len(
         points
     )
@@ -79,7 +79,7 @@ def peak(at: float):
 
 def verdicts(name: str, tmp_path: Path, rule, **more: Any) -> dict[str, str]:
     found = run_study(
-        make_study(name), ask(tmp_path, seeds=6, scenes=("room",), **more), invented(tmp_path, rule)
+        make_study(name), request(tmp_path, seeds=6, scenes=("room",), **more), invented(tmp_path, rule)
     )
     # Of two verdicts on one thing, the first.
     return {v.about: v.verdict for v in reversed(found)}
@@ -89,7 +89,7 @@ def verdicts(name: str, tmp_path: Path, rule, **more: Any) -> dict[str, str]:
 def no_pictures(monkeypatch):
     """Pictures are trials that are run; here only the figures are invented."""
     for module, cls in (("age.max_age", "Mat"), ("age.omega", "Omega")):
-        monkeypatch.setattr(f"edge_server.experiments.studies.{module}.{cls}._pictures", lambda *a: None)
+        monkeypatch.setattr(f"edge_server.experiments.studies.{module}.{cls}._draw_instants", lambda *a: None)
 
 
 def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
@@ -148,7 +148,7 @@ def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, onl
 def test_one_seed_decides_nothing(tmp_path: Path):
     for name in ("mat", "mat-delay", "lambda", "omega", "images", "phase"):
         found = run_study(
-            make_study(name), ask(tmp_path, seeds=1, scenes=("room",)), invented(tmp_path, peak(90.0))
+            make_study(name), request(tmp_path, seeds=1, scenes=("room",)), invented(tmp_path, peak(90.0))
         )
         assert {v.verdict for v in found} == {"undecided"}, name
 
@@ -219,12 +219,12 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
         return figures(gain + noise(trial.seed, trial.value), 50.0)
 
     study = make_study("phase")
-    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    found = run_study(study, request(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
     trade, mask, freshen = (found[i::3] for i in range(3))
     assert {v.verdict for v in (*trade, *freshen, *mask)} == {"holds"}
     assert "75 % [7" in freshen[0].found and "no delay is 2.00" in trade[0].found
     gains |= {"threshold": -1.0, "mask": -1.5, "freshen": 2.1}
-    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    found = run_study(study, request(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
     trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
     assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
     assert (tmp_path / "phase-room.png").exists()

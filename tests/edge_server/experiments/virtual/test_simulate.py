@@ -110,7 +110,7 @@ def test_the_scenario_says_zero_or_milliseconds():
 
     assert config("zero") == ComputeConfig() and ComputeConfig().charge_ns(1000) == 0
     assert config({"ms_per_step": 2.0}).charge_ns(10) == 20_000_000
-    for wrong in ("free", {"ms_per_step": -1.0}, {"seconds": 1}):
+    for wrong in ("free", {"ms_per_step": -1.0}, {"ms_per_update": float("nan")}, {"seconds": 1}):
         with pytest.raises(ScenarioError, match="compute"):
             config(wrong)
 

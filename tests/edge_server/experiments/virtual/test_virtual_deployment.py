@@ -195,13 +195,6 @@ def test_the_kitchen_in_virtual_time():
     assert deployment.publications and closes(deployment.frames())
 
 
-def test_compute_refuses_what_is_no_time():
-    with pytest.raises(ValueError, match="not negative"):
-        Compute(ms_per_step=-1.0)
-    with pytest.raises(ValueError, match="not negative"):
-        Compute(ms_per_update=float("nan"))
-
-
 def world_with(effects: dict[str, Any], scene: str = "tower", **source: Any) -> dict[str, Any]:
     size = {"kind": "world", "scene": scene, "width": 32, "height": 32, "fps": 15}
     return {**size, "params": {"supersample": 1}, "effects": effects, **source}

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import command
 from edge_server.experiments.studies.command import LEARNING, STUDIES, make_study
 from edge_server.experiments.studies.learning import (
@@ -24,8 +25,7 @@ from edge_server.experiments.studies.learning import (
     transfer,
 )
 from edge_server.experiments.studies.learning.setup import better, no_worse
-from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, Ask, Verdict
-from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.choices import named
 from edge_server.experiments.training.scheduler.episode import Outcome
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, evaluate_policies
@@ -65,16 +65,16 @@ def small(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, tmp_path: Path, capsys):
-    ask = Ask(True, tmp_path, Folders(), seeds=2)
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2)
     study = make_study(name)
-    assert study.points(ask) == []
-    first = study.report(ask, None)
+    assert study.points(request) == []
+    first = study.report(request, None)
     assert first and all(v.line() for v in first)
     rows = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
     assert rows and all(row["reward"] for row in rows)
     assert list(tmp_path.glob(f"{name}*.png"))
     lines = (tmp_path / "training/evaluations.jsonl").read_text().count("\n")
-    again = make_study(name).report(ask, None)
+    again = make_study(name).report(request, None)
     assert [(v.about, v.claim, v.verdict) for v in again] == [(v.about, v.claim, v.verdict) for v in first]
     assert (tmp_path / "training/evaluations.jsonl").read_text().count("\n") == lines
     capsys.readouterr()
@@ -82,8 +82,8 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, 
 
 @pytest.mark.slow
 def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tmp_path: Path):
-    ask = Ask(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
-    verdicts = make_study("ppo-wait").report(ask, None)
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
+    verdicts = make_study("ppo-wait").report(request, None)
     assert all(v.about.startswith("room, ch6, age -0.003/ms") for v in verdicts)
     logs = list((tmp_path / "training").glob("ppo-wait-ch6-0.003-*/training.jsonl"))
     assert len(logs) == 4 and all(
@@ -104,13 +104,13 @@ def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path
     assert "--episodes: expected 1" in capsys.readouterr().err
 
 
-def contest_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
+def evaluation_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
     """Every policy earns its level at every decision, but for what the seed does to all and a little luck."""
     rng = np.random.default_rng(1)
     asked = [(seed, n) for seed in range(seeds) for n in range(2)]
     shared = {seed: rng.normal() for seed in range(seeds)}
     found = Evaluation(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
-    for into in (found.outcomes, found.again):
+    for into in (found.outcomes, found.repeated):
         for name, level in levels.items():
             psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
             into[name] = {at: Outcome(v, None, None, None, None, 50.0, 3.0, 0.0) for at, v in psnr.items()}
@@ -136,7 +136,7 @@ WON = "differs between decisions"  # nothing does, here: levels do not depend on
 
 @pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
 def test_select_holds_if_and_only_if_what_was_learnt_is_better(level, said):
-    found = contest_of({**FIXED, "nearest:6": 0.3, "mask": 0.2, **runs("learnt", level)})
+    found = evaluation_of({**FIXED, "nearest:6": 0.3, "mask": 0.2, **runs("learnt", level)})
     verdicts = ppo_select.judge("here", found)
     assert answers([v for v in verdicts if WON not in v.claim]) == {said}
     assert answers(verdicts, WON).isdisjoint({HOLDS})
@@ -148,12 +148,12 @@ def test_select_holds_if_and_only_if_what_was_learnt_is_better(level, said):
 @pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
 def test_wait_holds_if_and_only_if_what_was_learnt_is_better(channel, level, said):
     both = {**runs("learnt-wait", level + 0.2), **runs("learnt-threshold", level)}
-    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **both}))
+    verdicts = ppo_wait.judge(channel, channel, evaluation_of({**FIXED, **both}))
     assert answers(verdicts, "best fixed omega", "uniformly random") == {said}
     assert answers(verdicts, "waiting beats thresholds") == {HOLDS}
     assert answers(verdicts, WON).isdisjoint({HOLDS})
     turned = {**runs("learnt-wait", level), **runs("learnt-threshold", level + 0.2)}
-    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **turned}))
+    verdicts = ppo_wait.judge(channel, channel, evaluation_of({**FIXED, **turned}))
     assert answers(verdicts, "waiting beats thresholds") == {DOES_NOT_HOLD}
 
 
@@ -169,27 +169,27 @@ def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
     levels: dict[str, float] = dict(FIXED)
     for k, name in enumerate(state_ablation.VARIANTS):
         levels |= runs(f"learnt {name}", 3.0 + step * k)
-    verdicts = state_ablation.judge(contest_of(levels), list(state_ablation.VARIANTS))
+    verdicts = state_ablation.judge(evaluation_of(levels), list(state_ablation.VARIANTS))
     assert answers(verdicts, "best fixed threshold") == {HOLDS}
     assert answers(verdicts, "age alone", "semantics add") == {said}
     levels |= runs("learnt age", -3.0)
-    verdicts = state_ablation.judge(contest_of(levels), list(state_ablation.VARIANTS))
+    verdicts = state_ablation.judge(evaluation_of(levels), list(state_ablation.VARIANTS))
     assert [v.verdict for v in verdicts if "best fixed" in v.claim] == [DOES_NOT_HOLD, HOLDS, HOLDS, HOLDS]
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
-    found = contest_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    found = evaluation_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
     for moves in (True, False):
         helps, *fixed = semantics.judge("x", found, moves)
         assert helps.verdict == said and answers(fixed) == {HOLDS}
-    low = contest_of({**FIXED, "freshest-k:6": 9.0, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    low = evaluation_of({**FIXED, "freshest-k:6": 9.0, **runs("with", 3.0 + gap), **runs("without", 3.0)})
     assert answers(semantics.judge("x", low, True)[1:]) == {DOES_NOT_HOLD}
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_why_semantics_do_not_help_is_told_apart(gap, said):
-    found = contest_of({**FIXED, "sees:1": 0.0, "sees:2": 3.0 + gap, **runs("without", 3.0)})
+    found = evaluation_of({**FIXED, "sees:1": 0.0, "sees:2": 3.0 + gap, **runs("without", 3.0)})
     tells, useful = semantics.why("x", found, (0.9, 0.8))
     assert tells.verdict == HOLDS and useful.verdict == said and "sees:2" in useful.found
     assert semantics.why("x", found, (0.7, 0.8))[0].verdict == DOES_NOT_HOLD
@@ -198,18 +198,18 @@ def test_why_semantics_do_not_help_is_told_apart(gap, said):
 @pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
 def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
     levels = {**FIXED, **runs("learnt a", 3.0), **runs("learnt b", 3.0 - gap)}
-    better_than_fixed, matters = reward_weights.judge(contest_of(levels), "a", ["a", "b"])
+    better_than_fixed, matters = reward_weights.judge(evaluation_of(levels), "a", ["a", "b"])
     assert (better_than_fixed.verdict, matters.verdict) == (HOLDS, said)
-    low = contest_of({**FIXED, **runs("learnt a", -3.0), **runs("learnt b", 0.0)})
+    low = evaluation_of({**FIXED, **runs("learnt a", -3.0), **runs("learnt b", 0.0)})
     assert reward_weights.judge(low, "a", ["a", "b"])[0].verdict == DOES_NOT_HOLD
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.1, HOLDS), (-0.6, DOES_NOT_HOLD)])
 def test_what_is_learnt_transfers_if_and_only_if_it_loses_little(gap, said):
     levels = {**FIXED, **runs("learnt at home", 3.0 + gap), **runs("learnt here", 3.0)}
-    verdicts = transfer.judge("elsewhere", contest_of(levels))
+    verdicts = transfer.judge("elsewhere", evaluation_of(levels))
     assert [v.verdict for v in verdicts] == [HOLDS, said]
-    low = contest_of({**FIXED, **runs("learnt at home", -3.0), **runs("learnt here", -6.0)})
+    low = evaluation_of({**FIXED, **runs("learnt at home", -3.0), **runs("learnt here", -6.0)})
     assert transfer.judge(transfer.HOME, low)[0].verdict == DOES_NOT_HOLD
 
 
@@ -219,15 +219,15 @@ def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap,
     for stage in (1, 10):
         levels |= runs(f"10 steps, {stage} batches", 3.0 + gap)
         levels |= runs(f"50 steps, {stage} batches", 3.0 + (0.0 if stage == 1 else 2.0 * gap))
-    number, time = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [30.0, 300.0]})
+    number, time = reward_cost.judge(evaluation_of(levels), (1, 10), {10: [2.0, 20.0], 50: [30.0, 300.0]})
     # Of the same number of decisions the dear one taught more; in the time that they take it had not begun.
     assert number.verdict == (DOES_NOT_HOLD if gap > 0 else HOLDS) and time.verdict == said
     assert "after 20.0 and 30.0 s" in time.found
     # What happens to the dear one after the cheap one has ended does not count.
-    (_, time) = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [15.0, 21.0]})
+    (_, time) = reward_cost.judge(evaluation_of(levels), (1, 10), {10: [2.0, 20.0], 50: [15.0, 21.0]})
     assert time.verdict == said and "after 20.0 and 15.0 s" in time.found
     (dim,) = reward_cost.judge_dims(
-        {f"d = {d}": contest_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
+        {f"d = {d}": evaluation_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
     )
     assert dim.verdict == said
 
@@ -275,12 +275,12 @@ def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
 
 
 def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
-    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
-        courses = {name: change.config(trainer, 7, 2) for name, change in channel_drift.changes().items()}
-    priced = [name for name, config in courses.items() if config.reward.views < 0]
-    assert [courses[name].spec.action for name in priced] == ["select"]
-    assert {config.spec.action for name, config in courses.items() if name not in priced} == {"threshold"}
-    assert {(config.episodes, config.seed) for config in courses.values()} == {(7, 2)}
+    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders())) as trainer:
+        configs = {name: change.config(trainer, 7, 2) for name, change in channel_drift.changes().items()}
+    priced = [name for name, config in configs.items() if config.reward.views < 0]
+    assert [configs[name].spec.action for name in priced] == ["select"]
+    assert {config.spec.action for name, config in configs.items() if name not in priced} == {"threshold"}
+    assert {(config.episodes, config.seed) for config in configs.values()} == {(7, 2)}
 
 
 def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
@@ -288,17 +288,17 @@ def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Pa
     assert usual.report == setup.REPORT and set(usual.report).isdisjoint(usual.rewarding)
     assert set(usual.report).isdisjoint(usual.scenario.training)
     assert set(setup.FOUR_VIEWPOINTS).isdisjoint(setup.REPORT)
-    reward, everybody = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
-    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
-        found = trainer.evaluate(reported(), everybody, reward, 2)
-        same = trainer.evaluate_as_rewarded(reported(), everybody, reward, 2)
+    reward, candidates = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
+    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders())) as trainer:
+        found = trainer.evaluate(reported(), candidates, reward, 2)
+        same = trainer.evaluate_as_rewarded(reported(), candidates, reward, 2)
     with WorkerPool(Folders()) as pool:
-        expected = evaluate_policies(reported().judged, pool, seeds(0, "test", 2), everybody, reward)
-    assert found.outcomes == expected.outcomes and found.again == expected.again
+        expected = evaluate_policies(reported().judged, pool, seeds(0, "test", 2), candidates, reward)
+    assert found.outcomes == expected.outcomes and found.repeated == expected.repeated
     assert found.outcomes["all"] != same.outcomes["all"]
 
 
-def test_how_differently_the_same_lesson_is_learnt_is_part_of_an_interval():
+def test_the_spread_of_repeated_trainings_is_part_of_an_interval():
     base = {s: 0.01 * (s % 3) for s in range(40)}
     alike = [{s: v + 0.2 + 0.01 * (-1) ** (s + r) for s, v in base.items()} for r in range(3)]
     unlike = [{s: v + level for s, v in base.items()} for level in (0.7, 0.2, -0.3)]
@@ -319,7 +319,7 @@ def test_verdicts_follow_from_the_paired_differences():
     assert [better("a", "b", x, base).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "undecided"
     ]  # fmt: skip
-    evaluation = contest_of({"random": 0.5, "all": 1.5})
+    evaluation = evaluation_of({"random": 0.5, "all": 1.5})
     assert [no_worse("a", "b", x, base, evaluation).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "holds"
     ]  # fmt: skip
@@ -341,6 +341,7 @@ def test_verdicts_follow_from_the_paired_differences():
         (-0.8, -1.0, "+20.0 %"),
         (0.5, 0.001, "no percentage"),  # whose own interval has the zero in it
         (0.1, -1.7, "no percentage"),
+        (0.5, 0.0, "no percentage"),
     ],
 )
 def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base, text):

@@ -11,7 +11,7 @@ from edge_server.experiments.training.detector.average_precision import (
     detections,
     measure,
 )
-from edge_server.experiments.training.detector.dataset import Pictures
+from edge_server.experiments.training.detector.dataset import LabeledImages
 from edge_server.experiments.training.detector.scenes import KINDS
 
 A, B = [0.0, 0.0, 10.0, 10.0], [20.0, 20.0, 30.0, 40.0]
@@ -101,7 +101,7 @@ def test_overlapping_detections_of_one_kind_become_one():
 
 def test_measure_is_the_mean_over_the_kinds_that_are_there():
     boxes = [np.array([[*A, 0]], np.float32), np.array([[*B, 1]], np.float32)]
-    pictures = Pictures(np.zeros((2, 64, 64, 3), np.uint8), boxes)
+    pictures = LabeledImages(np.zeros((2, 64, 64, 3), np.uint8), boxes)
 
     def run(images):
         assert images.shape == (2, 3, 64, 64) and images.dtype == np.float32

@@ -12,7 +12,7 @@ from camera_node.synthetic.placement import MovingBody, Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from camera_node.synthetic.textures import Plain
-from edge_server.experiments.training.detector.dataset import Pictures, render
+from edge_server.experiments.training.detector.dataset import LabeledImages, render
 from edge_server.experiments.training.detector.scenes import (
     KINDS,
     Shot,
@@ -128,6 +128,6 @@ def test_pictures_are_rendered_once_and_a_damaged_shard_again(tmp_path):
     shard.write_bytes(shard.read_bytes()[:500])
     mended = render("train", 2, 64, 0, tmp_path, 1)
     for other in (again, mended):
-        assert isinstance(other, Pictures) and len(other) == 16
+        assert isinstance(other, LabeledImages) and len(other) == 16
         assert (other.images == first.images).all()
         assert all((a == b).all() for a, b in zip(other.boxes, first.boxes))

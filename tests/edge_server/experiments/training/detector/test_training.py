@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from edge_server.experiments.training.detector.average_precision import box_iou
-from edge_server.experiments.training.detector.dataset import Pictures
+from edge_server.experiments.training.detector.dataset import LabeledImages
 from edge_server.experiments.training.detector.loss import assign, detection_loss, overlaps
 from edge_server.experiments.training.detector.network import Detector
 from edge_server.experiments.training.detector.scenes import KINDS
@@ -33,7 +33,7 @@ def _as_it_was():
     torch.set_num_threads(threads)
 
 
-def squares(n: int) -> Pictures:
+def squares(n: int) -> LabeledImages:
     """Bright squares (kind 2) and dark ones (kind 3) on grey."""
     rng = np.random.default_rng(0)
     images, boxes = np.full((n, SIDE, SIDE, 3), 110, np.uint8), []
@@ -43,7 +43,7 @@ def squares(n: int) -> Pictures:
         kind = int(rng.integers(2, 4))
         image[y : y + side, x : x + side] = 230 if kind == 2 else 20
         boxes.append(np.array([[x, y, x + side, y + side, kind]], np.float32))
-    return Pictures(images, boxes)
+    return LabeledImages(images, boxes)
 
 
 def test_overlaps_agree_with_the_measure():

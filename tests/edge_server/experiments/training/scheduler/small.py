@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.training.scheduler.setting import Setting
 from freshfield.scenario import Scenario, parse
 

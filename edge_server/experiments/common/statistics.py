@@ -1,7 +1,6 @@
-"""Means, intervals and optima over seeds: the seed is the unit that repeats, so all intervals are over seeds.
+"""Means, intervals and optima over seeds.
 
-Nothing here knows what a study is about. Everything random is drawn from a fixed stream: the same figures
-give the same intervals.
+Resampling draws from a fixed random stream, so the same values give the same intervals.
 """
 
 from __future__ import annotations
@@ -13,15 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from edge_server.experiments.common.tables import number
+
 _LEVEL = 0.95
+_Curve = Mapping[float, Mapping[int, float | None]]
 _RESAMPLES = 2000
-# Resampling fewer seeds than this tells nothing of how seeds differ: no interval is given.
+# Fewest seeds that are resampled; fewer say too little about how seeds differ.
 FEWEST = 5
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with the ends of its 95 % interval; the ends are NaN where one value cannot give them."""
+    """A mean with the ends of its 95 % interval, which are NaN for a single value."""
 
     mean: float
     low: float
@@ -33,19 +35,20 @@ class Interval:
             return f"{self.mean:.2f}"
         return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
-    @property
-    def half(self) -> float:
-        return (self.high - self.low) / 2
+    def text(self, digits: int) -> str:
+        """``mean [low, high]`` with so many decimals."""
+        mean, low, high = (number(v, digits) for v in (self.mean, self.low, self.high))
+        return f"{mean} [{low}, {high}]"
 
     def above(self, bound: float) -> bool | None:
-        """Whether the mean lies above ``bound``; None: the interval does not tell."""
+        """Whether the mean lies above ``bound``; None where the interval contains it."""
         if self.low > bound:
             return True
         return False if self.high < bound else None
 
 
 def interval(values: Sequence[float | None]) -> Interval:
-    """Student's t interval of the mean, over the values that there are."""
+    """Student's t interval of the mean of the known values."""
     known = np.array([v for v in values if v is not None], float)
     if not len(known):
         return Interval(np.nan, np.nan, np.nan, 0)
@@ -57,25 +60,25 @@ def interval(values: Sequence[float | None]) -> Interval:
 
 
 def negated(answer: bool | None) -> bool | None:
-    """Not; what cannot be told stays so."""
+    """The negation; unknown (None) stays unknown."""
     return None if answer is None else not answer
 
 
 def paired(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> Interval:
-    """Of a - b over the seeds that have both."""
+    """Interval of a - b over the seeds that have both."""
     return interval([x - y for s in a if (x := a[s]) is not None and (y := b.get(s)) is not None])
 
 
 def crossed(runs: Sequence[Mapping[int, float | None]]) -> Interval:
-    """Of what ``runs`` of the same training come to on the same seeds, over runs and seeds: another training
-    would have learnt something else, and other seeds would have asked for something else.
+    """Interval of repeated trainings on the same seeds, over runs and seeds.
 
-    Runs x seeds is a two-way table of random effects. The interval adds the squares of two halves (MOVER):
-    that of the seeds, and that of what the runs' means differ more than the table's rest explains, each with
-    its own Student's t; simulated with three runs on 60 seeds it covers 93 to 97 %, however large the runs'
-    share is. Resampling would not do: three runs can be resampled in ten ways. Of a single run it is the
-    seeds' alone.
-    Seeds that lack a value in any run are left out; count: those that are not.
+    Runs x seeds is a two-way table of random effects. The half width is the root of the sum of two squares
+    (MOVER): the half width over seeds, and that over runs, of which the residual variance is subtracted, each
+    with its own Student's t. Simulated with three runs on 60 seeds it covers 93 to 97 %, for any share of the
+    runs' variance. Resampling would not do, because three runs can be resampled in ten ways only.
+
+    runs: seed -> value of each run; a single run gives the interval over seeds. Seeds without a value in any
+        run are left out; ``count`` is the number of the others.
     """
     if not runs:
         return interval([])
@@ -98,13 +101,13 @@ def crossed(runs: Sequence[Mapping[int, float | None]]) -> Interval:
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where a curve over ``xs`` is best, over seeds.
+    """Where a curve is best, over seeds.
 
-    x: of the best mean. low, high: 95 % of resampled seeds have their best there (NaN for fewer than
-    ``FEWEST``). over_first, over_last: how
-    much better the best is than the curve's two ends. They are measured on seeds that had no part in choosing
-    the best (chosen on one half, measured on the other, and the other way round): a best point chosen and
-    measured on the same seeds looks better than it is.
+    x: of the best mean.
+    low, high: ends of the 95 % interval of x by resampling seeds; NaN for fewer than ``FEWEST``.
+    over_first, over_last: how much better the best is than the two ends of the curve. Chosen on one half of
+        the seeds and measured on the other, and the other way round, because a maximum is biased upwards on
+        the seeds that chose it.
     """
 
     x: float
@@ -115,47 +118,49 @@ class Optimum:
 
     @property
     def spread(self) -> str:
-        """`` (low to high)``, or nothing where it is not known."""
+        """`` (low to high)``, or nothing where they are unknown."""
         return "" if np.isnan(self.low) else f" ({self.low:g} to {self.high:g})"
 
     def interior(self, least: float = 0.0) -> bool | None:
-        """Whether the curve rises and falls by more than ``least``; None: the seeds do not tell."""
+        """Whether the curve rises and falls by more than ``least``; None where that is undecided."""
         sides = (self.over_first.above(least), self.over_last.above(least))
         if False in sides:
             return False
         return None if None in sides else True
 
 
-def optimum(curve: Mapping[float, Mapping[int, float | None]], lower_is_better: bool = False) -> Optimum:
-    """``curve``: x -> seed -> value. Seeds that lack a value anywhere are left out. ValueError: none left."""
+def optimum(curve: _Curve, lower_is_better: bool = False) -> Optimum:
+    """The optimum of a curve. curve: x -> seed -> value; seeds that lack a value anywhere are left out.
+    ValueError: none is left."""
     xs = sorted(curve)
-    common = set.intersection(*(set(curve[x]) for x in xs))
-    seeds = sorted(s for s in common if all(curve[x][s] is not None for x in xs))
+    seeds = _common_seeds([curve])
     if not seeds:
         raise ValueError("no seed has a value at every point of the curve")
-    table = np.array([[curve[x][s] for x in xs] for s in seeds], float)  # (seeds, xs)
-    if lower_is_better:
-        table = -table
+    table = _table(curve, seeds, lower_is_better)
     low, high = np.nan, np.nan
     if len(seeds) >= FEWEST:
         bests = np.array(xs)[table[_picks(len(seeds))].mean(1).argmax(1)]
         low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
-    gains = _held_out_gains(table)
-    return Optimum(
-        float(xs[int(table.mean(0).argmax())]), float(low), float(high),
-        interval(list(gains[:, 0])), interval(list(gains[:, 1])),
-    )  # fmt: skip
+    over_first, over_last = (interval(list(_chosen(table) - table[:, end])) for end in (0, -1))
+    return Optimum(float(xs[int(table.mean(0).argmax())]), float(low), float(high), over_first, over_last)
+
+
+def _common_seeds(curves: Sequence[_Curve]) -> list[int]:
+    """Seeds that have a value at every point of all curves."""
+    points = [values for curve in curves for values in curve.values()]
+    common = set.intersection(*map(set, points)) if points else set()
+    return sorted(s for s in common if all(values[s] is not None for values in points))
+
+
+def _table(curve: _Curve, seeds: Sequence[int], lower_is_better: bool) -> NDArray[np.float64]:
+    """Values (seeds, xs) of a curve, negated where lower is better."""
+    table = np.array([[curve[x][s] for x in sorted(curve)] for s in seeds], float)
+    return -table if lower_is_better else table
 
 
 def _picks(count: int) -> NDArray[np.int64]:
-    """The same resamples for every figure of so many seeds: (R, count) indices."""
+    """Indices (resamples, count) of resampled seeds, always the same for one count."""
     return np.random.default_rng(5).integers(0, count, (_RESAMPLES, count))
-
-
-def _held_out_gains(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of each seed (S, 2): the best minus the first and minus the last, the best as the others chose."""
-    chosen = _chosen(table)
-    return np.stack([chosen - table[:, 0], chosen - table[:, -1]], 1)
 
 
 def _chosen(table: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -169,48 +174,44 @@ def _chosen(table: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def at_its_best(
-    curve: Mapping[float, Mapping[int, float | None]], lower_is_better: bool = False
-) -> dict[int, float]:
-    """seed -> the curve's value where it is best, chosen by seeds that it is not measured on."""
-    xs = sorted(curve)
-    common = set.intersection(*(set(curve[x]) for x in xs)) if xs else set()
-    seeds = sorted(s for s in common if all(curve[x][s] is not None for x in xs))
+def at_its_best(curve: _Curve, lower_is_better: bool = False) -> dict[int, float]:
+    """seed -> value of the curve at its best point, which other seeds chose."""
+    seeds = _common_seeds([curve])
     if not seeds:
         return {}
-    sign = -1.0 if lower_is_better else 1.0
-    values = sign * _chosen(sign * np.array([[curve[x][s] for x in xs] for s in seeds], float))
-    return dict(zip(seeds, values.tolist()))
+    values = _chosen(_table(curve, seeds, lower_is_better))
+    return dict(zip(seeds, (-values if lower_is_better else values).tolist()))
 
 
 def move_of_optimum(
-    curves: Mapping[float, Mapping[float, Mapping[int, float | None]]], lower_is_better: bool = False
+    curves: Mapping[float, _Curve], lower_is_better: bool = False
 ) -> tuple[Interval, Interval]:
-    """How a curve's best x moves with a parameter: parameter -> x -> seed -> value. Returns the slope of best
-    x against the parameter, and best x at the last parameter minus that at the first; both by resampling
-    seeds, the same ones for every parameter. Ends are NaN for fewer than ``FEWEST`` seeds."""
-    sign = -1.0 if lower_is_better else 1.0
-    parameters, tables, grids = list(curves), [], []
-    common = set.intersection(*(set(v) for curve in curves.values() for v in curve.values()))
-    seeds = sorted(s for s in common if all(v[s] is not None for c in curves.values() for v in c.values()))
-    for curve in curves.values():
-        xs = sorted(curve)
-        grids.append(np.array(xs))
-        tables.append(sign * np.array([[curve[x][s] for x in xs] for s in seeds], float))
+    """How the best x of a curve moves with a parameter.
 
-    def text(picks: NDArray[np.int64]) -> tuple[float, float]:
+    curves: parameter -> x -> seed -> value.
+
+    Returns the slope of the best x against the parameter, and the best x at the last parameter minus that at
+    the first. Intervals by resampling seeds, the same ones for every parameter; their ends are NaN for fewer
+    than ``FEWEST`` seeds.
+    """
+    parameters = list(curves)
+    seeds = _common_seeds(list(curves.values()))
+    grids = [np.array(sorted(curve)) for curve in curves.values()]
+    tables = [_table(curve, seeds, lower_is_better) for curve in curves.values()]
+
+    def slope_and_move(picks: NDArray[np.int64]) -> tuple[float, float]:
         best = [grid[table[picks].mean(0).argmax()] for grid, table in zip(grids, tables)]
-        # A level line has a slope of 1e-16 or so, of either sign.
+        # Rounded, because a level line has a slope of 1e-16 or so of either sign.
         line = round(float(np.polyfit(parameters, best, 1)[0]), 9) if len(parameters) > 1 else np.nan
         return line, float(best[-1] - best[0])
 
     if not seeds:
         nothing = Interval(np.nan, np.nan, np.nan, 0)
         return nothing, nothing
-    means = text(np.arange(len(seeds)))
+    means = slope_and_move(np.arange(len(seeds)))
     lows = highs = np.full(2, np.nan)
     if len(seeds) >= FEWEST:
-        lows, highs = np.percentile([text(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
+        lows, highs = np.percentile([slope_and_move(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
     line, move = (Interval(m, float(a), float(b), len(seeds)) for m, a, b in zip(means, lows, highs))
     return line, move
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.experiments.studies.statistics import (
+from edge_server.experiments.common.statistics import (
     Interval,
     at_its_best,
     crossed,

@@ -1,0 +1,84 @@
+"""What the commands share: their parsers, arguments that several have, and how they end."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from edge_server.experiments.common.folders import Folders
+from edge_server.fidelity.lpips_weights import weights_folder
+
+
+class OptionError(ValueError):
+    """An option that cannot work; the message says what to change."""
+
+
+def command_parser(name: str, description: str) -> argparse.ArgumentParser:
+    """The parser of ``edge-server NAME``, which prints ``description`` as it stands."""
+    raw = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(f"edge-server {name}", description=description, formatter_class=raw)
+
+
+def add_folders(parser: argparse.ArgumentParser) -> None:
+    """Add ``--data`` and ``--lpips``, which ``folders_of`` reads."""
+    add = parser.add_argument
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--lpips", type=Path, metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+
+
+def folders_of(args: argparse.Namespace) -> Folders:
+    """The folders of ``--data`` and ``--lpips``, or those that the environment names."""
+    data = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    return Folders(data, weights_folder(args.lpips, data))
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """An argument type: a whole number of at least ``least``."""
+
+    def read(text: str) -> int:
+        if not text.isdigit() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from {least}")
+        return int(text)
+
+    return read
+
+
+def parse_options(words: Sequence[str]) -> dict[str, Any]:
+    """``KEY=VALUE`` words as settings of a field; values are YAML (8, 0.5, true, [0, 0, 1], white). Raises
+    OptionError."""
+    options: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not key or not equals:
+            raise OptionError(f"--option {word}: expected KEY=VALUE")
+        try:
+            options[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise OptionError(f"--option {word}: {value!r} is not a value") from None
+    return options
+
+
+def run_command(
+    name: str, work: Callable[[], object], errors: tuple[type[Exception], ...], stopped: str
+) -> int:
+    """Call ``work`` and return the exit status of ``edge-server NAME``.
+
+    errors: exceptions that are printed in one line; the status is then 2.
+    stopped: text that is printed after Ctrl-C; the status is then 130.
+    """
+    try:
+        work()
+    except errors as error:
+        print(f"edge-server {name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; {stopped}", flush=True)
+        return 130
+    return 0
