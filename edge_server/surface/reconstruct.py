@@ -30,8 +30,8 @@ class MeshSettings:
     the surface in unobserved space. min_weight: known voxels have more weight than this (a camera at normal
     incidence counts 1). solid, steepest_deg: pixel selection. keep_share, most: component selection.
     memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``). carve: with
-    sharpen, in a scene bounded by its field's box with enough images: start from voxels fitted in ``carve_steps``
-    steps, and use their depth where the images are ambiguous (``voxel_depth``)."""
+    sharpen, in a scene bounded by its field's box with enough images: start from voxels fitted in
+    ``carve_steps`` steps, and use their depth where the images are ambiguous (``voxel_depth``)."""
 
     method: str = "tsdf"
     sharpen: bool = True
