@@ -19,7 +19,7 @@ class ExportError(ValueError):
 
 
 @dataclass(frozen=True)
-class Shot:
+class PosedImage:
     """A posed picture as formats want it. name: of the file, without folder or extension. image: uint8
     (H, W, 3 or 4). camera_to_world: (4, 4), OpenCV axes, metres. t_s: when, in seconds."""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.export import ExportError, Shot
+from edge_server.export import ExportError, PosedImage
 from freshfield.files import write_bytes, write_text
 from freshfield.geometry import Pinhole, matrix_to_quaternion, se3_inverse
 
@@ -43,7 +43,7 @@ class _Image:
     points: NDArray[np.int64]  # (M,), numbers of points from 1
 
 
-def write_model(folder: Path, shots: Sequence[Shot], cloud: Cloud, binary: bool = False) -> None:
+def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud, binary: bool = False) -> None:
     """Write cameras, images and points3D (.txt, or .bin) to ``folder``, which is made. Images are called
     NAME.png. ExportError: no shots."""
     if not shots:
@@ -66,7 +66,7 @@ def write_model(folder: Path, shots: Sequence[Shot], cloud: Cloud, binary: bool 
         write_text(folder / "points3D.txt", _points_text(cloud, tracks))
 
 
-def _image(k: int, shot: Shot, lenses: list[Pinhole], cloud: Cloud) -> _Image:
+def _image(k: int, shot: PosedImage, lenses: list[Pinhole], cloud: Cloud) -> _Image:
     inverse = se3_inverse(shot.camera_to_world)
     which = np.flatnonzero(cloud.seen[:, k])
     pixels = shot.intrinsics.project(cloud.points[which] @ inverse[:3, :3].T + inverse[:3, 3])

@@ -114,16 +114,18 @@ class Export:
     @cached_property
     def maps(self):
         """What the cameras see of the field."""
-        from edge_server.surface.reconstruct import maps_of
+        from edge_server.surface.reconstruct import make_depth_maps
 
-        return maps_of(self.source.field.snapshot(), self.source.views, self._settings(), self._progress)
+        return make_depth_maps(
+            self.source.field.snapshot(), self.source.views, self._settings(), self._progress
+        )
 
     @cached_property
     def cloud(self):
         """Surface points and who sees them."""
-        from edge_server.export.point_cloud import cloud_of
+        from edge_server.export.point_cloud import sparse_points
 
-        return cloud_of(self.maps, self.args.count)
+        return sparse_points(self.maps, self.args.count)
 
     def run(self) -> None:
         """Check everything that can be checked at once, then write. ExportError, SurfaceError."""
@@ -172,10 +174,10 @@ class Export:
         )
 
     def _mesh(self, path: Path) -> None:
-        from edge_server.surface.reconstruct import mesh_of_maps
+        from edge_server.surface.reconstruct import mesh_from_depth_maps
 
         begin = time.perf_counter()
-        mesh = mesh_of_maps(self.maps, self._settings(), self._progress)
+        mesh = mesh_from_depth_maps(self.maps, self._settings(), self._progress)
         if path.suffix.lower() == ".glb":
             from edge_server.export.glb import write_mesh
         else:

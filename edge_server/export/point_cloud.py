@@ -8,12 +8,12 @@ import numpy as np
 
 from edge_server.export.colmap import Cloud
 from edge_server.surface.depth import DepthMap
-from edge_server.surface.sharpen import shows
+from edge_server.surface.refine_depth import on_surface
 
 SAME = 0.01  # depth tolerance of the same point, share of the distance
 
 
-def cloud_of(maps: Sequence[DepthMap], count: int) -> Cloud:
+def sparse_points(maps: Sequence[DepthMap], count: int) -> Cloud:
     """Up to ``count`` points, evenly many of the pixels of each map that see a surface, with the maps that
     show a surface there."""
     points, colors, source = [], [], []
@@ -30,7 +30,7 @@ def cloud_of(maps: Sequence[DepthMap], count: int) -> Cloud:
     every = np.concatenate(points) if points else np.zeros((0, 3))
     seen = np.zeros((len(every), len(maps)), np.bool_)
     for k, found in enumerate(maps):
-        seen[:, k] = shows(found, every, SAME)
+        seen[:, k] = on_surface(found, every, SAME)
     if len(every):
         seen[np.arange(len(every)), np.concatenate(source)] = True
     return Cloud(every, np.concatenate(colors) if colors else np.zeros((0, 3), np.uint8), seen)

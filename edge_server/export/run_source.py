@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.export import ExportError, Shot, file_names
+from edge_server.export import ExportError, PosedImage, file_names
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
 from freshfield.geometry import GeometryError, Pose
@@ -31,11 +31,13 @@ class Source:
     views: tuple[View, ...]
 
     @property
-    def shots(self) -> list[Shot]:
+    def shots(self) -> list[PosedImage]:
         """The views as pictures to be written."""
         names = file_names([v.camera for v in self.views])
         return [
-            Shot(name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics, v.generated_ns / 1e9)
+            PosedImage(
+                name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics, v.generated_ns / 1e9
+            )
             for name, v in zip(names, self.views)
         ]
 
@@ -48,7 +50,7 @@ def open_source(path: Path) -> Source:
         state, about = checkpoint.load(file)
         name = str(about["field"])
         options: dict[str, Any] = dict(about.get("options") or {})
-        field = make_field(name, _as_made(name, options, state), seed=int(about.get("seed", 0)))
+        field = make_field(name, _saved_options(name, options, state), seed=int(about.get("seed", 0)))
         field.load_state(state)
     except KeyError:
         raise ExportError(f"{file}: does not say which representation it is of") from None
@@ -60,7 +62,7 @@ def open_source(path: Path) -> Source:
     return Source(file, name, field, views)
 
 
-def _as_made(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
+def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
     """The options a field was made with: those of the state where it tells, since a deadline may have chosen
     them, but on this machine's threads and device."""
     try:
@@ -113,7 +115,7 @@ def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
     return found
 
 
-def write_images(folder: Path, shots: list[Shot]) -> None:
+def write_images(folder: Path, shots: list[PosedImage]) -> None:
     """NAME.png of every shot, transparency kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for shot in shots:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.export import ExportError, Shot
+from edge_server.export import ExportError, PosedImage
 from freshfield.files import write_json
 from freshfield.geometry import OPENGL_TO_OPENCV
 
 
-def write_transforms(folder: Path, shots: Sequence[Shot], points: str | None = None) -> Path:
+def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | None = None) -> Path:
     """Write ``folder``/transforms.json for images in ``folder``/images; returns its path. points: name of a
     PLY beside it, which nerfstudio starts splats from. ExportError: no shots."""
     if not shots:

@@ -68,7 +68,12 @@ class MeshLayer:
 
         from edge_server.fields.common.threads.thread_pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
-        from edge_server.surface.reconstruct import MeshSettings, grid_for, maps_of, mesh_of_maps
+        from edge_server.surface.reconstruct import (
+            MeshSettings,
+            grid_for,
+            make_depth_maps,
+            mesh_from_depth_maps,
+        )
 
         renderer = self._state.renderer
         views = getattr(renderer, "cameras", ())
@@ -76,14 +81,14 @@ class MeshLayer:
             raise SurfaceError("the field has not been trained yet")
         # No sharpening: it compares images, and moving parts differ between them.
         settings, pool = MeshSettings(sharpen=False, memory_mb=MEMORY_MB), shared_pool(nice=SERVER_NICE)
-        maps = maps_of(renderer, views, settings, pool=pool)
+        maps = make_depth_maps(renderer, views, settings, pool=pool)
         grid = grid_for(maps, settings)
         span = float(np.subtract(grid.upper, grid.lower).max())
         settings = MeshSettings(
             sharpen=False, memory_mb=MEMORY_MB, voxel_m=max(grid.voxel_m, span / VOXELS),
             bounds=(grid.lower, grid.upper),
         )  # fmt: skip
-        mesh = mesh_of_maps(maps, settings, pool=pool)
+        mesh = mesh_from_depth_maps(maps, settings, pool=pool)
         return self._server.scene.add_mesh_trimesh(
             NODE, trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.color, process=False)
         )

@@ -20,7 +20,7 @@ from freshfield.geometry import Pinhole
 SOLID = 0.8  # minimum opacity of a ray that hits a surface
 EMPTY = 0.1  # maximum opacity of a ray that hits nothing
 EMPTY_TRUST = 0.25  # of a pixel whose ray hits nothing; 1 is a surface at normal incidence
-MOST_M = 1e6  # larger depths are invalid
+MAX_DEPTH_M = 1e6  # larger depths are invalid
 STEEPEST_DEG = 80.0  # maximum angle between ray and normal; beyond it is an edge, or unreliable
 Camera = tuple[NDArray[np.float64], Pinhole]
 
@@ -61,7 +61,7 @@ def depth_map(
     steepest_deg: float = STEEPEST_DEG,
 ) -> DepthMap:
     """A depth map from depth along rays (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond
-    ``MOST_M``: unknown. sure: float32 (H, W), factor of the trust of pixels that see a surface.
+    ``MAX_DEPTH_M``: unknown. sure: float32 (H, W), factor of the trust of pixels that see a surface.
     SurfaceError: shapes do not match.
 
     Trust is the cosine between ray and normal: uncertainty grows as the surface turns away.
@@ -73,8 +73,8 @@ def depth_map(
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SurfaceError("a depth map's camera_to_world must be a finite (4, 4) matrix")
     empty = np.isposinf(depth)
-    depth = np.where((depth > 0) & (depth < MOST_M), depth, 0).astype(np.float32)
-    cosine = incidence(depth, intrinsics)
+    depth = np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0).astype(np.float32)
+    cosine = incidence_cosine(depth, intrinsics)
     trust = cosine if sure is None else cosine * np.clip(np.nan_to_num(sure, nan=0.0), 0.0, 1.0)
     seen = cosine >= np.cos(np.deg2rad(steepest_deg))
     depth = np.where(seen, depth, np.where(empty, np.inf, 0.0)).astype(np.float32)
@@ -82,7 +82,7 @@ def depth_map(
     return DepthMap(depth, trust, np.where(empty, np.float32(1.0), cosine), color, pose, intrinsics)
 
 
-def incidence(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.float32]:
+def incidence_cosine(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.float32]:
     """Cosine between each ray and the surface normal, float32 (H, W); 0 if a neighbor that the normal needs
     has no depth."""
     rays = intrinsics.rays()
@@ -117,7 +117,7 @@ def _slope(points: NDArray[np.float64], known: NDArray[np.bool_], axis: int) -> 
     return np.where((count == needed)[..., None], out, 0.0)
 
 
-def rendered(
+def render_depth_maps(
     renderer: Renderer,
     cameras: Sequence[Camera],
     solid: float = SOLID,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import CELLS, SIDE
-from edge_server.surface.volume import Volume, unblocked
+from edge_server.surface.volume import Volume, unblock
 
 Floats = NDArray[np.float32]
 
@@ -48,7 +48,7 @@ class Mesh:
         return areas
 
 
-def extracted(
+def extract_mesh(
     volume: Volume,
     min_weight: float = 0.0,
     watertight: bool = False,
@@ -73,11 +73,11 @@ def extracted(
         distance, known = dense.slab(first, last)
         # scikit-image reads a cell's mask at its upper corner.
         cells = np.zeros(known.shape, np.bool_)
-        cells[1:, 1:, 1:] = _all_corners(known) & _crossed(distance)
+        cells[1:, 1:, 1:] = _all_corners(known) & _crosses_surface(distance)
         if cells.any():
             points, triangles, *_ = marching_cubes(distance, 0.0, mask=cells)
             points = points.astype(np.float64) + np.array([first, 0, 0])
-            number = _joined(points, count, (first, last), seams)
+            number = _merge_seams(points, count, (first, last), seams)
             new = number >= count
             vertices.append(points[new])
             faces.append(number[triangles])
@@ -90,10 +90,10 @@ def extracted(
     color = dense.colors(index)
     metres = dense.metres(index)
     mesh = Mesh(metres.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
-    return without_degenerate(mesh)
+    return remove_degenerate(mesh)
 
 
-def _joined(
+def _merge_seams(
     points: NDArray[np.float64], count: int, planes: tuple[int, int], seams: dict[bytes, int]
 ) -> NDArray[np.int64]:
     """Vertex indices of ``points`` (N, 3); new indices start at ``count``. Points on a plane between slabs
@@ -117,7 +117,7 @@ def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
-def _crossed(distance: Floats) -> NDArray[np.bool_]:
+def _crosses_surface(distance: Floats) -> NDArray[np.bool_]:
     """Whether the surface passes through each cell (X - 1, Y - 1, Z - 1)."""
     inside = distance < 0
     some, every = inside, inside
@@ -173,7 +173,7 @@ class _Dense:
             sure[:] = True
         cut = slice(begin - b0 * SIDE, end - b0 * SIDE)
         least = np.float32(LEAST * grid.voxel_m)
-        dense, known = unblocked(distance)[cut], unblocked(sure)[cut]
+        dense, known = unblock(distance)[cut], unblock(sure)[cut]
         dense = np.where(np.abs(dense) < least, np.where(dense < 0, -least, least), dense)
         if pad:
             width = ((pad - (first > 0), pad - (last < self.span[0] - 1)), (1, 1), (1, 1))
@@ -207,16 +207,16 @@ class _Dense:
         return np.where(number[:, None] >= 0, sums, 0.0)
 
 
-def without_degenerate(mesh: Mesh) -> Mesh:
+def remove_degenerate(mesh: Mesh) -> Mesh:
     """Remove faces of zero area and unused vertices."""
     corners = mesh.faces
     apart = (
         (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
     )
-    return _of_faces(mesh, apart & (mesh.areas_m2() > 0.0))
+    return _select_faces(mesh, apart & (mesh.areas_m2() > 0.0))
 
 
-def cleaned(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None) -> Mesh:
+def remove_small_components(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None) -> Mesh:
     """Keep components with at least ``keep_share`` of the largest area, and only the ``most`` largest."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -231,10 +231,10 @@ def cleaned(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None)
     area = np.bincount(of_face, weights=mesh.areas_m2())
     order = np.argsort(-area, kind="stable")
     kept = order[area[order] >= keep_share * area.max()][:most]
-    return _of_faces(mesh, np.isin(of_face, kept))
+    return _select_faces(mesh, np.isin(of_face, kept))
 
 
-def _of_faces(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
+def _select_faces(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
     faces = mesh.faces[which]
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[faces] = True

@@ -49,7 +49,7 @@ class Comparison:
     precise: float
 
 
-def thinned(points: Points, spacing_m: float) -> NDArray[np.int64]:
+def thin_points(points: Points, spacing_m: float) -> NDArray[np.int64]:
     """Indices of the first of points (N, 3) in every grid cell."""
     cells = np.floor(points / spacing_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
@@ -61,7 +61,7 @@ def thinned(points: Points, spacing_m: float) -> NDArray[np.int64]:
     return np.sort(first)
 
 
-def on_mesh(mesh: Mesh, count: int = SAMPLES, seed: int = 0) -> Points:
+def sample_mesh(mesh: Mesh, count: int = SAMPLES, seed: int = 0) -> Points:
     """Sample ``count`` points (N, 3) uniformly over a mesh's area."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 56]))
     area = mesh.areas_m2()
@@ -86,7 +86,7 @@ def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
     asked = truth.points[truth.cameras >= SEEN_BY]
     if not len(mesh.faces) or not len(asked):
         raise SurfaceError("nothing to compare: the mesh, or what two cameras see, is empty")
-    points = on_mesh(mesh, samples)
+    points = sample_mesh(mesh, samples)
     to_truth, _ = cKDTree(truth.points).query(points)
     to_mesh, _ = cKDTree(points).query(asked)
     return Comparison(

@@ -10,14 +10,14 @@ import numpy as np
 from edge_server.fields import Renderer, View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
-from edge_server.surface.carve import STEPS, box_of, carved, completed
-from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, rendered
-from edge_server.surface.mesh import KEEP_SHARE, Mesh, cleaned, extracted
-from edge_server.surface.sharpen import PASSES, sharpened
-from edge_server.surface.volume import TRUNCATION, Grid, bounds_of, fused
+from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, render_depth_maps
+from edge_server.surface.mesh import KEEP_SHARE, Mesh, extract_mesh, remove_small_components
+from edge_server.surface.refine_depth import PASSES, refine_depth
+from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
+from edge_server.surface.voxel_depth import STEPS, fill_depth, fit_voxels, voxel_box
 
 METHODS = ("tsdf", "sdf")
-GUESS = 0.5  # minimum opacity of a surface as initial depth for sharpening
+GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
 FINEST = 512  # maximum voxels along the longest side without a given voxel size
 Corner = tuple[float, float, float]
 Say = Callable[[str, float], None]
@@ -29,9 +29,9 @@ class MeshSettings:
     truncation: voxels. bounds: lower and upper corner, meters; None: from the depth maps. watertight: close
     the surface in unobserved space. min_weight: known voxels have more weight than this (a camera at normal
     incidence counts 1). solid, steepest_deg: pixel selection. keep_share, most: component selection.
-    memory_mb: of the volume. sharpen: refine depth by photo-consistency (``sharpen``). carve: with sharpen,
-    in a scene bounded by its field's box with enough images: start from voxels fitted in ``carve_steps``
-    steps, and use their depth where the images are ambiguous (``carve``)."""
+    memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``). carve: with
+    sharpen, in a scene bounded by its field's box with enough images: start from voxels fitted in
+    ``carve_steps`` steps, and use their depth where the images are ambiguous (``voxel_depth``)."""
 
     method: str = "tsdf"
     sharpen: bool = True
@@ -64,64 +64,56 @@ def silent(what: str, share: float) -> None:
     """Report no progress."""
 
 
-def mesh_of(
-    renderer: Renderer,
-    views: Sequence[View],
-    settings: MeshSettings | None = None,
-    say: Say = silent,
-    pool: Pool | None = None,
-) -> Mesh:
-    """Extract the surface seen from the cameras of ``views``. say: called with each stage and its completed
-    share. SurfaceError: there is no surface, or the settings do not allow it."""
-    settings = settings or MeshSettings()
-    return mesh_of_maps(maps_of(renderer, views, settings, say, pool), settings, say, pool)
-
-
-def maps_of(
+def make_depth_maps(
     renderer: Renderer,
     views: Sequence[View],
     settings: MeshSettings,
     say: Say = silent,
     pool: Pool | None = None,
 ) -> list[DepthMap]:
-    """The depth maps that ``mesh_of`` fuses."""
+    """Make the depth maps that ``mesh_from_depth_maps`` fuses.
+
+    renderer: of the field. views: the cameras, with their images. say: called with each stage and its
+    completed share. SurfaceError: there are no views.
+    """
     if not views:
         raise SurfaceError("the field knows no cameras yet: fit it first")
     cameras = [(v.camera_to_world, v.intrinsics) for v in views]
-    box = box_of(renderer, views) if settings.sharpen and settings.carve else None
+    box = voxel_box(renderer, views) if settings.sharpen and settings.carve else None
     if box is not None:
         say("carve", 0.0)
         behind = getattr(renderer, "background", None)
-        renderer = carved(box, behind, views, settings.carve_steps, pool)
+        renderer = fit_voxels(box, behind, views, settings.carve_steps, pool)
         say("carve", 1.0)
-    # A translucent initial surface is sufficient for sharpening.
+    # A translucent initial surface is sufficient for refinement.
     solid = min(settings.solid, GUESS) if settings.sharpen else settings.solid
     maps = list(
-        rendered(
+        render_depth_maps(
             renderer, cameras, solid, settings.steepest_deg, lambda done: say("depth", done / len(views))
         )
     )
     if not settings.sharpen or len(maps) < 2:
         return maps
-    # Carved depth is accurate enough to skip the widest search, which may find a wrong match.
+    # Voxel depth is accurate enough to skip the widest search, which may find a wrong match.
     passes = PASSES if box is None else PASSES[1:]
-    sharp = sharpened(maps, [v.image for v in views], passes, pool, lambda share: say("sharpen", share))
-    return sharp if box is None else completed(sharp, maps)
+    sharp = refine_depth(maps, [v.image for v in views], passes, pool, lambda share: say("sharpen", share))
+    return sharp if box is None else fill_depth(sharp, maps)
 
 
-def mesh_of_maps(
+def mesh_from_depth_maps(
     maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent, pool: Pool | None = None
 ) -> Mesh:
-    """The surface of depth maps; see ``mesh_of``."""
+    """Extract the surface of ``maps``. say: called with each stage and its completed share. SurfaceError:
+    there is no surface, or the settings do not allow it."""
     grid = grid_for(maps, settings)
     if settings.method == "sdf":
-        from edge_server.surface.sdf import fitted  # torch, only where it is asked for
+        from edge_server.surface.sdf import fit_sdf  # imports torch
 
-        volume = fitted(grid, maps, settings.memory_mb, say, pool)
+        volume = fit_sdf(grid, maps, settings.memory_mb, say, pool)
     else:
-        volume = fused(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
-    mesh = extracted(volume, settings.min_weight, settings.watertight, lambda share: say("extract", share))
-    return cleaned(mesh, settings.keep_share, settings.most)
+        volume = fuse_maps(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
+    mesh = extract_mesh(volume, settings.min_weight, settings.watertight, lambda share: say("extract", share))
+    return remove_small_components(mesh, settings.keep_share, settings.most)
 
 
 def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
@@ -130,7 +122,7 @@ def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
     if settings.bounds is not None:
         lower, upper = settings.bounds
     else:
-        lower, upper = bounds_of(maps, 2.0 * settings.truncation * voxel_m)
+        lower, upper = bounding_box(maps, 2.0 * settings.truncation * voxel_m)
     if settings.voxel_m is None:
         voxel_m = max(voxel_m, float(np.subtract(upper, lower).max()) / FINEST)
     return Grid(lower, upper, voxel_m, settings.truncation * voxel_m)

@@ -20,9 +20,9 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
-from edge_server.surface.volume import Grid, Volume, fused
+from edge_server.surface.volume import Grid, Volume, fuse_maps
 
-MOST_NODES = 1 << 24
+MAX_NODES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SdfSettings:
     seed: int = 0
 
 
-def fitted(
+def fit_sdf(
     grid: Grid,
     maps: Sequence[DepthMap],
     memory_mb: float = 2048.0,
@@ -51,18 +51,18 @@ def fitted(
     """Fit a function to ``maps`` and return its distances as a volume. SurfaceError: torch is missing, the
     grid is too fine, or there is nothing to fit."""
     settings = settings or SdfSettings()
-    volume = fused(grid, maps, memory_mb, pool)
+    volume = fuse_maps(grid, maps, memory_mb, pool)
     samples = _Samples.of(maps, grid)
     if not len(samples.points):
         raise SurfaceError("no camera sees anything solid within the bounds")
     nodes = int(np.prod(grid.blocks * SIDE))
-    if nodes > MOST_NODES:
-        least = grid.voxel_m * (nodes / MOST_NODES) ** (1 / 3)
+    if nodes > MAX_NODES:
+        least = grid.voxel_m * (nodes / MAX_NODES) ** (1 / 3)
         raise SurfaceError(
             f"a distance function at {1e3 * grid.voxel_m:g} mm has too many nodes: take {1e3 * least:.2g} mm "
             "or more, smaller bounds, or method tsdf"
         )
-    distance = _optimised(grid, samples, settings, say)
+    distance = _optimize(grid, samples, settings, say)
     x, y, z = grid.blocks
     blocked = distance.reshape(x, SIDE, y, SIDE, z, SIDE).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, CELLS)
     clipped = np.clip(blocked[tuple(volume.blocks.place.T)], -grid.band_m, grid.band_m)
@@ -93,7 +93,7 @@ class _Samples:
         return cls(*every)
 
 
-def _optimised(
+def _optimize(
     grid: Grid, samples: _Samples, s: SdfSettings, say: Callable[[str, float], None] | None
 ) -> NDArray[np.float32]:
     """Distances (X, Y, Z) at the grid's voxels, meters."""
@@ -107,12 +107,12 @@ def _optimised(
     cosine, trust = torch.from_numpy(samples.cosine), torch.from_numpy(samples.trust)
     chances = (trust.double() / trust.double().sum()).cumsum(0)
     size = tuple(int(n) for n in grid.blocks * SIDE)
-    # All values start slightly outside; the sides term and surface points carve the inside.
-    values = torch.full((1, 1, *_coarser(size, s.levels - 1)), 0.5 * grid.band_m)
+    # All distances start slightly positive; the sides term and the surface points make the inside negative.
+    values = torch.full((1, 1, *_coarse_shape(size, s.levels - 1)), 0.5 * grid.band_m)
     for level in range(s.levels):
         scale = 2 ** (s.levels - 1 - level)
         voxel = grid.voxel_m * scale
-        shape = _coarser(size, s.levels - 1 - level)
+        shape = _coarse_shape(size, s.levels - 1 - level)
         if level:
             values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
         values = values.detach().clone().requires_grad_()
@@ -136,7 +136,7 @@ def _optimised(
     return found
 
 
-def _coarser(size: tuple[int, ...], halvings: int) -> tuple[int, ...]:
+def _coarse_shape(size: tuple[int, ...], halvings: int) -> tuple[int, ...]:
     return tuple(max(2, -(-n // 2**halvings)) for n in size)
 
 
@@ -151,19 +151,23 @@ def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
     far = torch.rand(len(points), generator=generator)[:, None]
     free = points - rays * (band + far * (extent.max() - band))
     inside = ((free > 0) & (free < extent)).all(dim=1)
-    on = at(values, points, extent)
-    front, back, clear = at(values, before, extent), at(values, behind, extent), at(values, free, extent)
+    on = sample_grid(values, points, extent)
+    front, back, clear = (
+        sample_grid(values, before, extent),
+        sample_grid(values, behind, extent),
+        sample_grid(values, free, extent),
+    )
     sides = torch.relu(0.5 * along[:, 0] - front).mean() + torch.relu(0.5 * along[:, 0] + back).mean()
     sides = sides + (torch.relu(0.5 * band - clear) * inside).mean()
     domain = torch.cat([points, before, behind])[
         torch.randperm(3 * len(points), generator=generator)[: len(points)]
     ]
-    steep = slope(values, domain, extent, voxel)
+    steep = gradient_norm(values, domain, extent, voxel)
     eikonal = ((steep - 1.0) ** 2).mean()
     return on.abs().mean() / voxel + s.sides * sides / voxel + s.eikonal * eikonal
 
 
-def at(values, points, extent):
+def sample_grid(values, points, extent):
     """Interpolate grid values (1, 1, X, Y, Z) at points (N, 3), meters from the grid's corner: (N,)."""
     from torch.nn.functional import grid_sample
 
@@ -173,10 +177,10 @@ def at(values, points, extent):
     return grid_sample(values, where, mode="bilinear", padding_mode="border", align_corners=True).view(-1)
 
 
-def slope(values, points, extent, voxel):
+def gradient_norm(values, points, extent, voxel):
     """|grad d| (N,) by central differences over one voxel to each side (3.13)."""
     import torch
 
     steps = torch.eye(3) * voxel
-    parts = [at(values, points + e, extent) - at(values, points - e, extent) for e in steps]
+    parts = [sample_grid(values, points + e, extent) - sample_grid(values, points - e, extent) for e in steps]
     return (torch.stack(parts).pow(2).sum(0) / (2.0 * voxel) ** 2 + 1e-12).sqrt()

@@ -17,10 +17,10 @@ from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
-from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, Look, fuse
+from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
 
-BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
-MOST_ENTRIES = 1 << 24  # in the table of blocks: 24 bytes each during fusion
+BLOCK_BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
+MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
 TRUNCATION = 4.0  # voxels, the default
 
 
@@ -47,8 +47,8 @@ class Grid:
         if not all(low < high for low, high in zip(self.lower, self.upper)):
             raise SurfaceError(f"bounds: each lower corner must be below its upper one: {self.describe()}")
         entries = np.prod(self.blocks.astype(float))
-        if entries > MOST_ENTRIES:
-            least = self.voxel_m * (entries / MOST_ENTRIES) ** (1 / 3)
+        if entries > MAX_BLOCKS:
+            least = self.voxel_m * (entries / MAX_BLOCKS) ** (1 / 3)
             raise SurfaceError(
                 f"{1e3 * self.voxel_m:g} mm voxels are too many in {self.describe()}: "
                 f"take {1e3 * least:.2g} mm or more, or smaller bounds"
@@ -76,7 +76,7 @@ class Volume:
     through: NDArray[np.bool_]
 
 
-def bounds_of(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -> tuple[
+def bounding_box(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -> tuple[
     tuple[float, float, float], tuple[float, float, float]
 ]:  # fmt: skip
     """Lower and upper corner, meters, of the maps' points, plus a margin. spare: share of points to ignore
@@ -90,7 +90,7 @@ def bounds_of(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -
     return (float(a[0]), float(a[1]), float(a[2])), (float(b[0]), float(b[1]), float(b[2]))
 
 
-def fused(
+def fuse_maps(
     grid: Grid,
     maps: Iterable[DepthMap],
     memory_mb: float = 2048.0,
@@ -101,8 +101,8 @@ def fused(
     maps = list(maps)
     pool = pool or shared_pool()
     table = np.full(tuple(grid.blocks), -1, np.int32)
-    place = np.argwhere(near_surfaces(grid, maps)).astype(np.int32)
-    needed_mb = len(place) * BYTES / 1e6
+    place = np.argwhere(blocks_near_surfaces(grid, maps)).astype(np.int32)
+    needed_mb = len(place) * BLOCK_BYTES / 1e6
     if needed_mb > memory_mb:
         # The number of blocks near a surface grows with the square of the resolution.
         least_m = grid.voxel_m * np.sqrt(needed_mb / memory_mb)
@@ -118,12 +118,12 @@ def fused(
     coarse = np.argwhere(np.ones(across, np.bool_)).astype(np.int32)
     middles = _blocks(coarse, np.array(grid.lower) + 0.5 * (side - grid.voxel_m), grid.band_m)
     for done, found in enumerate(maps, 1):
-        look = as_look(found)
+        look = kernel_depth(found)
         pool.run(fuse, blocks, look, float(grid.voxel_m), float(grid.band_m))
         pool.run(fuse, middles, look, float(side), float(grid.band_m))
         if on_map is not None:
             on_map(done)
-    free = unblocked(((middles.weight > 0) & (middles.distance > 0)).reshape(*across, CELLS))
+    free = unblock(((middles.weight > 0) & (middles.distance > 0)).reshape(*across, CELLS))
     return Volume(grid, blocks, table, free[: table.shape[0], : table.shape[1], : table.shape[2]])
 
 
@@ -137,16 +137,16 @@ def _blocks(place: NDArray[np.int32], lowest: NDArray[np.float64], band_m: float
     )
 
 
-def unblocked(blocks: NDArray) -> NDArray:
+def unblock(blocks: NDArray) -> NDArray:
     """Reshape blocks of voxels (X, Y, Z, CELLS) to one array (SIDE X, SIDE Y, SIDE Z)."""
     x, y, z = blocks.shape[:3]
     layers = blocks.reshape(x, y, z, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
     return layers.reshape(x * SIDE, y * SIDE, z * SIDE)
 
 
-def as_look(found: DepthMap) -> Look:
+def kernel_depth(found: DepthMap) -> KernelDepth:
     """Convert a depth map to the kernel's input."""
-    return Look(
+    return KernelDepth(
         lens=np.array(lens_row(found.intrinsics), dtype=np.float64),
         rotation=np.ascontiguousarray(found.camera_to_world[:3, :3]),
         origin=np.ascontiguousarray(found.camera_to_world[:3, 3]),
@@ -157,7 +157,7 @@ def as_look(found: DepthMap) -> Look:
     )
 
 
-def near_surfaces(grid: Grid, maps: Sequence[DepthMap]) -> NDArray[np.bool_]:
+def blocks_near_surfaces(grid: Grid, maps: Sequence[DepthMap]) -> NDArray[np.bool_]:
     """Which blocks (X, Y, Z) come within the truncation of a depth map's points."""
     wanted = np.zeros(tuple(grid.blocks), np.bool_)
     side = SIDE * grid.voxel_m

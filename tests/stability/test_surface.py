@@ -10,13 +10,13 @@ import pytest
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.surface import SurfaceError
-from edge_server.surface.carve import carved, completed
-from edge_server.surface.depth import DepthMap, depth_map, rendered
-from edge_server.surface.mesh import cleaned, extracted
-from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
-from edge_server.surface.sharpen import sharpened
-from edge_server.surface.volume import Grid, bounds_of, fused
-from tests.edge_server.surface.shapes import LENS, RADIUS_M, BallRenderer, around, ball_depth, ball_maps
+from edge_server.surface.depth import DepthMap, depth_map, render_depth_maps
+from edge_server.surface.mesh import extract_mesh, remove_small_components
+from edge_server.surface.reconstruct import MeshSettings, mesh_from_depth_maps
+from edge_server.surface.refine_depth import refine_depth
+from edge_server.surface.volume import Grid, bounding_box, fuse_maps
+from edge_server.surface.voxel_depth import fill_depth, fit_voxels
+from tests.edge_server.surface.shapes import LENS, RADIUS_M, BallRenderer, ball_depth, ball_maps, poses_around
 
 skimage = pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 
@@ -30,7 +30,9 @@ def with_depth(found: DepthMap, depth: np.ndarray) -> DepthMap:
 
 
 def radii(maps, **settings) -> np.ndarray:
-    mesh = mesh_of_maps(maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper), **settings))
+    mesh = mesh_from_depth_maps(
+        maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper), **settings)
+    )
     assert np.isfinite(mesh.vertices).all()
     return np.linalg.norm(mesh.vertices, axis=1)
 
@@ -38,19 +40,19 @@ def radii(maps, **settings) -> np.ndarray:
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, -np.inf, 1e30, 1e-30])
 def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
     maps = [with_depth(m, np.full((64, 64), value)) for m in ball_maps(3)]
-    volume = fused(GRID, maps)
+    volume = fuse_maps(GRID, maps)
     for array in (volume.blocks.distance, volume.blocks.weight, volume.blocks.color):
         assert np.isfinite(array).all()
     with pytest.raises(SurfaceError, match="no surface"):
-        extracted(volume)
+        extract_mesh(volume)
     if not any(m.seen.any() for m in maps):
         with pytest.raises(SurfaceError, match="no camera sees anything solid"):
-            bounds_of(maps, 0.01)
+            bounding_box(maps, 0.01)
 
 
 def test_no_maps_at_all():
     with pytest.raises(SurfaceError, match="no surface"):
-        extracted(fused(GRID, []))
+        extract_mesh(fuse_maps(GRID, []))
 
 
 def test_noise_averages_out():
@@ -71,7 +73,7 @@ def test_one_camera_that_contradicts_all_others_is_outvoted():
 
 def test_cameras_that_agree_on_nothing_stay_within_bounds():
     maps = [with_depth(m, RNG.uniform(0.2, 0.6, m.depth.shape)) for m in ball_maps(12)]
-    volume = fused(GRID, maps)
+    volume = fuse_maps(GRID, maps)
     assert np.abs(volume.blocks.distance).max() <= GRID.band_m + 1e-6  # (3.8)
     assert np.isfinite(volume.blocks.color).all()
 
@@ -88,14 +90,14 @@ def test_single_pixels_of_nonsense_do_not_spread():
 def test_a_million_equal_maps_would_not_overflow():
     """Weights add up (3.10): the mean must hold when one more says nothing new."""
     one = ball_maps(1)
-    volume = fused(GRID, one)
+    volume = fuse_maps(GRID, one)
     heavy = volume.blocks._replace(weight=volume.blocks.weight * 1e6)
     before = heavy.distance.copy()
     from edge_server.fields.common.threads.thread_pool import shared_pool
     from edge_server.surface.kernels.fuse import fuse
-    from edge_server.surface.volume import as_look
+    from edge_server.surface.volume import kernel_depth
 
-    shared_pool().run(fuse, heavy, as_look(one[0]), GRID.voxel_m, GRID.band_m)
+    shared_pool().run(fuse, heavy, kernel_depth(one[0]), GRID.voxel_m, GRID.band_m)
     known = volume.blocks.weight > 0
     np.testing.assert_allclose(heavy.distance[known], before[known], atol=1e-6)
 
@@ -104,7 +106,7 @@ def test_a_camera_within_the_surface_and_one_behind_it():
     inside = np.eye(4)
     inside[:3, 3] = (0.0, 0.0, 0.05)
     look = depth_map(np.full((64, 64), 0.04, np.float32), GREY, inside, LENS)
-    volume = fused(GRID, [look, *ball_maps(8)])
+    volume = fuse_maps(GRID, [look, *ball_maps(8)])
     assert np.isfinite(volume.blocks.distance).all()
 
 
@@ -114,7 +116,7 @@ def test_a_renderer_that_has_diverged():
             good = super().render(camera_to_world, intrinsics)
             return replace(good, depth=good.depth * np.nan, opacity=good.opacity * np.nan)
 
-    maps = list(rendered(Diverged(), [(pose, LENS) for pose in around(3)]))
+    maps = list(render_depth_maps(Diverged(), [(pose, LENS) for pose in poses_around(3)]))
     assert not any(m.seen.any() or m.trust.any() for m in maps)
 
 
@@ -122,7 +124,7 @@ def test_a_renderer_that_has_diverged():
 def test_pictures_without_texture_leave_depth_where_it_was(level):
     maps = ball_maps(8)
     flat = [np.full((64, 64, 3), level, np.uint8)] * 8
-    found = sharpened(maps, flat)
+    found = refine_depth(maps, flat)
     for before, after in zip(maps, found):
         both = before.seen & after.seen
         assert both.sum() > 0.8 * before.seen.sum()
@@ -133,7 +135,7 @@ def test_pictures_without_texture_leave_depth_where_it_was(level):
 def test_pictures_of_noise_do_not_make_a_surface_anywhere_else():
     maps = ball_maps(8)
     noise = [RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8) for _ in maps]
-    found = sharpened(maps, noise)
+    found = refine_depth(maps, noise)
     for before, after in zip(maps, found):
         both = before.seen & after.seen
         assert np.isfinite(after.depth[both]).all()
@@ -142,16 +144,16 @@ def test_pictures_of_noise_do_not_make_a_surface_anywhere_else():
 
 
 def test_cameras_that_see_nothing_in_common_are_left_as_they_are():
-    pose = around(1)[0]
+    pose = poses_around(1)[0]
     alone = [depth_map(ball_depth(LENS, pose), GREY, pose, LENS)]
-    (found,) = sharpened(alone, [GREY])
+    (found,) = refine_depth(alone, [GREY])
     assert found.seen.sum() > 0.8 * alone[0].seen.sum()
     np.testing.assert_array_equal(found.depth[found.seen], alone[0].depth[found.seen])
 
 
 def test_a_volume_of_one_block():
     tiny = Grid((0.09, -0.02, -0.02), (0.11, 0.02, 0.02), 0.005, 0.01)
-    mesh = cleaned(extracted(fused(tiny, ball_maps(20))))
+    mesh = remove_small_components(extract_mesh(fuse_maps(tiny, ball_maps(20))))
     assert len(mesh.faces) and np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS_M).max() < 0.003
 
 
@@ -164,16 +166,16 @@ def test_voxels_carved_from_pictures_of_nothing(kind):
         "noise": lambda k: RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8),
         "contradictory": lambda k: np.full((64, 64, 3), 255 * (k % 2), np.uint8),
     }
-    views = [View(f"c{k}", pictures[kind](k), pose, LENS) for k, pose in enumerate(around(6))]
+    views = [View(f"c{k}", pictures[kind](k), pose, LENS) for k, pose in enumerate(poses_around(6))]
     box = SceneBox((0.0, 0.0, 0.0), 0.15, 0.1, False, 0.4, 0.005)
-    field = carved(box, (0.35, 0.35, 0.35), views, 30, None)
-    maps = list(rendered(field, [(v.camera_to_world, v.intrinsics) for v in views], 0.5))
-    found = completed(sharpened(maps, [v.image for v in views]), maps)
+    field = fit_voxels(box, (0.35, 0.35, 0.35), views, 30, None)
+    maps = list(render_depth_maps(field, [(v.camera_to_world, v.intrinsics) for v in views], 0.5))
+    found = fill_depth(refine_depth(maps, [v.image for v in views]), maps)
     for m in found:
         assert np.isfinite(m.trust).all() and not np.isnan(m.depth).any() and np.isfinite(m.cosine).all()
         # Within the box, but for what a sweep of all passes may move it.
         assert (m.depth[m.seen] > 0.86 * 0.1).all() and (m.depth[m.seen] < 1.14 * (0.4 + 0.15 * 3**0.5)).all()
-    volume = fused(GRID, found)
+    volume = fuse_maps(GRID, found)
     assert np.isfinite(volume.blocks.distance).all() and np.isfinite(volume.blocks.color).all()
     assert np.abs(volume.blocks.distance).max(initial=0.0) <= GRID.band_m + 1e-6
     if kind == "plain":

@@ -2,7 +2,7 @@
 
 A field is fitted to a scan of ``tile`` from 0.3 m (``scenes.tile_scan``). After each fitting time its depth
 is compared with the exact depth, and meshes are made: from the depth of the field, from depth sharpened by
-the images, and from carved voxels that are then sharpened (``surface.carve``), with truncated signed
+the images, and from carved voxels that are then sharpened (``surface.voxel_depth``), with truncated signed
 distances at several voxel sizes and with a fitted distance function. Row ``exact`` fuses the exact depth: the
 best that images of this size and these cameras allow.
 """
@@ -37,7 +37,7 @@ from edge_server.surface.metrics import (
     compare,
     depth_error_mm,
 )
-from edge_server.surface.reconstruct import MeshSettings, maps_of, mesh_of_maps
+from edge_server.surface.reconstruct import MeshSettings, make_depth_maps, mesh_from_depth_maps
 from freshfield.machine_load import LoadMeter
 
 # What is fitted, by name: representation and options.
@@ -149,7 +149,7 @@ def _case(
             def say(what: str, share: float, seconds=seconds, began=began) -> None:
                 seconds[what] = time.perf_counter() - began - sum(v for k, v in seconds.items() if k != what)
 
-            maps = maps_of(snapshot, close.views, DEPTHS[depth], say)
+            maps = make_depth_maps(snapshot, close.views, DEPTHS[depth], say)
             fit[depth] = {**_depth_error(maps, exact), **{f"{k}_s": v for k, v in seconds.items()}}
             fit["meshes"] += [_mesh(maps, method, depth, mm, truth) for method, mm in wanted]
         fits.append(fit)
@@ -172,7 +172,7 @@ def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, tr
     row: dict[str, Any] = {"method": method, "depth": depth, "voxel_mm": voxel_mm}
     began = time.perf_counter()
     try:
-        mesh = mesh_of_maps(maps, MeshSettings(method=method, voxel_m=1e-3 * voxel_mm))
+        mesh = mesh_from_depth_maps(maps, MeshSettings(method=method, voxel_m=1e-3 * voxel_mm))
     except SurfaceError as error:
         return {**row, "failed": str(error)}
     row |= {"seconds": time.perf_counter() - began, "triangles": len(mesh.faces)}

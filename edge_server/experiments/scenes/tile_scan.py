@@ -17,7 +17,7 @@ from camera_node.synthetic.placement import PlacedParts, place_static
 from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
 from edge_server.fields import View
-from edge_server.surface.metrics import STEEPEST_DEG, Truth, thinned
+from edge_server.surface.metrics import STEEPEST_DEG, Truth, thin_points
 from freshfield.geometry import Pinhole, world_rays
 
 DISTANCE_M = 0.3
@@ -85,11 +85,11 @@ def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
         met = origin[:, None] + t[hit] * rays[:, hit]
         _, facing = surface_properties(placed, which[hit], met, rays[:, hit])
         seen = -(facing * rays[:, hit]).sum(axis=0) >= np.cos(np.deg2rad(STEEPEST_DEG))
-        first = thinned(met.T[seen], spacing_m)
+        first = thin_points(met.T[seen], spacing_m)
         points.append(met.T[seen][first])
         normals.append(facing.T[seen][first])
     every, all_normals = np.concatenate(points), np.concatenate(normals)
-    first = thinned(every, spacing_m)
+    first = thin_points(every, spacing_m)
     every, all_normals = every[first], all_normals[first]
     count = np.zeros(len(every), np.int64)
     for view in scan.views:

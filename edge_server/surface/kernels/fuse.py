@@ -18,7 +18,7 @@ FREE = 0.05  # weight factor of a voxel far before a surface; 1 at the surface
 CLOSE = 2.0  # maximum depth difference of neighboring pixels on one surface, in truncations
 
 
-class Look(NamedTuple):
+class KernelDepth(NamedTuple):
     """One depth map as the kernel reads it. lens: float64 (8,), fx fy cx cy k1 k2 p1 p2. rotation: float64
     (3, 3), camera-to-world; origin: float64 (3,), metres. depth: float32 (H, W), metres along the ray, 0
     where nothing is known, FAR where the ray meets nothing. trust: float32 (H, W), w_new of (3.9); cosine:
@@ -47,7 +47,7 @@ class Blocks(NamedTuple):
 
 
 @njit(inline="always")
-def _bent(look, a, b):
+def _distort(look, a, b):
     """Distorted normalised coordinates; NaN far outside, where the polynomial folds back into the picture."""
     k1, k2, p1, p2 = look.lens[4], look.lens[5], look.lens[6], look.lens[7]
     r2 = a * a + b * b
@@ -134,7 +134,7 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
             over = 1.0 / deep
             u, v = (r00 * x + r10 * y + r20 * z) * over, (r01 * x + r11 * y + r21 * z) * over
             if distorted:
-                u, v = _bent(look, u, v)
+                u, v = _distort(look, u, v)
             u, v = fx * u + cx, fy * v + cy
             if not (u >= 0.0 and v >= 0.0 and u < f_width and v < f_height):
                 continue

@@ -21,7 +21,7 @@ FLAT = 0.25  # minimum variance, gray levels squared, of a textured patch
 NONE = -2.0  # score of a point that no other image shows
 
 
-class Others(NamedTuple):
+class SourceImages(NamedTuple):
     """S pictures to compare with. lens: float64 (S, 8), fx fy cx cy k1 k2 p1 p2. rotation: (S, 3, 3),
     camera-to-world; origin: (S, 3), metres. first: int64 (S + 1,) into grey: float32 (P,), row by row;
     size: int64 (S, 2), width and height."""
@@ -35,7 +35,7 @@ class Others(NamedTuple):
 
 
 @njit(inline="always")
-def _seen_at(others, s, x, y, z):
+def _project(others, s, x, y, z):
     """Project a world point to image s; -1e9 if behind the camera or far outside."""
     x, y, z = x - others.origin[s, 0], y - others.origin[s, 1], z - others.origin[s, 2]
     r, lens = others.rotation, others.lens
@@ -62,7 +62,7 @@ def _on_plane(rays, row, column, nx, ny, nz, reach):
 
 
 @njit
-def agreement(patch, spread, others, s, u, v, ux, vx, uy, vy):
+def correlation(patch, spread, others, s, u, v, ux, vx, uy, vy):
     """Correlation of ``patch`` (TAPS^2, its mean taken off, ``spread`` its squared length) with picture s
     around (u, v), where a pixel to the right is (ux, vx) and one down (uy, vy); NONE: outside."""
     width, height, first = others.size[s, 0], others.size[s, 1], others.first[s]
@@ -144,19 +144,19 @@ def sweep(counter, worker, rays, origin, grey, depth, normal, others, factors, b
                 d = d0 * factors[k]
                 one = two = NONE
                 for s in range(others.first.size - 1):
-                    u, v = _seen_at(others, s, origin[0] + d * rx, origin[1] + d * ry, origin[2] + d * rz)
+                    u, v = _project(others, s, origin[0] + d * rx, origin[1] + d * ry, origin[2] + d * rz)
                     if u < 0.0 or v < 0.0 or u >= others.size[s, 0] or v >= others.size[s, 1]:
                         continue
                     a, b = d * right, d * down
-                    ur, vr = _seen_at(
+                    ur, vr = _project(
                         others, s, origin[0] + a * rays[row, column + 1, 0],
                         origin[1] + a * rays[row, column + 1, 1], origin[2] + a * rays[row, column + 1, 2],
                     )  # fmt: skip
-                    ud, vd = _seen_at(
+                    ud, vd = _project(
                         others, s, origin[0] + b * rays[row + 1, column, 0],
                         origin[1] + b * rays[row + 1, column, 1], origin[2] + b * rays[row + 1, column, 2],
                     )  # fmt: skip
-                    found = agreement(patch, spread, others, s, u, v, ur - u, vr - v, ud - u, vd - v)
+                    found = correlation(patch, spread, others, s, u, v, ur - u, vr - v, ud - u, vd - v)
                     if found > one:
                         one, two = found, one
                     elif found > two:

@@ -81,14 +81,14 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     from edge_server.experiments.scenes.mesh_truth import distances
     from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
-    from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
+    from edge_server.surface.reconstruct import MeshSettings, mesh_from_depth_maps
 
     near = scan(64, ((-0.065, 0.0, 0.03), (0.065, 0.0, 0.03)))
     maps = [
         depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for v in near.views
     ]
-    found = distances(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
+    found = distances(mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
     assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import ExportError, Shot, file_names, glb, ply
+from edge_server.export import ExportError, PosedImage, file_names, glb, ply
 from edge_server.export.colmap import Cloud, write_model
-from edge_server.export.point_cloud import cloud_of
+from edge_server.export.point_cloud import sparse_points
 from edge_server.export.run_source import write_images
 from edge_server.export.splats import Y0, write_splats
 from edge_server.export.trajectory import write_tum
@@ -21,21 +21,22 @@ from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
 from freshfield.geometry import Pose, quaternion_to_matrix, se3_inverse
-from tests.edge_server.surface.shapes import BENT, LENS, ball_maps
+from tests.edge_server.surface.shapes import DISTORTED_LENS, LENS, ball_maps
 
 RNG = np.random.default_rng(5)
 
 
-def shots(count: int = 4) -> list[Shot]:
+def shots(count: int = 4) -> list[PosedImage]:
     maps = ball_maps(count)
-    lenses = [LENS, BENT]
+    lenses = [LENS, DISTORTED_LENS]
     pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
     return [
-        Shot(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k)) for k, m in enumerate(maps)
+        PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k))
+        for k, m in enumerate(maps)
     ]
 
 
-def cloud(of: list[Shot]) -> Cloud:
+def cloud(of: list[PosedImage]) -> Cloud:
     """Points in front of all cameras, each seen where its pixel lies in the picture."""
     points = RNG.uniform(-0.08, 0.08, (50, 3))
     seen = np.zeros((50, len(of)), np.bool_)
@@ -45,7 +46,7 @@ def cloud(of: list[Shot]) -> Cloud:
     return Cloud(points, RNG.integers(0, 255, (50, 3), dtype=np.uint8), seen)
 
 
-def pixels(shot: Shot, points: np.ndarray) -> np.ndarray:
+def pixels(shot: PosedImage, points: np.ndarray) -> np.ndarray:
     inverse = se3_inverse(shot.camera_to_world)
     return shot.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
@@ -100,14 +101,14 @@ def test_transforms_read_back_as_they_were(tmp_path):
         np.testing.assert_array_equal(view.image, shot.image)
         assert view.intrinsics == shot.intrinsics
         point = RNG.uniform(-0.05, 0.05, (20, 3))
-        again = Shot("", view.image, view.camera_to_world, view.intrinsics)
+        again = PosedImage("", view.image, view.camera_to_world, view.intrinsics)
         assert np.abs(pixels(again, point) - pixels(shot, point)).max() < 0.01
     assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
 
 
 def test_transparent_pictures_stay_transparent(tmp_path):
     picture = RNG.integers(0, 255, (64, 64, 4), dtype=np.uint8)
-    write_images(tmp_path, [Shot("a", picture, np.eye(4), LENS)])
+    write_images(tmp_path, [PosedImage("a", picture, np.eye(4), LENS)])
     back = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(cv2.cvtColor(back, cv2.COLOR_BGRA2RGBA), picture)
 
@@ -213,7 +214,7 @@ def test_points_open_in_trimesh(tmp_path):
 
 def test_points_know_who_sees_them():
     maps = ball_maps(12)
-    found = cloud_of(maps, 1200)
+    found = sparse_points(maps, 1200)
     assert 1000 < len(found.points) <= 1200
     assert np.abs(np.linalg.norm(found.points, axis=1) - 0.1).max() < 1e-3
     # Who sees a point of a ball stands on its side; nobody sees it through the ball.

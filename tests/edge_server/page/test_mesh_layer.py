@@ -13,7 +13,7 @@ import viser
 from edge_server.fields import View
 from edge_server.page.mesh_layer import NODE, MeshLayer
 from tests.edge_server.page.test_page import bare_state, publication
-from tests.edge_server.surface.shapes import LENS, BallRenderer, around
+from tests.edge_server.surface.shapes import LENS, BallRenderer, poses_around
 from tests.waiting import wait_until
 
 
@@ -43,7 +43,7 @@ def test_a_mesh_comes_and_goes(server):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     state, client = bare_state(), Client()
     picture = np.zeros((64, 64, 3), np.uint8)
-    cameras = tuple(View(f"cam{k}", picture, pose, LENS) for k, pose in enumerate(around(10)))
+    cameras = tuple(View(f"cam{k}", picture, pose, LENS) for k, pose in enumerate(poses_around(10)))
     state.publish(publication(0), BallRenderer(cameras))
     layer = MeshLayer(server, state)
     press(layer, client)

@@ -13,7 +13,7 @@ from freshfield.geometry import Pinhole, look_at, world_rays
 
 RADIUS_M = 0.1
 LENS = Pinhole.from_fov(64, 64, 40.0)
-BENT = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (-0.2, 0.05, 0.002, -0.001))
+DISTORTED_LENS = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (-0.2, 0.05, 0.002, -0.001))
 
 
 def ball_depth(camera: Pinhole, pose: NDArray, radius_m: float = RADIUS_M) -> NDArray[np.float32]:
@@ -24,7 +24,7 @@ def ball_depth(camera: Pinhole, pose: NDArray, radius_m: float = RADIUS_M) -> ND
     return np.where(root > 0, -along - np.sqrt(np.maximum(root, 0)), np.inf).astype(np.float32)
 
 
-def around(count: int, distance_m: float = 0.4) -> list[NDArray]:
+def poses_around(count: int, distance_m: float = 0.4) -> list[NDArray]:
     """Poses spread over a sphere, looking at the origin (a Fibonacci spiral)."""
     k = np.arange(count) + 0.5
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
@@ -36,7 +36,7 @@ def around(count: int, distance_m: float = 0.4) -> list[NDArray]:
 def ball_maps(count: int = 20, camera: Pinhole = LENS) -> list[DepthMap]:
     """A ball seen from all sides, grey with a red upper half."""
     maps = []
-    for pose in around(count):
+    for pose in poses_around(count):
         depth = ball_depth(camera, pose)
         origin, rays = world_rays(camera, pose)
         up = (origin + rays * np.where(np.isfinite(depth), depth, 0)[..., None])[..., 2] > 0

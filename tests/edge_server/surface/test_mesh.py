@@ -9,8 +9,8 @@ import pytest
 
 from edge_server.surface import SurfaceError
 from edge_server.surface import mesh as mesh_module
-from edge_server.surface.mesh import Mesh, cleaned, extracted, without_degenerate
-from edge_server.surface.volume import Grid, fused
+from edge_server.surface.mesh import Mesh, extract_mesh, remove_degenerate, remove_small_components
+from edge_server.surface.volume import Grid, fuse_maps
 from tests.edge_server.surface.shapes import RADIUS_M, ball_maps
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
@@ -20,7 +20,7 @@ GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
 
 @pytest.fixture(scope="module")
 def ball():
-    return fused(GRID, ball_maps(24))
+    return fuse_maps(GRID, ball_maps(24))
 
 
 def volume_m3(mesh: Mesh) -> float:
@@ -29,7 +29,7 @@ def volume_m3(mesh: Mesh) -> float:
 
 
 def test_a_ball_comes_out_as_a_ball(ball):
-    mesh = cleaned(extracted(ball))
+    mesh = remove_small_components(extract_mesh(ball))
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(radius.mean() - RADIUS_M) < 3e-4 and np.abs(radius - RADIUS_M).max() < 0.003
     # Faces look outwards, so the volume is positive.
@@ -39,38 +39,38 @@ def test_a_ball_comes_out_as_a_ball(ball):
 
 
 def test_slabs_leave_no_seam(ball, monkeypatch):
-    whole = extracted(ball, watertight=True)
+    whole = extract_mesh(ball, watertight=True)
     monkeypatch.setattr(mesh_module, "SLAB_CELLS", 1)
-    slabs = extracted(ball, watertight=True)
+    slabs = extract_mesh(ball, watertight=True)
     assert whole.watertight and slabs.watertight
     assert len(whole.faces) == len(slabs.faces) and len(whole.vertices) == len(slabs.vertices)
     assert np.allclose(np.sort(whole.vertices, axis=0), np.sort(slabs.vertices, axis=0), atol=1e-7)
 
 
 def test_what_nobody_saw_stays_open_or_is_closed():
-    seen_from_above = fused(GRID, [m for m in ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
-    opened, closed = extracted(seen_from_above), extracted(seen_from_above, watertight=True)
+    seen_from_above = fuse_maps(GRID, [m for m in ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
+    opened, closed = extract_mesh(seen_from_above), extract_mesh(seen_from_above, watertight=True)
     assert not opened.watertight and closed.watertight
     assert opened.vertices[:, 2].min() > -0.09  # the ball's lower end is missing
     assert closed.vertices[:, 2].min() < GRID.lower[2] + 0.01  # solid down to the end of the box
 
 
 def test_dirt_goes_and_pieces_stay(ball):
-    mesh = cleaned(extracted(ball))
+    mesh = remove_small_components(extract_mesh(ball))
     dirt = Mesh(
         np.concatenate([mesh.vertices, [[0.2, 0, 0], [0.21, 0, 0], [0.2, 0.01, 0]]]).astype(np.float32),
         np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 1, 2]])]).astype(np.int32),
         np.concatenate([mesh.color, np.zeros((3, 3), np.uint8)]),
     )
-    assert len(cleaned(dirt).faces) == len(mesh.faces)
-    assert len(cleaned(dirt, keep_share=0.0).faces) == len(mesh.faces) + 1
-    assert len(cleaned(dirt, keep_share=0.0, most=1).faces) == len(mesh.faces)
+    assert len(remove_small_components(dirt).faces) == len(mesh.faces)
+    assert len(remove_small_components(dirt, keep_share=0.0).faces) == len(mesh.faces) + 1
+    assert len(remove_small_components(dirt, keep_share=0.0, most=1).faces) == len(mesh.faces)
 
 
 def test_faces_without_area_go():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 1, 1], [0, 1, 3]], np.int32)
-    found = without_degenerate(Mesh(vertices, faces, np.zeros((4, 3), np.uint8)))
+    found = remove_degenerate(Mesh(vertices, faces, np.zeros((4, 3), np.uint8)))
     assert found.faces.tolist() == [[0, 1, 2]] and len(found.vertices) == 3
 
 
@@ -85,4 +85,4 @@ def test_watertight_needs_every_edge_twice():
 
 def test_no_surface_is_an_error(ball):
     with pytest.raises(SurfaceError, match="no surface"):
-        extracted(ball, min_weight=1e9)
+        extract_mesh(ball, min_weight=1e9)

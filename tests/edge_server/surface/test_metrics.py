@@ -10,7 +10,7 @@ from edge_server.experiments.scenes.tile_scan import exact_depth, scan, surface_
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import depth_map
 from edge_server.surface.mesh import Mesh
-from edge_server.surface.metrics import Truth, compare, depth_error_mm, on_mesh, thinned
+from edge_server.surface.metrics import Truth, compare, depth_error_mm, sample_mesh, thin_points
 
 
 def sheet(z: float, share: float = 1.0) -> Mesh:
@@ -51,8 +51,8 @@ def test_only_what_two_cameras_see_is_asked_for():
 
 
 def test_points_are_spread_evenly_and_repeatably():
-    points = on_mesh(sheet(0.0), 10_000)
-    assert np.array_equal(points, on_mesh(sheet(0.0), 10_000))
+    points = sample_mesh(sheet(0.0), 10_000)
+    assert np.array_equal(points, sample_mesh(sheet(0.0), 10_000))
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=5, range=[[0, 0.1], [0, 0.1]])
     assert counts.min() > 320 and counts.max() < 480
 
@@ -60,7 +60,7 @@ def test_points_are_spread_evenly_and_repeatably():
 def test_thinning_leaves_one_a_cell():
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (5000, 3))
-    kept = points[thinned(points, 0.25)]
+    kept = points[thin_points(points, 0.25)]
     assert (
         len(np.unique(np.floor(kept / 0.25), axis=0))
         == len(kept)

@@ -8,8 +8,8 @@ import torch
 
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
-from edge_server.surface.mesh import cleaned, extracted
-from edge_server.surface.sdf import SdfSettings, at, fitted, slope
+from edge_server.surface.mesh import extract_mesh, remove_small_components
+from edge_server.surface.sdf import SdfSettings, fit_sdf, gradient_norm, sample_grid
 from edge_server.surface.volume import Grid
 from tests.edge_server.surface.shapes import RADIUS_M, ball_maps
 
@@ -26,11 +26,11 @@ def exact(volume) -> np.ndarray:
 
 def test_the_distances_are_those_of_the_ball():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    volume = fitted(GRID, ball_maps(16), settings=SHORT)
+    volume = fit_sdf(GRID, ball_maps(16), settings=SHORT)
     truth = exact(volume)
     near = np.abs(truth) < 0.01
     assert np.abs(volume.blocks.distance - truth)[near].mean() < 0.0015
-    mesh = cleaned(extracted(volume))
+    mesh = remove_small_components(extract_mesh(volume))
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(radius.mean() - RADIUS_M) < 0.0007
 
@@ -39,7 +39,7 @@ def test_the_eikonal_term_makes_it_a_distance():
     maps = ball_maps(12)
     steep = []
     for weight in (0.0, 0.3):
-        volume = fitted(GRID, maps, settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=weight))
+        volume = fit_sdf(GRID, maps, settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=weight))
         distance = volume.blocks.distance.reshape(-1, SIDE, SIDE, SIDE)
         known = (np.abs(exact(volume)) < 0.02).reshape(distance.shape)[:, 1:-1, 1:-1, 1:-1]
         parts = [np.gradient(distance, GRID.voxel_m, axis=k)[:, 1:-1, 1:-1, 1:-1] for k in (1, 2, 3)]
@@ -51,8 +51,8 @@ def test_values_between_nodes_and_their_slope():
     x, y, z = torch.meshgrid(*[torch.arange(n) * 0.5 for n in (5, 6, 7)], indexing="ij")
     plane = (0.6 * x + 0.8 * z + 0.0 * y)[None, None]
     extent, points = torch.tensor([2.0, 2.5, 3.0]), torch.tensor([[1.0, 1.2, 1.1], [0.8, 0.9, 2.2]])
-    torch.testing.assert_close(at(plane, points, extent), 0.6 * points[:, 0] + 0.8 * points[:, 2])
-    torch.testing.assert_close(slope(plane, points, extent, 0.5), torch.ones(2))
+    torch.testing.assert_close(sample_grid(plane, points, extent), 0.6 * points[:, 0] + 0.8 * points[:, 2])
+    torch.testing.assert_close(gradient_norm(plane, points, extent, 0.5), torch.ones(2))
 
 
 def test_the_number_of_threads_changes_no_bit():
@@ -61,7 +61,7 @@ def test_the_number_of_threads_changes_no_bit():
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            volume = fitted(GRID, maps, settings=SdfSettings(levels=2, steps=10, points=2000))
+            volume = fit_sdf(GRID, maps, settings=SdfSettings(levels=2, steps=10, points=2000))
             found.append(volume.blocks.distance)
     finally:
         torch.set_num_threads(before)
@@ -70,4 +70,4 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_too_many_nodes_say_what_would_do():
     with pytest.raises(SurfaceError, match=r"too many nodes: take [\d.]+ mm or more"):
-        fitted(Grid((-0.13,) * 3, (0.13,) * 3, 0.0009, 0.004), ball_maps(2))
+        fit_sdf(Grid((-0.13,) * 3, (0.13,) * 3, 0.0009, 0.004), ball_maps(2))

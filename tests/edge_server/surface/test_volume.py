@@ -8,16 +8,16 @@ import pytest
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
-from edge_server.surface.volume import BYTES, Grid, bounds_of, fused
-from tests.edge_server.surface.shapes import BENT, LENS, RADIUS_M, ball_maps, plain_fuse
+from edge_server.surface.volume import BLOCK_BYTES, Grid, bounding_box, fuse_maps
+from tests.edge_server.surface.shapes import DISTORTED_LENS, LENS, RADIUS_M, ball_maps, plain_fuse
 
 BOX = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 
 
-@pytest.mark.parametrize("camera", [LENS, BENT], ids=["straight", "distorted"])
+@pytest.mark.parametrize("camera", [LENS, DISTORTED_LENS], ids=["straight", "distorted"])
 def test_the_kernel_fuses_as_the_equations_say(camera):
     maps = ball_maps(5, camera)
-    volume = fused(BOX, maps)
+    volume = fuse_maps(BOX, maps)
     rng = np.random.default_rng(0)
     number, cell = rng.integers(0, len(volume.blocks.place), 400), rng.integers(0, SIDE**3, 400)
     inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
@@ -29,7 +29,7 @@ def test_the_kernel_fuses_as_the_equations_say(camera):
 
 
 def test_blocks_hold_every_voxel_near_the_surface():
-    volume = fused(BOX, ball_maps())
+    volume = fuse_maps(BOX, ball_maps())
     size = np.array(volume.table.shape) * SIDE
     index = np.stack(np.meshgrid(*[np.arange(n) for n in size], indexing="ij"), axis=-1).reshape(-1, 3)
     away = np.abs(np.linalg.norm(np.array(BOX.lower) + BOX.voxel_m * index, axis=1) - RADIUS_M)
@@ -38,7 +38,7 @@ def test_blocks_hold_every_voxel_near_the_surface():
 
 
 def test_distances_are_those_of_the_ball():
-    volume = fused(BOX, ball_maps())
+    volume = fuse_maps(BOX, ball_maps())
     cell = np.arange(SIDE**3)
     inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
     points = np.array(BOX.lower) + BOX.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
@@ -50,7 +50,7 @@ def test_distances_are_those_of_the_ball():
 
 def test_the_number_of_threads_changes_no_bit():
     maps = ball_maps(6)
-    one, three = (fused(BOX, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
+    one, three = (fuse_maps(BOX, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
     for a, b in zip(one.blocks, three.blocks):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(one.through, three.through)
@@ -61,16 +61,16 @@ def test_too_fine_a_grid_says_what_would_do():
     with pytest.raises(
         SurfaceError, match=r"2 mm voxels need \d+ MB, more than the 5 allowed: take [\d.]+ mm"
     ):
-        fused(Grid((-0.13,) * 3, (0.13,) * 3, 0.002, 0.008), maps, memory_mb=5)
+        fuse_maps(Grid((-0.13,) * 3, (0.13,) * 3, 0.002, 0.008), maps, memory_mb=5)
     with pytest.raises(SurfaceError, match="voxels are too many"):
         Grid((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004)
     with pytest.raises(SurfaceError, match="at least one voxel"):
         Grid((0, 0, 0), (1, 1, 1), 0.1, 0.05)
     with pytest.raises(SurfaceError, match="lower corner"):
         Grid((0, 0, 1), (1, 1, 1), 0.1, 0.4)
-    assert BYTES == SIDE**3 * 24
+    assert BLOCK_BYTES == SIDE**3 * 24
 
 
 def test_bounds_are_those_of_what_is_seen():
-    low, high = bounds_of(ball_maps(), 0.01)
+    low, high = bounding_box(ball_maps(), 0.01)
     assert np.allclose(low, -0.11, atol=0.006) and np.allclose(high, 0.11, atol=0.006)

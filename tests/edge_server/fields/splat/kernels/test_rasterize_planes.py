@@ -38,7 +38,7 @@ from edge_server.fields.splat.planar import (
     plane_depth,
 )
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.surface.depth import rendered
+from edge_server.surface.depth import render_depth_maps
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, world_rays
 from tests.edge_server.fields.scenes import ring
 
@@ -208,6 +208,6 @@ def test_a_field_that_is_asked_for_surfaces_shows_their_planes():
     camera = (views[0].camera_to_world, views[0].intrinsics)
     snapshot = fields[1].snapshot()
     assert snapshot.planar and not fields[0].snapshot().planar
-    (found,) = rendered(snapshot, [camera])
+    (found,) = render_depth_maps(snapshot, [camera])
     shown = snapshot.render_surface(*camera)
     np.testing.assert_array_equal(found.depth[found.seen], shown.depth[found.seen])

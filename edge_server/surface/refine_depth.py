@@ -20,7 +20,7 @@ from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.sweep import Others, sweep
+from edge_server.surface.kernels.sweep import SourceImages, sweep
 
 OTHERS = 4  # images to compare each image with
 # Per pass: search range to each side, as a share of the depth, and number of steps.
@@ -34,7 +34,7 @@ ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
 UNSURE = 0.05  # factor of the trust of a pixel with a flat patch
 
 
-def sharpened(
+def refine_depth(
     maps: Sequence[DepthMap],
     pictures: Sequence[NDArray[np.uint8]],
     passes: Sequence[tuple[float, int]] = PASSES,
@@ -47,22 +47,22 @@ def sharpened(
         raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
     greys = [_grey(picture, found) for picture, found in zip(pictures, maps)]
-    chosen = [neighbours(maps, k) for k in range(len(maps))]
+    chosen = [neighboring_maps(maps, k) for k in range(len(maps))]
     now, scores = list(maps), [np.zeros(m.depth.shape, np.float32) for m in maps]
     for number, (share, steps) in enumerate(passes):
         factors = 1.0 + np.linspace(-share, share, steps)
         for k, found in enumerate(now):
             if chosen[k]:
-                depth, scores[k] = _swept(found, greys, now, k, chosen[k], factors, pool)
+                depth, scores[k] = _sweep_map(found, greys, now, k, chosen[k], factors, pool)
                 if number < len(passes) - 1:
-                    depth = _settled(depth, found.seen, scores[k])
+                    depth = _filter_depth(depth, found.seen, scores[k])
                 now[k] = replace(found, depth=np.where(found.seen, depth, found.depth))
             if on_map is not None:
                 on_map((number + (k + 1) / len(now)) / len(passes))
-    return confirmed([_weighed(m, score) for m, score in zip(now, scores)], chosen)
+    return downweight_unconfirmed([_weight_by_score(m, score) for m, score in zip(now, scores)], chosen)
 
 
-def neighbours(maps: Sequence[DepthMap], k: int) -> list[int]:
+def neighboring_maps(maps: Sequence[DepthMap], k: int) -> list[int]:
     """Indices of the maps to compare map k with: same place, seen from an angle near ``BEST_DEG``."""
     points = maps[k].points()
     if not len(points):
@@ -84,21 +84,21 @@ def neighbours(maps: Sequence[DepthMap], k: int) -> list[int]:
     return [j for _, j in sorted(ranked)[:OTHERS]]
 
 
-def confirmed(maps: Sequence[DepthMap], chosen: Sequence[Sequence[int]]) -> list[DepthMap]:
+def downweight_unconfirmed(maps: Sequence[DepthMap], chosen: Sequence[Sequence[int]]) -> list[DepthMap]:
     """Scale by ``ALONE`` the trust of pixels that no map in ``chosen`` for their map confirms."""
     out = []
     for k, found in enumerate(maps):
         points = found.points()
         agree = np.zeros(len(points), np.bool_)
         for j in chosen[k]:
-            agree |= shows(maps[j], points, CONFIRMED)
+            agree |= on_surface(maps[j], points, CONFIRMED)
         alone = np.zeros(found.depth.shape, np.bool_)
         alone[found.seen] = ~agree
         out.append(replace(found, trust=np.where(alone, np.float32(ALONE) * found.trust, found.trust)))
     return out
 
 
-def shows(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
+def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
     """Whether each point (N, 3) lies on a depth map's surface. within: tolerance, share of the distance."""
     lens, pose = found.intrinsics, found.camera_to_world
     local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -120,7 +120,7 @@ def _grey(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
     return cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
-def _swept(
+def _sweep_map(
     found: DepthMap,
     greys: Sequence[NDArray[np.float32]],
     maps: Sequence[DepthMap],
@@ -132,7 +132,7 @@ def _swept(
     pose = found.camera_to_world
     rays = np.ascontiguousarray(found.intrinsics.rays() @ pose[:3, :3].T)
     size = np.array([[maps[j].intrinsics.width, maps[j].intrinsics.height] for j in chosen], np.int64)
-    others = Others(
+    others = SourceImages(
         lens=np.array([lens_row(maps[j].intrinsics) for j in chosen], dtype=np.float64),
         rotation=np.stack([maps[j].camera_to_world[:3, :3] for j in chosen]),
         origin=np.stack([maps[j].camera_to_world[:3, 3] for j in chosen]),
@@ -162,7 +162,7 @@ def smooth_normals(found: DepthMap, rays: NDArray[np.float64]) -> NDArray[np.flo
     return normal.astype(np.float32)
 
 
-def _settled(
+def _filter_depth(
     depth: NDArray[np.float32], seen: NDArray[np.bool_], score: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Initial depth of the next pass: the 5 x 5 median, without outliers, where images agree; elsewhere
@@ -176,7 +176,7 @@ def _settled(
     return np.where(lost, between, calm).astype(np.float32)
 
 
-def _weighed(found: DepthMap, score: NDArray[np.float32]) -> DepthMap:
+def _weight_by_score(found: DepthMap, score: NDArray[np.float32]) -> DepthMap:
     """Weight each pixel of a depth map by how well the images agree there."""
     sure = np.clip((score - AGREES) / (1.0 - AGREES), 0.0, 1.0)
     sure = np.where(score == 0.0, np.float32(UNSURE), sure)

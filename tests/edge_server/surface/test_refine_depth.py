@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.sweep import NONE, REACH, Others, agreement
-from edge_server.surface.sharpen import neighbours, sharpened, smooth_normals
+from edge_server.surface.kernels.sweep import NONE, REACH, SourceImages, correlation
+from edge_server.surface.refine_depth import neighboring_maps, refine_depth, smooth_normals
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
@@ -42,7 +42,7 @@ def rig() -> tuple[list[DepthMap], list[np.ndarray], list[np.ndarray]]:
 
 def test_depth_moves_to_where_the_pictures_agree(rig):
     maps, pictures, exact = rig
-    found = sharpened(maps, pictures)
+    found = refine_depth(maps, pictures)
     before = [np.abs(m.depth - e)[m.seen] for m, e in zip(maps, exact)]
     after = [np.abs(m.depth - e)[m.seen & (m.trust > 0.3)] for m, e in zip(found, exact)]
     assert np.median(np.concatenate(before)) > 0.005
@@ -52,7 +52,7 @@ def test_depth_moves_to_where_the_pictures_agree(rig):
 
 def test_the_number_of_threads_changes_no_bit(rig):
     maps, pictures, _ = rig
-    one, three = (sharpened(maps[:3], pictures[:3], pool=p) for p in (Pool(1, nice=0), Pool(3, nice=0)))
+    one, three = (refine_depth(maps[:3], pictures[:3], pool=p) for p in (Pool(1, nice=0), Pool(3, nice=0)))
     for a, b in zip(one, three):
         np.testing.assert_array_equal(a.depth, b.depth)
         np.testing.assert_array_equal(a.trust, b.trust)
@@ -61,7 +61,7 @@ def test_the_number_of_threads_changes_no_bit(rig):
 def test_agreement_is_the_correlation_of_two_patches():
     rng = np.random.default_rng(3)
     grey = rng.uniform(0, 255, (30, 40)).astype(np.float32)
-    others = Others(
+    others = SourceImages(
         np.zeros((1, 8)), np.eye(3)[None], np.zeros((1, 3)), np.array([0, grey.size]), np.array([[40, 30]]),
         grey.ravel(),
     )  # fmt: skip
@@ -72,11 +72,11 @@ def test_agreement_is_the_correlation_of_two_patches():
         grey.astype(float), [v - 0.5 + i * vx + j * vy, u - 0.5 + i * ux + j * uy], order=1
     )
     centred = (patch - patch.mean()).ravel()
-    found = agreement(centred, np.float32(centred @ centred), others, 0, u, v, ux, vx, uy, vy)
+    found = correlation(centred, np.float32(centred @ centred), others, 0, u, v, ux, vx, uy, vy)
     assert found == pytest.approx(np.corrcoef(patch.ravel(), other.ravel())[0, 1], abs=1e-4)
-    assert agreement(centred, np.float32(1.0), others, 0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0) == NONE
+    assert correlation(centred, np.float32(1.0), others, 0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0) == NONE
     same = grey[12:17, 17:22] - grey[12:17, 17:22].mean()
-    exact = agreement(same.ravel(), np.float32((same**2).sum()), others, 0, 19.5, 14.5, 1.0, 0.0, 0.0, 1.0)
+    exact = correlation(same.ravel(), np.float32((same**2).sum()), others, 0, 19.5, 14.5, 1.0, 0.0, 0.0, 1.0)
     assert exact == pytest.approx(1.0, abs=1e-4)
 
 
@@ -91,13 +91,13 @@ def test_normals_are_those_of_the_plate(rig):
 def test_a_map_is_compared_with_those_that_see_the_same_from_aside(rig):
     maps, _, _ = rig
     far = depth_map(maps[0].depth, maps[0].color, look_at((5.0, 0, 0.3), (5, 0, 0), up=(0, 1, 0)), LENS)
-    assert set(neighbours([*maps, far], 0)) == {1, 2, 3}
-    assert neighbours([maps[0], maps[0]], 0) == []  # no angle between them, no depth
+    assert set(neighboring_maps([*maps, far], 0)) == {1, 2, 3}
+    assert neighboring_maps([maps[0], maps[0]], 0) == []  # no angle between them, no depth
 
 
 def test_pictures_must_belong_to_the_maps(rig):
     maps, pictures, _ = rig
     with pytest.raises(SurfaceError, match="3 pictures do not belong to 4"):
-        sharpened(maps, pictures[:3])
+        refine_depth(maps, pictures[:3])
     with pytest.raises(SurfaceError, match="does not belong to a depth map"):
-        sharpened(maps, [p[:10] for p in pictures])
+        refine_depth(maps, [p[:10] for p in pictures])
