@@ -221,7 +221,7 @@ class Export:
                 f"--splats: {self.source.name} has no Gaussians: use a run or fit of field splat"
             )
         path.parent.mkdir(parents=True, exist_ok=True)
-        print(f"{path}: {write_splats(path, snapshot.gaussians, snapshot.box)} Gaussians", flush=True)
+        print(f"{path}: {write_splats(path, snapshot.shown, snapshot.box)} Gaussians", flush=True)
 
     def _colmap(self, folder: Path) -> None:
         from edge_server.export.colmap import write_model

@@ -86,12 +86,23 @@ class Rendering:
 
 
 class Renderer(Protocol):
-    """An immutable snapshot of a field; safe to use from any thread while the field trains on."""
+    """Renders one scene; safe to use from any thread while a field trains on."""
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` surface points (N, 3) in world metres and colors (N, 3) in [0, 1]."""
+        ...
+
+
+class Snapshot(Renderer, Protocol):
+    """An immutable copy of a field."""
+
+    def at(self, present_ns: int) -> Snapshot:
+        """The same field at another instant, where a representation knows how things move; itself elsewhere.
+
+        present_ns: on the clock of the views' ``generated_ns``.
+        """
         ...
 
 
@@ -102,7 +113,7 @@ class Field(Renderer, Protocol):
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""
         ...
 
-    def snapshot(self, present_ns: int | None = None) -> Renderer:
+    def snapshot(self, present_ns: int | None = None) -> Snapshot:
         """The field as it is now, for others to render from while it trains on.
 
         present_ns: the instant to show, on the clock of the views' ``generated_ns``, where a representation

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from queue import Empty, Queue
 
-from edge_server.fields import FitReport, Renderer, View
+from edge_server.fields import FitReport, Snapshot, View
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Publication
 from edge_server.live.update_budget import UpdateBudget
@@ -38,7 +38,7 @@ class UpdateLoop:
         clock: Clock,
         budget: UpdateBudget,
         grace_ms: float,
-        on_published: Callable[[Publication, Renderer, list[View]], None],
+        on_published: Callable[[Publication, Snapshot, list[View]], None],
         on_status: Callable[[str], None],
         on_checkpoint: Callable[[Path], None],
     ) -> None:

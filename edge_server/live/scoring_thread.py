@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import View
-from edge_server.live.state import Comparison, Publication, Renderer
+from edge_server.live.state import Comparison, Publication, Snapshot
 from freshfield import payload
 from freshfield.frame import Frame
 
@@ -61,7 +61,7 @@ class ScoringThread:
         self._held_out = tuple(held_out)
         self._scorer = scorer
         self._on_scored = on_scored
-        self._inbox: deque[Frame | tuple[Publication, Renderer, list[View]]] = deque(maxlen=_INBOX)
+        self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
         self._ending = False
         self._frames: dict[str, deque[Frame]] = {c: deque(maxlen=_KEPT_FRAMES) for c in self._held_out}
@@ -87,10 +87,10 @@ class ScoringThread:
         """A held-out frame has arrived; it is decoded when it is compared with. Never blocks."""
         self._put(frame)
 
-    def published(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+    def published(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         self._put((publication, renderer, views))
 
-    def _put(self, item: Frame | tuple[Publication, Renderer, list[View]]) -> None:
+    def _put(self, item: Frame | tuple[Publication, Snapshot, list[View]]) -> None:
         with self._wake:
             self._inbox.append(item)
             self._wake.notify()
@@ -116,7 +116,7 @@ class ScoringThread:
             except Exception:  # one bad image must not end all scoring; it is logged with its traceback
                 log.exception("a publication could not be scored")
 
-    def _score_later(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+    def _score_later(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         self._open[publication.number] = _OpenPublication(publication, [])
         while len(self._open) > _OPEN_PUBLICATIONS:
             del self._open[min(self._open)]
@@ -126,7 +126,7 @@ class ScoringThread:
             self._finish(self._scorer.publish(camera, render, publication.published_ns))
 
     def _render_later(
-        self, camera: str, renderer: Renderer, published_ns: int
+        self, camera: str, renderer: Snapshot, published_ns: int
     ) -> Callable[[int], NDArray[np.float32]]:
         def render(generated_ns: int) -> NDArray[np.float32]:
             frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
@@ -180,7 +180,7 @@ class ScoringThread:
             self.baselines.append(baseline(self._views, truth, frame.pose.matrix()))
         return Comparison(score.camera, truth[..., :3], to_bytes(image), number)
 
-    def _score_selected(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+    def _score_selected(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         with self._wake:
             if any(isinstance(i, tuple) for i in self._inbox):
                 return  # a newer publication is waiting: this one stays unscored

@@ -30,7 +30,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
-from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
+from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
 from edge_server.live.update_budget import open_budget
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson
@@ -139,7 +139,8 @@ class EdgeServer:
             policies=self.policies.offered,
             controls=Controls(policy.name, policy.value),
             cameras=self._cameras,
-            now_s=lambda: (self.clock.now_ns() - self.start_ns) / 1e9,
+            start_ns=self.start_ns,
+            now_ns=self.clock.now_ns,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
             channel=ReplacedJson(options.out / "channel.json").read,
@@ -218,7 +219,7 @@ class EdgeServer:
 
     # --- callbacks -------------------------------------------------------------------------
 
-    def _published(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+    def _published(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         if self._first_ms is None:
             self._first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import Score
-from edge_server.fields import Renderer
+from edge_server.fields import Snapshot
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
@@ -112,6 +112,7 @@ class Controls:
 class EdgeState:
     """The state of one run. Methods are thread-safe; the server sets the callbacks once.
 
+    start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
@@ -124,7 +125,8 @@ class EdgeState:
     policies: tuple[str, ...]
     controls: Controls
     cameras: Callable[[], list[CameraView]]
-    now_s: Callable[[], float]
+    start_ns: int
+    now_ns: Callable[[], int]
     set_policy: Callable[[str, float | None], None]
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
@@ -136,11 +138,15 @@ class EdgeState:
     bounds: NDArray[np.float64] | None = None
     status_line: str = ""
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
-    _renderer: Renderer | None = None
+    _renderer: Snapshot | None = None
     _comparison: Comparison | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def publish(self, publication: Publication, renderer: Renderer) -> None:
+    def now_s(self) -> float:
+        """Seconds since the run began."""
+        return (self.now_ns() - self.start_ns) / 1e9
+
+    def publish(self, publication: Publication, renderer: Snapshot) -> None:
         """Add a publication."""
         with self._lock:
             self._publications.append(publication)
@@ -169,7 +175,7 @@ class EdgeState:
             return next((p for p in every if not scored or p.psnr_db is not None), None)
 
     @property
-    def renderer(self) -> Renderer | None:
+    def renderer(self) -> Snapshot | None:
         with self._lock:
             return self._renderer
 

@@ -40,7 +40,7 @@ _SUN = np.array([0.4, -0.5, 0.77])
 
 
 class BallScene:
-    """The scene at one instant, as a Renderer. Empty space is dark blue."""
+    """The scene at one instant, as a Snapshot. Empty space is dark blue."""
 
     def __init__(self, t_s: float) -> None:
         angle = 2 * np.pi * t_s / PERIOD_S
@@ -48,6 +48,9 @@ class BallScene:
             [ORBIT_RADIUS_M * np.cos(angle), ORBIT_RADIUS_M * np.sin(angle), BALL_RADIUS_M]
         )
         self.spin = 3.0 * angle
+
+    def at(self, present_ns: int) -> BallScene:
+        return self
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         origin, rays = world_rays(intrinsics, camera_to_world)
@@ -123,7 +126,8 @@ class Preview:
             policies=tuple(POLICIES),
             controls=Controls(self._policy.name, self._policy.value),
             cameras=self.cameras,
-            now_s=lambda: (self._clock.now_ns() - self._start_ns) / 1e9,
+            start_ns=self._start_ns,
+            now_ns=self._clock.now_ns,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
             channel=self._channel,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Renderer, Rendering
+from edge_server.fields import Rendering, Snapshot
 from edge_server.live.state import EdgeState
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
@@ -67,7 +67,7 @@ class ClientState:
     viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None
     moved_at: float = 0.0
     serial: int = 0
-    renderer: Renderer | None = None
+    renderer: Snapshot | None = None
     level: int = -1
     sent: int = 0
 
@@ -84,7 +84,7 @@ class RenderLoop:
         self._stopped = False
         self._rows = [1.5 * level.min_rows for level in LEVELS]
         self._not_before = [0.0] * len(LEVELS)
-        self._points_from: Renderer | None = None
+        self._points_from: Snapshot | None = None
         self._points_not_before = 0.0
         self._points_shown = False
         self._last_error = ""
@@ -184,7 +184,7 @@ class RenderLoop:
         self._render_and_send(visitor, renderer, level)
         return True
 
-    def _next_level(self, visitor: ClientState, renderer: Renderer, now: float) -> int | None:
+    def _next_level(self, visitor: ClientState, renderer: Snapshot, now: float) -> int | None:
         """The level to render next for a visitor; None if it has the finest or must wait."""
         if visitor.level < 0:
             level = 0
@@ -198,14 +198,15 @@ class RenderLoop:
             return None
         return level
 
-    def _render_and_send(self, visitor: ClientState, renderer: Renderer, level: int) -> None:
+    def _render_and_send(self, visitor: ClientState, renderer: Snapshot, level: int) -> None:
         with self._wake:
             viewpoint, serial = visitor.viewpoint, visitor.serial
         assert viewpoint is not None
         pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))
         began = perf_counter()
         try:
-            image = self._render(renderer, pose, camera, visitor, serial, level)
+            shown = renderer.at(self._state.now_ns())
+            image = self._render(shown, pose, camera, visitor, serial, level)
         finally:
             spent = perf_counter() - began
             # The second bound matters if rendering is cheap: it spares the network and the browser.
@@ -233,7 +234,7 @@ class RenderLoop:
 
     def _render(
         self,
-        renderer: Renderer,
+        renderer: Snapshot,
         pose: NDArray,
         camera: Pinhole,
         visitor: ClientState,
@@ -254,7 +255,7 @@ class RenderLoop:
             np.concatenate([p.opacity for p in parts]),
         )
 
-    def _update_points(self, renderer: Renderer | None, now: float) -> bool:
+    def _update_points(self, renderer: Snapshot | None, now: float) -> bool:
         """Update the point cloud if it is wanted and due; remove it if not wanted. True if updated."""
         if renderer is None or not self.want_points:
             if self._points_shown:

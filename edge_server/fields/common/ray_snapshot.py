@@ -37,6 +37,10 @@ class RaySnapshot:
     pool: Pool
     step: int
 
+    def at(self, present_ns: int) -> RaySnapshot:
+        """Itself: nothing in it is known to move."""
+        return self
+
     def render(
         self,
         camera_to_world: NDArray[np.float64],

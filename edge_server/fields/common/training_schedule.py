@@ -80,6 +80,7 @@ class StepBudget:
         self._start = self._step_start = now()
         self._timer: StepTimer | None = None
         self._made: set[StepTimer] = set()
+        self._from: dict[StepTimer, float] = {}  # what was spent when steps of a kind began
         self.steps = 0
 
     def elapsed_s(self) -> float:
@@ -93,22 +94,28 @@ class StepBudget:
         return whole is None or (seconds <= share * whole and self.elapsed_s() + seconds + then_s <= whole)
 
     def begin_step(self, timer: StepTimer, then_s: float = 0.0) -> float | None:
-        """Progress of the fit in [0, 1] at which the next step is made; None when the budget is spent.
+        """Progress, in [0, 1], of this kind of step through what the budget had left when the first was made;
+        None when the budget is spent.
 
         timer: of this kind of step; ``end_step`` adds to it.
         then_s: seconds of what has to follow within the budget.
         """
         self._step_start, self._timer = self._now(), timer
         if self._budget.steps is not None:
-            return None if self.steps >= self._budget.steps else self.steps / self._budget.steps
+            left = self.steps < self._budget.steps
+            return self._progress(timer, self.steps, self._budget.steps) if left else None
         assert self._budget.seconds is not None
         spent, first = self._step_start - self._start, timer not in self._made
         most = self._budget.seconds * (LATE if first and not then_s else 1.0)
         if spent + timer.seconds + then_s <= most:
-            return min(spent / self._budget.seconds, 1.0) if self._budget.seconds else 1.0
+            return self._progress(timer, spent, self._budget.seconds)
         if first:
             timer.drop_longest()
         return None
+
+    def _progress(self, timer: StepTimer, spent: float, whole: float) -> float:
+        begun = self._from.setdefault(timer, spent)
+        return min((spent - begun) / (whole - begun), 1.0) if whole > begun else 1.0
 
     def end_step(self) -> None:
         """The step is made."""

@@ -76,13 +76,7 @@ def find_outliers(
     settled: bool,
     render_points: RenderPoints,
 ) -> NDArray[np.bool_]:
-    """Which views contradict the field so much that this fit leaves them out: bool (V,).
-
-    A view contradicts when half of it is off by more than ``beyond`` times what is usual for the set: a
-    picture of noise, of another scene, of nothing. What moves through a picture does not reach that. A view
-    is refused only where an earlier one from the same place agreed (a camera that sees what no other does is
-    learned from), only ``MOST_REFUSALS`` times in a row (then the scene must have changed), and never
-    together with more than a quarter of the views.
+    """Which views contradict the field so much that this fit leaves them out (``refuse``): bool (V,).
 
     views: of this fit; each has an entry in ``memory``.
     memory: ``refusals_left`` of its entries is updated.
@@ -90,24 +84,43 @@ def find_outliers(
     settled: whether the field has learned enough to be agreed with.
     render_points: what the field renders.
     """
-    refused = np.zeros(len(views), np.bool_)
     if beyond <= 0.0 or not settled or len(views) < LEAST_VIEWS:
-        return refused
+        return np.zeros(len(views), np.bool_)
     rendered = render_points(views, [_grid_points(view) for view in views])
     errors = np.array([_typical_error(view, colors) for view, colors in zip(views, rendered)])
-    # The lower bound matters where half of every picture is plain sky, rendered exactly: no other view
-    # would agree.
-    usual = max(float(np.median(errors)), LEAST_ERROR / beyond)
-    contradicts = errors > beyond * usual
-    few = 4 * contradicts.sum() <= len(views)
-    for k, view in enumerate(views):
-        known = memory[view.camera]
-        if errors[k] <= AGREEMENT * usual:
-            known.refusals_left = MOST_REFUSALS
-        elif contradicts[k] and few and known.refusals_left > 0:
-            known.refusals_left -= 1
-            refused[k] = True
-    return refused
+    usual = usual_error(errors, beyond)
+    few = 4 * (errors > beyond * usual).sum() <= len(views)
+    return np.array(
+        [refuse(memory[v.camera], e, usual, beyond, few) for v, e in zip(views, errors)], np.bool_
+    )
+
+
+def refuse(camera: CameraMemory, error: float, usual: float, beyond: float, few: bool) -> bool:
+    """Whether a view is refused because it contradicts the field.
+
+    A view contradicts the field when half of it is off by more than ``beyond`` times what is usual for the
+    set: an image of noise, of another scene, of nothing. What moves through an image does not reach that. A
+    view is refused only where an earlier one from the same place agreed (a camera that sees what no other
+    does is learned from), only ``MOST_REFUSALS`` times in a row (then the scene must have changed), and never
+    together with more than a quarter of the views.
+
+    camera: its ``refusals_left`` is updated.
+    error: median error of the view, in [0, 1]. usual: ``usual_error`` of the set.
+    few: whether at most a quarter of the views contradict the field.
+    """
+    if error <= AGREEMENT * usual:
+        camera.refusals_left = MOST_REFUSALS
+    elif error > beyond * usual and few and camera.refusals_left > 0:
+        camera.refusals_left -= 1
+        return True
+    return False
+
+
+def usual_error(errors: Sequence[float] | NDArray[np.float64], beyond: float) -> float:
+    """The error that is usual for a set of views, from that of each view."""
+    # The lower bound matters where half of every image is plain sky, rendered exactly: no other view would
+    # agree.
+    return max(float(np.median(errors)), LEAST_ERROR / beyond)
 
 
 def _grid_points(view: View) -> NDArray[np.float64]:

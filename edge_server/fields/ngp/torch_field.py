@@ -162,6 +162,10 @@ class TorchSnapshot:
     model: TorchModel
     cameras: tuple[View, ...]
 
+    def at(self, present_ns: int) -> TorchSnapshot:
+        """Itself: nothing in it is known to move."""
+        return self
+
     def render(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, max_samples: int | None = None
     ) -> Rendering:

@@ -22,12 +22,14 @@ from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.fair_lock import FairLock
 from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
+from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.supervision import supervising_views, without_views
 from edge_server.fields.common.threads.precompile import compile_ahead
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.training_schedule import BETA1, BETA2, StepBudget, StepTimer, step_key
-from edge_server.fields.common.view_store import Arrays, ViewStore, same_views
+from edge_server.fields.common.view_outliers import LEAST_VIEWS, refuse, usual_error
+from edge_server.fields.common.view_store import SETTLED_STEPS, Arrays, ViewStore, same_views
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, adam_step, clamp_gaussians
@@ -50,7 +52,7 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole
 
 _AGES = 4096  # steps after which Adam's bias correction no longer matters
-MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
+RESEED_AFTER = 30  # steps of learning since the last time
 TRACKING_SHARE = 0.35  # largest share of an update that tracks what moved
 CHANGED_SLOTS = 4  # largest number of views whose changed tiles one step trains on
 
@@ -126,18 +128,14 @@ class SplatField:
         """An immutable copy that renders from any thread. present_ns: the instant to which moving Gaussians
         are extrapolated."""
         with self._lock:
-            now_ns = self._now_ns
-            ahead_s = 0.0 if present_ns is None or now_ns is None else (present_ns - now_ns) / 1e9
-            ahead_s = min(max(ahead_s, 0.0), MAX_AHEAD_S)
-            known = self._snapshot
-            if known is None or known.step != self.step or known.ahead_s != ahead_s:
+            if self._snapshot is None or self._snapshot.step != self.step:
                 live = self._live()
-                params, velocity = live.gaussians.params.copy(), live.gaussians.velocity
-                params[:, :3] += velocity * np.float32(ahead_s)
-                gaussians = live.gaussians._replace(params=params, velocity=np.zeros_like(velocity))
-                known = replace(live, gaussians=gaussians, ahead_s=ahead_s, raster=None)
-                self._snapshot = known
-            return known
+                copies = live.gaussians._replace(
+                    params=live.gaussians.params.copy(), velocity=live.gaussians.velocity.copy()
+                )
+                self._snapshot = replace(live, gaussians=copies)
+            known = self._snapshot
+        return known if present_ns is None else known.at(present_ns)
 
     def _live(self) -> SplatSnapshot:
         """A snapshot of the arrays in use, not copied, for a thread that holds the lock."""
@@ -148,7 +146,7 @@ class SplatField:
             cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
-            raster=self._render_raster,
+            now_ns=self._now_ns,
             planar=self.settings.planar,
         )
 
@@ -168,12 +166,11 @@ class SplatField:
         pose[2, 3] = -3.0
         for channels in (3, 4):
             field = SplatField(tiny, pool)
-            for k in range(3):  # something moves: it is found, then tracked
+            for k in range(3):  # something moves: it is found, then tracked, and new Gaussians are seeded
                 image = np.full((32, 32, channels), 128, np.uint8)
                 image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
-                field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
+                field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=RESEED_AFTER))
             field.render(pose, camera)
-            field._live().colors_at(field.view_store.views, [np.full((1, 2), 0.5)])  # as outliers are found
 
     # --- state --------------------------------------------------------------------------------
 
@@ -184,6 +181,7 @@ class SplatField:
                 "step": self.step, "grown": self._grown, "dropped": self.dropped,
                 "now_ns": self._now_ns, "given": [v.camera for v in self._given],
                 "refused": sorted(self._refused), "unsure": sorted(self._unsure),
+                "reseeded": self._reseeded, "unjudged": sorted(self._unjudged), "errors": self._errors,
             }  # fmt: skip
             cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
             return pack_state("splat", self.settings, self.view_store, counters, cloud)
@@ -200,6 +198,9 @@ class SplatField:
             self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
             self._given = tuple(self.view_store.memory[camera].view for camera in meta.get("given", ()))
             self._refused, self._unsure = (set(meta.get(key, ())) for key in ("refused", "unsure"))
+            self._unjudged.update(meta.get("unjudged", ()))
+            self._errors.update(meta.get("errors", {}))
+            self._reseeded = int(meta.get("reseeded", 0))
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -216,6 +217,9 @@ class SplatField:
         self._views: tuple[View, ...] = ()
         self._given = ()
         self._refused, self._unsure = set(), set()
+        self._unjudged: set[int] = set()  # views of this fit that no step has judged yet
+        self._errors: dict[str, float] = {}  # of each camera's newest judged view
+        self._reseeded = 0  # step of the last reseeding
         self._epoch = -1
 
     def _rng(self, purpose: int) -> np.random.Generator:
@@ -242,11 +246,9 @@ class SplatField:
             if not known:
                 self._before = self.cloud.params[:, :3].copy()
                 extrapolate(self.cloud, elapsed_s, any(memory[v.camera].moved is not None for v in views))
-                self._refuse_outliers(views, news)
-            data = self._data = without_views(
-                intake.data, np.array([v.camera in self._refused for v in views])
-            )
-            self._asked = supervising_views(data) or list(range(len(views)))  # all, where every weight is 0
+                self._await_judgement(views, news)
+            self._packed = intake.data
+            data = self._leave_out_refused(views)
             moved = weighted_changes(
                 [None if v.camera in self._unsure else memory[v.camera].moved for v in views], data
             )
@@ -270,32 +272,70 @@ class SplatField:
         usual_s = self._tracking_time.seconds
         return min(most, int(TRACKING_SHARE * budget.seconds / usual_s)) if usual_s else most
 
-    def _refuse_outliers(self, views: Sequence[View], news: set[str]) -> None:
-        """Refuse the views that contradict the field. The next view of such a camera says nothing about
-        motion, because it would be compared with a wrong one."""
+    def _await_judgement(self, views: Sequence[View], news: set[str]) -> None:
+        """New views are judged by the first steps that see them. The next view of a refused one's camera says
+        nothing about motion, because it would be compared with a wrong one."""
         self._unsure = (self._unsure - news) | (self._refused & news)
-        flags = self.view_store.find_outliers(views, self.step, self._live().colors_at)
-        given = {v.camera for v in views}
-        self._refused = (self._refused - given) | {v.camera for v, flag in zip(views, flags) if flag}
+        self._refused -= news
+        judges = (
+            self.settings.refuse_beyond > 0.0 and self.step >= SETTLED_STEPS and len(views) >= LEAST_VIEWS
+        )
+        self._unjudged = {k for k, v in enumerate(views) if v.camera in news} if judges else set()
+
+    def _leave_out_refused(self, views: Sequence[View]) -> Views:
+        """Set what the kernels read: the packed views, the refused ones without weight."""
+        refused = np.array([v.camera in self._refused for v in views])
+        self._data = without_views(self._packed, refused)
+        # All of them, where every weight is 0.
+        self._asked = supervising_views(self._data) or list(range(len(views)))
+        return self._data
+
+    def _refuses(self, picked: NDArray[np.int64], errors: Sequence[float]) -> bool:
+        """Judge the views of a step by its errors, before it is applied: whether any is refused.
+
+        errors: of each picked view, the median over its tiles of the root mean square error, in [0, 1].
+        """
+        news = [(self._views[k].camera, e) for k, e in zip(picked.tolist(), errors) if k in self._unjudged]
+        if not news:
+            return False
+        self._unjudged.difference_update(picked.tolist())
+        self._errors.update(news)
+        beyond, given = self.settings.refuse_beyond, {v.camera for v in self._views}
+        usual = usual_error([e for camera, e in self._errors.items() if camera in given], beyond)
+        refused = self._refused & given
+        for camera, error in news:
+            few = 4 * (len(refused) + 1) <= len(given)
+            if refuse(self.view_store.memory[camera], error, usual, beyond, few):
+                refused.add(camera)
+        if refused <= self._refused:
+            return False
+        self._refused |= refused
+        self._leave_out_refused(self._views)
+        return True
 
     def _follow_motion(self, change: SceneChange, pace: StepBudget, steps: int) -> tuple[int, int]:
-        """Track what moved, then reseed where that is not enough; returns pixels and pairs."""
+        """Track what moved. Reseed where that is not enough, but only after some steps of learning since the
+        last time: what is removed and seeded has to be learned. Returns pixels and pairs."""
         s, rays, samples = self.settings, 0, 0
+        due = self.step - self._reseeded >= RESEED_AFTER
         with self._lock:
             tracking = track(self._tracking_raster, self.cloud, change, steps)
-        while pace.begin_step(self._tracking_time, then_s=self._reseed_time.seconds) is not None:
+        then_s = self._reseed_time.seconds if due else 0.0
+        while pace.begin_step(self._tracking_time, then_s=then_s) is not None:
             with self._lock:
                 done = next(tracking, None)
             if done is None:
                 break
             rays, samples = rays + done[0], samples + done[1]
             pace.end_step()
-        began = pace.elapsed_s()
-        with self._lock:
-            release_left_behind(self.pool, self.cloud, change, self._before)
-            reseed(s, self._tracking_raster, self.cloud, change, self._rng(2))
-            self._snapshot = None
-        self._reseed_time.add(pace.elapsed_s() - began)
+        if due:
+            began = pace.elapsed_s()
+            with self._lock:
+                release_left_behind(self.pool, self.cloud, change, self._before)
+                reseed(s, self._tracking_raster, self.cloud, change, self._rng(2))
+                self._reseeded = self.step
+            self._reseed_time.add(pace.elapsed_s() - began)
+        self._snapshot = None
         return rays, samples
 
     def _choose_tiles(self, key: np.uint64) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
@@ -309,7 +349,7 @@ class SplatField:
             self._order = np.random.default_rng(pick).permutation(n)
         picked = np.array(self._asked, np.int64)[self._order[(first + np.arange(slots)) % n]]
         moving = [k for k, tiles in enumerate(self._changed) if tiles is not None]
-        if moving and int(key) * 2.0**-64 < s.changed_share:
+        if moving and not self._unjudged and int(key) * 2.0**-64 < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
             return some, [self._changed[k] for k in some]
         if s.tile_share >= 1.0:
@@ -348,6 +388,14 @@ class SplatField:
             train_tiles, self._data, picked.astype(np.int64), tasks, raster.columns, raster.projected,
             raster.lists, loss, raster.memory, raster.saved, raster.sums, losses,
         )  # fmt: skip
+        pixels, room = TILE * TILE * len(tasks), raster.lists.pair.shape[1]
+        pairs = sum(min(needed, room) for needed in raster.lists.needed[: len(picked)].tolist())
+        if self._unjudged and wanted[0] is None:
+            by_tile = np.sqrt(losses[:, 1] / (3 * TILE * TILE))
+            by_view = [float(np.median(by_tile[tasks[:, 0] == b])) for b in range(len(picked))]
+            if self._refuses(picked, by_view):
+                self._finish_step()
+                return float(losses[:, 1].sum()) / (3 * pixels), pixels, pairs, 0
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
         self.pool.run(
             adam_step, cams, gaussians, len(cloud), raster.projected, raster.lists.own_first,
@@ -360,8 +408,6 @@ class SplatField:
         if broken:
             self._repair()
         self._finish_step()
-        pixels, room = TILE * TILE * len(tasks), raster.lists.pair.shape[1]
-        pairs = sum(min(needed, room) for needed in raster.lists.needed[: len(picked)].tolist())
         return square / (3 * pixels), pixels, pairs, int(broken) + int(dropped.sum())
 
     def _planar_step(self, view: int) -> None:

@@ -68,8 +68,10 @@ class GsplatField(SplatField):
         params = torch.tensor(cloud.params, device=self._device, requires_grad=True)
         pixels, square, lost = 0, 0.0, 0
         drawn = torch.zeros(len(cloud), device=self._device)
+        errors = []
         for k in picked.tolist():
             error, info = self._residuals(params, k)
+            errors.append(float(error.detach().abs().amax(dim=-1).median()))
             weight = self._weight(k)
             loss = (weight * (error.abs() if s.loss == "l1" else error.square())).sum()
             if not bool(torch.isfinite(loss)):
@@ -82,6 +84,9 @@ class GsplatField(SplatField):
             drawn += self._record_statistics(info, float(self._cams[k, SIZE]))
             pixels += error.shape[0] * error.shape[1]
             square += float((weight * error.detach().square()).sum())
+        if self._unjudged and self._refuses(picked, np.nan_to_num(errors, nan=1.0).tolist()):
+            self._finish_step()
+            return square / (3 * max(pixels, 1)), pixels, 0, lost
         gradient = np.zeros_like(cloud.params) if params.grad is None else params.grad.cpu().numpy()
         lost += int((~np.isfinite(gradient)).sum())
         self._adam(np.nan_to_num(gradient, posinf=0.0, neginf=0.0), drawn.cpu().numpy() > 0, progress)

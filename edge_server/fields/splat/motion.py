@@ -104,23 +104,19 @@ class SceneChange:
 def weighted_changes(
     moved: Sequence[NDArray[np.bool_] | None], data: Views
 ) -> list[NDArray[np.bool_] | None]:
-    """``moved`` without pixels of weight 0; None for views without any changed pixel left."""
-    if data.weight.size == 0:
-        return list(moved)
+    """``moved`` without pixels of weight 0; None for views without any changed pixel left, or with so many
+    that it is no motion."""
     left: list[NDArray[np.bool_] | None] = []
     for k, mask in enumerate(moved):
-        if mask is not None:
+        if mask is not None and data.weight.size:
             mask = mask & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(mask.shape)
-        left.append(mask if mask is not None and mask.any() else None)
+        left.append(mask if mask is not None and 0.0 < mask.mean() < MAX_CHANGED else None)
     return left
 
 
 def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.uint8] | None]:
-    """For each view the tiles with changed pixels, uint8 (tiles,), or None where nothing changed, or too much
-    to be motion."""
-    return [
-        None if mask is None or not 0.0 < mask.mean() < MAX_CHANGED else _tile_mask(mask) for mask in moved
-    ]
+    """For each view the tiles with changed pixels, uint8 (tiles,), or None where nothing changed."""
+    return [None if mask is None else _tile_mask(mask) for mask in moved]
 
 
 def unweighted_tiles(data: Views) -> list[NDArray[np.uint8] | None]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,21 @@ from edge_server.fields.common.camera_rows import camera_rows, ray_lengths
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
-from edge_server.fields.splat.kernels.project import TILE, Gaussians
-from edge_server.fields.splat.kernels.rasterize import render_points, render_tiles
+from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.kernels.rasterize import render_tiles
 from freshfield.geometry import Pinhole
 
+MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
 @dataclass(frozen=True)
 class SplatSnapshot:
-    """Gaussians and cameras of one instant, never written after construction.
+    """Gaussians and cameras, never written after construction.
 
-    ahead_s: how much later that instant is than the newest view.
-    raster: buffers for ``colors_at``, where only one thread uses the snapshot; None: new ones a call.
+    gaussians: at ``now_ns``, with the velocities of those that move.
+    now_ns: the instant of the newest view; None before the first.
+    ahead_s: how much later the instant that is rendered is.
     planar: the Gaussians are flat, so ``render_surface`` renders depth from their planes.
     """
 
@@ -35,9 +37,24 @@ class SplatSnapshot:
     cameras: tuple[View, ...]
     pool: Pool
     step: int
+    now_ns: int | None = None
     ahead_s: float = 0.0
-    raster: RasterBuffers | None = None
     planar: bool = False
+
+    def at(self, present_ns: int) -> SplatSnapshot:
+        """The snapshot with its moving Gaussians extrapolated to another instant."""
+        ahead_s = 0.0 if self.now_ns is None else (present_ns - self.now_ns) / 1e9
+        ahead_s = min(max(ahead_s, 0.0), MAX_AHEAD_S)
+        return self if ahead_s == self.ahead_s else replace(self, ahead_s=ahead_s)
+
+    @cached_property
+    def shown(self) -> Gaussians:
+        """The Gaussians at the instant that is rendered."""
+        if self.ahead_s == 0.0 or not self.gaussians.velocity.any():
+            return self.gaussians
+        params, velocity = self.gaussians.params.copy(), self.gaussians.velocity
+        params[:, :3] += velocity * np.float32(self.ahead_s)
+        return self.gaussians._replace(params=params, velocity=np.zeros_like(velocity))
 
     def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """As ``render``, with the depth at which rays meet the Gaussians' planes (see ``planar``)."""
@@ -45,7 +62,7 @@ class SplatSnapshot:
 
         image = self.render(camera_to_world, intrinsics)
         raster, cams = self._project(camera_to_world, intrinsics)
-        depth, opacity = plane_depth(raster, self.gaussians, cams[0], intrinsics)
+        depth, opacity = plane_depth(raster, self.shown, cams[0], intrinsics)
         return Rendering(image.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
@@ -64,31 +81,8 @@ class SplatSnapshot:
     def _project(self, pose: NDArray[np.float64], lens: Pinhole) -> tuple[RasterBuffers, NDArray[np.float32]]:
         """Fresh buffers with the Gaussians that one camera sees, and that camera's rows."""
         raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
-        raster.project_and_bin(cams, self.gaussians, [None], differentiate=False)
+        raster.project_and_bin(cams, self.shown, [None], differentiate=False)
         return raster, cams
-
-    def colors_at(
-        self, views: Sequence[View], points: Sequence[NDArray[np.float64]]
-    ) -> list[NDArray[np.float32]]:
-        """Rendered colors (N, 3) at image points (N, 2) of each view. All views at once, because most of the
-        work is the projection of the Gaussians, which then runs on all cores."""
-        raster = self.raster or RasterBuffers(self.pool)
-        cams = camera_rows([v.camera_to_world for v in views], [v.intrinsics for v in views], self.box)
-        wanted = []
-        for view, where in zip(views, points):
-            lens = view.intrinsics
-            tiles = np.zeros((-(-lens.height // TILE), -(-lens.width // TILE)), np.uint8)
-            tiles[tuple((where[:, ::-1] // TILE).astype(np.int64).T)] = 1
-            wanted.append(tiles.reshape(-1))
-        raster.project_and_bin(cams, self.gaussians, wanted, differentiate=False)
-        counts = [len(where) for where in points]
-        slots = np.repeat(np.arange(len(views)), counts)
-        color = np.empty((len(slots), 3), np.float32)
-        self.pool.run(
-            render_points, raster.columns, slots, np.concatenate(points).astype(np.float32), raster.projected,
-            raster.lists, self.background, color,
-        )  # fmt: skip
-        return np.split(color, np.cumsum(counts)[:-1])
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` surface points (N, 3) in world meters and their colors (N, 3): the known cameras

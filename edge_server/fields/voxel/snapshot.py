@@ -37,6 +37,10 @@ class VoxelSnapshot:
     pool: Pool
     step: int
 
+    def at(self, present_ns: int) -> VoxelSnapshot:
+        """Itself: nothing in it is known to move."""
+        return self
+
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture a camera at this pose would take."""
         w, h = intrinsics.width, intrinsics.height

@@ -42,6 +42,9 @@ class Broken:
 
     renders = 0
 
+    def at(self, present_ns):
+        return self
+
     def render(self, camera_to_world, intrinsics: Pinhole) -> Rendering:
         self.renders += 1
         shape = (intrinsics.height, intrinsics.width)
@@ -69,7 +72,8 @@ def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
 
     return EdgeState(
         scenario="bare", policies=(), controls=Controls("all", None), cameras=lambda: cameras or [],
-        now_s=time.monotonic, set_policy=refuse, save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
+        start_ns=0, now_ns=time.monotonic_ns, set_policy=refuse,
+        save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
     )  # fmt: skip
 
 

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.simd import draw, exp32, fetch_add, is_finite, uniform
+from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite, uniform
 from edge_server.fields.splat.kernels.composite import (
-    ALPHA_MAX,
     PIXELS,
     SAVED,
-    STOP,
     STRIP,
     STRIPS,
     SUMS,
@@ -27,14 +25,6 @@ from edge_server.fields.splat.kernels.composite import (
     composite_backward,
 )
 from edge_server.fields.splat.kernels.project import (
-    ALPHA,
-    ALPHA_MIN,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    MEAN_X,
-    MEAN_Y,
-    RED,
     TILE,
 )
 
@@ -276,43 +266,6 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
             healthy = is_finite(far) and is_finite(seen)
             depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
             opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0
-
-
-@kernel
-def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
-    """Render single image points, which costs much less than their tiles. Tasks are runs of 16 points.
-
-    slots: int64 (N,), the camera slot of each point.
-    points: float32 (N, 2), image points in tiles that are wanted.
-    color: float32 (N, 3), written.
-    """
-    most, least, stop = np.float32(ALPHA_MAX), np.float32(ALPHA_MIN), np.float32(STOP)
-    while True:
-        base = fetch_add(counter, 1) * 16
-        if base >= points.shape[0]:
-            return
-        for n in range(base, min(base + 16, points.shape[0])):
-            x, y = points[n, 0], points[n, 1]
-            v = slots[n]
-            t = (np.int64(y) // TILE) * columns[v] + np.int64(x) // TILE
-            r = g = b = _F0
-            left = _F1
-            for j in range(lists.first[v, t], lists.first[v, t + 1]):
-                row = projected[v, lists.owner[v, lists.pair[v, j]]]
-                dx, dy = x - row[MEAN_X], y - row[MEAN_Y]
-                power = -_HALF * (row[CONIC_A] * dx * dx + row[CONIC_C] * dy * dy) - row[CONIC_B] * dx * dy
-                a = min(row[ALPHA] * exp32(power), most)
-                if a >= least:
-                    w = a * left
-                    r += w * row[RED]
-                    g += w * row[RED + 1]
-                    b += w * row[RED + 2]
-                    left -= w
-                    if not left >= stop:
-                        break
-            for c, value in enumerate((r, g, b)):
-                value += left * background[c]
-                color[n, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
 
 
 @kernel

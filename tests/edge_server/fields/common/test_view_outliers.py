@@ -288,20 +288,20 @@ def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_ag
     wrong = [replace(v, generated_ns=500 * MS) for v in views]
     noise = np.random.default_rng(1).integers(0, 256, views[3].image.shape, dtype=np.uint8)
     wrong[3] = replace(wrong[3], image=noise)
-    assert field.fit(wrong, Budget(steps=2)).refused == ("cam03",)
+    assert field.fit(wrong, Budget(steps=26)).refused == ("cam03",)
     credit = field.view_store.memory["cam03"].refusals_left
     assert credit < MOST_REFUSALS
-    again = field.fit(wrong, Budget(steps=2))
+    again = field.fit(wrong, Budget(steps=26))
     other = small(name)
     other.load_state(field.state())
-    resumed = other.fit(wrong, Budget(steps=2))
+    resumed = other.fit(wrong, Budget(steps=26))
     assert again.refused == resumed.refused == ("cam03",)
     assert (
         field.view_store.memory["cam03"].refusals_left
         == other.view_store.memory["cam03"].refusals_left
         == credit
     )
-    assert field.fit([replace(v, generated_ns=600 * MS) for v in views], Budget(steps=2)).refused == ()
+    assert field.fit([replace(v, generated_ns=600 * MS) for v in views], Budget(steps=26)).refused == ()
 
 
 def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
@@ -310,7 +310,7 @@ def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
     field.fit(views, Budget(steps=150))
     dark = [replace(v, generated_ns=100 * MS) for v in views]
     dark[3] = replace(dark[3], image=(views[3].image * 0.2).astype(np.uint8))
-    assert field.fit(dark, Budget(steps=2)).refused == ()
+    assert field.fit(dark, Budget(steps=26)).refused == ()
 
 
 @every_field

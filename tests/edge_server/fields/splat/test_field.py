@@ -246,7 +246,6 @@ for module in (plane_sweep, view_evidence, project, rasterize, bin_tiles, optimi
         "collect_evidence",
         "position_gradients",
         "compare_tiles",
-        "render_points",
         "train_tiles",
     } <= counts.keys()
     assert set(counts.values()) == {"1"}, counts

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
+from edge_server.fields.splat.kernels.composite import ALPHA_MAX, STOP
 from edge_server.fields.splat.kernels.project import (
     ALPHA_MIN,
     COLOR,
@@ -23,7 +24,6 @@ from edge_server.fields.splat.kernels.project import (
     SCALE_HIGH,
     SCALE_LOW,
 )
-from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX, STOP
 
 
 @dataclass(frozen=True)

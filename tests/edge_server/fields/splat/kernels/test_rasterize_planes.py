@@ -13,6 +13,7 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.kernels.composite import ALPHA_MAX
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
     ALPHA_MIN,
@@ -27,7 +28,6 @@ from edge_server.fields.splat.kernels.project import (
     SCALE,
     Gaussians,
 )
-from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX
 from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.planar import (
     align,
