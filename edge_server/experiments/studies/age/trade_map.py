@@ -115,8 +115,9 @@ class Phase:
             more["speed_m_per_s"] = cell.speed
         base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":
-            steps = {"first_steps": 2 * base.steps, "steps": base.steps // 3}
-            base = dataclasses.replace(base, scratch=False, settle=2, decisions=3, **steps)
+            base = dataclasses.replace(
+                base, scratch=False, settle=2, decisions=3, first_steps=2 * base.steps, steps=base.steps // 3
+            )
         if cell.compute == "charged":
             base = dataclasses.replace(base, compute=CHARGED)
         return base

@@ -145,7 +145,7 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
         reward = priced(trainer, "moving")
         config = TrainingConfig(Spec("select", layout), reward, request.training_episodes(EPISODES_BY_DIM))
         trained = trainer.train_repeats(f"reward-cost-d{dim}", setting, config)
-        candidates = {**baseline_policies((), (), ("random",)), **named_runs(name, trained)}
+        candidates: dict[str, Any] = {**baseline_policies((), (), ("random",)), **named_runs(name, trained)}
         evaluations[name] = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
     _draw_dims(request, evaluations)
     found = [row for name, evaluation in evaluations.items() for row in rows(evaluation, what=name)]
