@@ -21,7 +21,12 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
 from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, rows
+from edge_server.experiments.training.scheduler.evaluation import (
+    Candidate,
+    Evaluation,
+    baseline_policies,
+    rows,
+)
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, stage_file
@@ -145,7 +150,10 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
         reward = priced(trainer, "moving")
         config = TrainingConfig(Spec("select", layout), reward, request.training_episodes(EPISODES_BY_DIM))
         trained = trainer.train_repeats(f"reward-cost-d{dim}", setting, config)
-        candidates: dict[str, Any] = {**baseline_policies((), (), ("random",)), **named_runs(name, trained)}
+        candidates: dict[str, Candidate] = {
+            **baseline_policies((), (), ("random",)),
+            **named_runs(name, trained),
+        }
         evaluations[name] = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
     _draw_dims(request, evaluations)
     found = [row for name, evaluation in evaluations.items() for row in rows(evaluation, what=name)]
