@@ -15,10 +15,14 @@ def summarize(out: Path) -> str:
     frames, age = report.get("frames", {}), report.get("age_ms", {})
     updates, fidelity = report.get("updates", {}), report.get("fidelity", {})
     final, baseline = fidelity.get("final") or {}, fidelity.get("baseline") or {}
+    shown = fidelity.get("shown") or {}
     rejected = sum(frames.get("rejected", {}).values())
     lines = [
         "",
-        f"fidelity   PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run "
+        f"shown      PSNR {fmt(shown.get('psnr_db'), '.2f')} dB over the last fifth of the run "
+        f"(moving pixels {fmt(shown.get('psnr_moving_db'), '.2f')} dB, still "
+        f"{fmt(shown.get('psnr_still_db'), '.2f')}), {_parts(shown.get('age_ms') or {})}",
+        f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run "
         f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
         f"LPIPS {fmt(final.get('lpips'), '.3f')})",
         f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
@@ -33,6 +37,11 @@ def summarize(out: Path) -> str:
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
     return "\n".join(lines)
+
+
+def _parts(age_ms: dict[str, Any]) -> str:
+    """What the age of the views that were shown consists of."""
+    return "age of " + " + ".join(f"{fmt(ms, '.0f')} ms {part}" for part, ms in age_ms.items())
 
 
 def _mesh(mesh: dict[str, Any] | None) -> list[str]:

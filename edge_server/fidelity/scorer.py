@@ -36,6 +36,9 @@ MAX_PENDING = 8
 # The truth may be half a period from the present; the rest allows for jitter of a real camera's clock.
 GAP_PERIODS = 0.55
 
+SHOWN = ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")
+"""The scores that are reported of what was shown."""
+
 Load = Callable[[], NDArray]
 # A rendering, or a function that makes it once the truth's generation time is known: by then a moving
 # held-out camera has another pose.
@@ -53,9 +56,10 @@ class PerceptualMetric(Protocol):
 
 @dataclass(frozen=True)
 class Score:
-    """Fidelity of one publication.
+    """Fidelity of one rendering.
 
-    published_ns: the present. psnr_moving_db: None where nothing is known to move. ssim, lpips: None where
+    published_ns: the present. psnr_moving_db: None where nothing is known to move; psnr_still_db: of the
+    pixels that are not known to move, None where all do. ssim, lpips: None where
     the image is too small, lpips also without weights. truth_gap_ms: capture of the truth minus the present
     (None on selected views). on: the kind of truth. perceptual: None unless it was asked for; it is not
     LPIPS, see fidelity.perceptual.
@@ -71,6 +75,7 @@ class Score:
     moving_share: float = 0.0
     on: Literal["held-out", "selected"] = "held-out"
     perceptual: float | None = None
+    psnr_still_db: float | None = None
 
 
 @dataclass(eq=False)
@@ -162,6 +167,15 @@ class Scorer:
             state.frames.popleft()
         return self._score_ready(camera)
 
+    def newest(self, camera: str, rendering: Callable[[int], NDArray]) -> Score | None:
+        """Score what was shown when the newest held-out frame of ``camera`` was taken; None where nothing is
+        known of the camera's period yet, or its frame cannot be decoded. rendering: of its generation time.
+        ImageError as ``score``."""
+        state, period = self._camera(camera), self.period_ms(camera)
+        if not state.frames or period is None:
+            return None
+        return self._against_nearest(camera, state, period, state.frames[-1].generated_ns, rendering)
+
     def score(
         self,
         camera: str,
@@ -190,6 +204,7 @@ class Scorer:
             published_ns=published_ns,
             psnr_db=total,
             psnr_moving_db=psnr(a, b, moving),
+            psnr_still_db=psnr(a, b, ~moving),
             ssim=ssim(a, b) if side >= TAPS else None,
             lpips=by(self._lpips),
             perceptual=by(self._perceptual),
@@ -289,6 +304,7 @@ def mean_score(scores: Sequence[Score]) -> Score:
         camera=",".join(dict.fromkeys(s.camera for s in scores)),
         psnr_db=float(np.mean([s.psnr_db for s in scores])),
         psnr_moving_db=mean([s.psnr_moving_db for s in scores]),
+        psnr_still_db=mean([s.psnr_still_db for s in scores]),
         ssim=mean([s.ssim for s in scores]),
         lpips=mean([s.lpips for s in scores]),
         perceptual=mean([s.perceptual for s in scores]),

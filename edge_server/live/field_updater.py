@@ -197,6 +197,8 @@ class FieldUpdater:
     ) -> Publication:
         """The record of an update that became visible at ``published_ns``; ages are taken then (6.35)."""
         ages = tuple((published_ns - view.generated_ns) / 1e6 for view in views)
+        used = {view.camera for view in views}
+        network = [i.received_ns - i.generated_ns for i in selection.items if i.frame.camera in used]
         publication = Publication(
             number=self.number,
             t_s=(published_ns - self.start_ns) / 1e9,
@@ -209,6 +211,7 @@ class FieldUpdater:
             steps=fit.steps,
             loss=fit.loss if np.isfinite(fit.loss) else None,
             refused=fit.refused,
+            network_ms=float(np.mean(network)) / 1e6 if network else None,
         )
         self.number += 1
         return publication

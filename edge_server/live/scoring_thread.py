@@ -1,8 +1,12 @@
-"""Scores each publication on a thread of its own, so that neither ingest nor the field waits for it.
+"""Scores publications, and what is shown between them, on a thread of its own, so that neither ingest nor
+the field waits for it.
 
 A publication's renderer is kept until the held-out capture nearest to its present has arrived; it then
 renders that capture's pose, and the two images are compared. If scoring falls behind, publications stay
-unscored (nulls in the series) and nothing queues up.
+unscored (nulls in the series) and nothing queues up. The thread uses a bounded share of the machine.
+
+What is shown: at random held-out captures, the newest publication of that instant, carried on to it as the
+page does (``Snapshot.at``).
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +28,8 @@ from edge_server.fields import View
 from edge_server.live.state import Comparison, Publication, Snapshot
 from freshfield import payload
 from freshfield.frame import Frame
+from freshfield.machine_load import usable_cores
+from freshfield.scenario import seed_sequence
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +41,11 @@ _OPEN_PUBLICATIONS = 16
 _KEPT_FRAMES = 128
 _BASELINE_EVERY = 5
 _KEPT_RENDERINGS = 32
+# Publications that may be the newest one of a held-out capture that is still on its way.
+_KEPT_PUBLICATIONS = 32
+_SHOWN_EVERY_S = 0.4  # mean time between two scores of what is shown
+# Largest share of the cores' time that this thread takes, after a first allowance of CPU seconds.
+_SHARE, _ALLOWANCE_S = 0.03, 1.0
 
 
 @dataclass
@@ -50,6 +62,9 @@ class ScoringThread:
     held_out: ids of the held-out cameras; where there are none, the selected views are scored.
     on_scored(publication with scores, comparison or None, final): called on this thread. final: the scores of
     all held-out cameras are in.
+    on_shown(score, publication): what was shown at ``score.published_ns``, ``publication`` carried on to that
+    instant, has a score. Called on this thread.
+    seed: of the random instants.
     """
 
     def __init__(
@@ -57,10 +72,17 @@ class ScoringThread:
         held_out: Sequence[str],
         scorer: Scorer,
         on_scored: Callable[[Publication, Comparison | None, bool], None],
+        on_shown: Callable[[Score, Publication], None],
+        seed: int = 0,
     ) -> None:
         self._held_out = tuple(held_out)
         self._scorer = scorer
         self._on_scored = on_scored
+        self._on_shown = on_shown
+        self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
+        self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
+        self._next_shown_ns = 0
+        self._started_s = time.monotonic()
         self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
         self._ending = False
@@ -110,11 +132,33 @@ class ScoringThread:
                 if isinstance(item, Frame):
                     self._score_with(item)
                 elif self._held_out:
-                    self._score_later(*item)
+                    self._recent.append(item[:2])
+                    if self._affordable():
+                        self._score_later(*item)
                 else:
                     self._score_selected(*item)
             except Exception:  # one bad image must not end all scoring; it is logged with its traceback
                 log.exception("a publication could not be scored")
+
+    def _affordable(self) -> bool:
+        """Whether this thread has used less than its share of the cores' time."""
+        elapsed_s = time.monotonic() - self._started_s
+        return time.thread_time() < _ALLOWANCE_S + _SHARE * usable_cores() * elapsed_s
+
+    def _score_shown(self, frame: Frame) -> None:
+        """Score what was shown when a held-out frame was taken, if it is time for that."""
+        taken_ns = frame.generated_edge_ns
+        found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
+        if found is None or taken_ns < self._next_shown_ns or not self._affordable():
+            return
+        self._next_shown_ns = taken_ns + round(self._rng.exponential(_SHOWN_EVERY_S) * 1e9)
+        publication, snapshot = found
+        score = self._scorer.newest(
+            frame.camera,
+            lambda at_ns: snapshot.at(at_ns).render(frame.pose.matrix(), frame.intrinsics).color,
+        )
+        if score is not None:
+            self._on_shown(score, publication)
 
     def _score_later(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         self._open[publication.number] = _OpenPublication(publication, [])
@@ -144,6 +188,7 @@ class ScoringThread:
             frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose
         )
         self._finish(scores)
+        self._score_shown(frame)
 
     def _decode(self, frame: Frame) -> NDArray[np.uint8]:
         k = frame.intrinsics

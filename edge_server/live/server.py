@@ -18,7 +18,7 @@ import numpy as np
 
 from edge_server.config import EdgeConfig, embedding_for
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
+from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
 from edge_server.fields import View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
@@ -102,7 +102,7 @@ class EdgeServer:
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
         scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
-        self.scoring = ScoringThread(scenario.held_out, scorer, self._scored)
+        self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)
         try:
             self.policies = ServerPolicies(scenario, config, self.lpips_missing, options.out)
         except ValueError as error:
@@ -240,6 +240,9 @@ class EdgeServer:
             self.trainer.add_score(publication.number, publication)
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
+
+    def _shown(self, score: Score, publication: Publication) -> None:
+        self.journal.shown((score.published_ns - self.start_ns) / 1e9, score, publication)
 
     def _set_status_line(self, line: str) -> None:
         self.state.status_line = line

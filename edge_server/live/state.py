@@ -30,7 +30,8 @@ class Publication:
 
     t_s, published_ns: instant of publication (the present), in seconds since the run began and on the clock.
     selected: cameras whose frames were used; ages_ms: their ages then; aaoi_ms: mean of these (6.35).
-    update_ms: from decision to publication.
+    update_ms: from decision to publication. network_ms: mean time of the selected frames from capture to
+    arrival. What is left of aaoi_ms is the time that they waited in the buffer.
     refused: selected cameras whose view the field left out, because it contradicts all others.
     psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
     is nothing to score. truth_gap_ms: time from the present to that truth.
@@ -56,6 +57,7 @@ class Publication:
     truth_gap_ms: float | None = None
     scored_on: str | None = None
     perceptual: float | None = None
+    network_ms: float | None = None
 
     @property
     def views(self) -> float:

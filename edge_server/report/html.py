@@ -87,9 +87,12 @@ def _tiles(report: Report) -> str:
         similarity.append((_n(final["perceptual"], 3), "perceptual (not LPIPS)"))
     if report["kind"] == "fit":
         return _tile_row([(_n(final["psnr_db"], 1, " dB"), "PSNR at the end"), *similarity])
+    shown = report["fidelity"]["shown"]
+    tiles = [(shown, "PSNR of what was shown")] if shown["psnr_db"] is not None else []
     return _tile_row([
-        (_n(final["psnr_db"], 1, " dB"), "PSNR at the present, last fifth of the run"),
-        (_n(final["psnr_moving_db"], 1, " dB"), "PSNR where the scene moves"),
+        *((_n(found[key], 1, " dB"), f"{what}{where}, last fifth of the run")
+          for found, what in [*tiles, (final, "PSNR at publication")]
+          for key, where in (("psnr_db", ""), ("psnr_moving_db", " where the scene moves"))),
         *similarity,
         (_n(age["mean"], 0, " ms"), f"mean age (95 %: {_n(age['p95'], 0)} ms)"),
         (_n(report["updates"]["ms_p50"], 0, " ms"), f"median of {report['updates']['count']} updates"),
@@ -115,6 +118,9 @@ def _fidelity_table(report: Report) -> str:
         if fit and name == "mean":
             continue  # the mean of a learning curve is no result
         rows.append([label, *(_n(found[name][metric], digits) for metric, digits in metrics.items())])
+    if not fit and found["shown"]["psnr_db"] is not None:
+        shown = [_n(found["shown"].get(metric), digits) for metric, digits in metrics.items()]
+        rows.insert(1, ["shown, last fifth of the run", *shown])
     for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean color")):
         rows.append([label, _n(found["baseline"][name], 2), *[""] * (len(metrics) - 1)])
     remarks = []

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.fidelity.scorer import SHOWN
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.machine import machine, versions
 from edge_server.report.run_files import Row, RunFiles, read_run_files
@@ -65,7 +66,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
         "age_ms": ages(files.ages),
         "updates": updates(series, edge.get("updates") or {}),
-        "fidelity": fidelity(series, seconds, edge),
+        "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
         "channel": {
             name: files.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
         },
@@ -133,6 +134,26 @@ def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]
         "scored_on": sorted({str(row["scored_on"]) for row in series if row.get("scored_on")}),
         "scored": sum(row.get("psnr_db") is not None for row in series),
         "series": [{name: row.get(name) for name in SERIES} for row in series],
+    }
+
+
+def shown(rows: Sequence[Row], seconds: float) -> dict[str, Any]:
+    """What was shown at random instants of the last fifth of the run's ``seconds``: mean of each score, count
+    of the instants, and age_ms {network, waiting, computing, display}: what the mean age of the views that
+    were shown consists of."""
+    late = [row for row in rows if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
+
+    def mean(values: Iterable[Any]) -> float | None:
+        known = _known(values)
+        return float(np.mean(known)) if known else None
+
+    return {
+        **{name: mean(row.get(name) for row in late) for name in SHOWN},
+        "count": len(late),
+        "age_ms": {
+            part: mean((row.get("age_ms") or {}).get(part) for row in late)
+            for part in ("network", "waiting", "computing", "display")
+        },
     }
 
 

@@ -20,6 +20,7 @@ class RunFiles:
     """Contents of a run's folder.
 
     edge, channel: status files of the edge and the emulator. series: rows as in state.Publication.
+    shown: rows as ``Journal.shown`` writes them.
     ages: rows {t_s, age_ms: {camera: ms or None}}. processes: rows {t_s, name: {rss_mb, cpu, pid}}.
     mesh: as ``edge-server export --json`` writes it. images: those that exist, by name.
     notes: one line for people on whatever was missing or torn.
@@ -29,6 +30,7 @@ class RunFiles:
     edge: Row = field(default_factory=dict)
     channel: Row = field(default_factory=dict)
     series: list[Row] = field(default_factory=list)
+    shown: list[Row] = field(default_factory=list)
     ages: list[Row] = field(default_factory=list)
     processes: list[Row] = field(default_factory=list)
     mesh: Row = field(default_factory=dict)
@@ -45,6 +47,8 @@ def read_run_files(out: Path) -> RunFiles:
     files.channel = _read_json(out / "channel.json", files.notes)
     files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
     files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
+    if (out / "shown.jsonl").exists():  # not of a fit, nor where nothing is held out
+        files.shown = _continuous(_read_lines(out / "shown.jsonl", files.notes))
     if (out / "processes.jsonl").exists():  # written only where one command started all processes
         files.processes = _continuous(_read_lines(out / "processes.jsonl", files.notes))
     if (out / "mesh.json").exists():  # only where the scenario asks for one

@@ -21,7 +21,7 @@ from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips
-from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
+from edge_server.fidelity.scorer import SHOWN, Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
@@ -42,6 +42,7 @@ steps, and virtual time is charged for them: zero, as the thesis does, or ms a s
 one result: the digest that is printed is of every publication and of the field's parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
+_SHOWN_EVERY_MS = 100.0  # where every publication is scored
 # Seconds of virtual time between two lines of progress.
 _PROGRESS_EVERY_S = 1.0
 
@@ -60,6 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             epoch_ms=args.epoch_ms,
             grace_ms=config.grace_ms,
             score_every_ms=args.score_every_ms,
+            shown_every_ms=args.score_every_ms or _SHOWN_EVERY_MS,
         )
         metric, missing = None, None
         if config.lpips != "none":
@@ -100,8 +102,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def summary(
     scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float
 ) -> dict[str, Any]:
-    """A run's frame counts, means over its last fifth, and the digest that tells runs apart."""
+    """A run's frame counts, means over its last fifth, and the digest that tells runs apart.
+
+    last_fifth: at publication, the thesis's measure. shown: at random instants, of what was shown then.
+    """
     publications = deployment.publications
+    shown = [s for s in deployment.shown if s.published_ns >= 0.8e9 * seconds]
     late = [p for p in publications if p.t_s >= 0.8 * seconds]
     return {
         "scenario": scenario.name,
@@ -114,6 +120,7 @@ def summary(
         "updates": len(publications),
         "frames": deployment.frames(),
         "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
+        "shown": {name: mean_or_none([getattr(s, name) for s in shown]) for name in SHOWN},
         "views": mean_or_none([float(len(p.selected)) for p in publications]),
         "update_ms": mean_or_none([p.update_ms for p in publications]),
         "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
@@ -157,6 +164,7 @@ def show(found: dict[str, Any]) -> str:
             for k, v in found["last_fifth"].items()
             if k != "perceptual" or v is not None
         ),
+        "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]}",
     ]
@@ -217,7 +225,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
     add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
-    add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
+    add("--score-every-ms", type=float, default=250.0, metavar="MS",
+        help="publications, and what is shown at a random instant of each period [%(default)g]")  # fmt: skip
     add_folders(parser)
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip

@@ -33,6 +33,10 @@ class ExactTruth:
     cameras: dict[str, tuple[Pinhole, NDArray[np.float64]]]
     image: Callable[[str, float], NDArray[np.uint8]]
 
+    def nearest_ns(self, present_ns: int) -> int:
+        """The instant itself: the truth is known at any."""
+        return present_ns
+
     def view(self, camera: str, present_ns: int) -> Seen:
         """Image of a held-out camera at an instant, intrinsics and camera-to-world pose."""
         return self.image(camera, present_ns / 1e9), *self.cameras[camera]
@@ -63,6 +67,10 @@ class CapturedTruth:
             c.name: noise_bound(_image(c, c.capture(k)) for k in range(NOISE_FRAMES)) if noisy else BOUND
             for c in cameras
         }
+
+    def nearest_ns(self, present_ns: int) -> int:
+        """The instant of the first held-out camera's capture nearest to ``present_ns``."""
+        return _instant_ns(self._cameras[0], _nearest(self._cameras[0], present_ns))
 
     def view(self, camera: str, present_ns: int) -> Seen:
         """Held-out capture nearest to an instant: image, intrinsics and camera-to-world pose."""

@@ -9,10 +9,13 @@ no result, because nothing reads a frame before.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from camera_node.capture import Camera
 from channel_emu.model.channel import Channel
@@ -21,7 +24,7 @@ from channel_emu.model.link import Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
-from edge_server.fields import Budget
+from edge_server.fields import Budget, Snapshot
 from edge_server.live.buffer import BufferedFrame
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
@@ -29,6 +32,7 @@ from edge_server.live.state import Publication
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
+from freshfield.scenario import seed_sequence
 
 SESSION = "virtual"
 # The pose comes with the capture; nothing reads it before the frame is used.
@@ -53,6 +57,10 @@ _AT_ARRIVAL = WakeCondition(on_arrival=True)
 class Truth(Protocol):
     """Scores renders of the field at the present. See ``experiments.virtual.truth``."""
 
+    def nearest_ns(self, present_ns: int) -> int:
+        """The instant nearest to ``present_ns`` of which the truth is known."""
+        ...
+
     def score(self, field: Any, present_ns: int) -> Score | None: ...
 
     def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
@@ -70,6 +78,7 @@ class RunSettings:
     epoch_ms: least time between two decisions.
     grace_ms: how long the first update waits for cameras that have not reported.
     score_every_ms: publications nearer than this to the last scored one are not scored; None scores nothing.
+    shown_every_ms: what is shown is scored at seeded random instants, one in each such period; None: never.
     first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
         it, so that policies that take different times decide at the same instants.
     scratch: every update starts with an empty field, as in the thesis.
@@ -81,6 +90,7 @@ class RunSettings:
     epoch_ms: float = 0.0
     grace_ms: float = 3000.0
     score_every_ms: float | None = 0.0
+    shown_every_ms: float | None = None
     first_ms: float | None = None
     scratch: bool = False
 
@@ -90,6 +100,8 @@ class RunSettings:
         waits = (self.epoch_ms, self.grace_ms, self.score_every_ms or 0.0)
         if not all(0.0 <= ms < 1e12 for ms in waits):
             raise ValueError("epoch_ms, grace_ms and score_every_ms: expected finite numbers of at least 0")
+        if self.shown_every_ms is not None and not 0.0 < self.shown_every_ms < 1e12:
+            raise ValueError("shown_every_ms: expected a finite number above 0")
         if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
             raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
 
@@ -132,6 +144,8 @@ class VirtualDeployment:
         self.settings = settings
         self.truth = truth
         self.publications: list[Publication] = []
+        self.shown: list[Score] = []
+        """Scores of what was shown: at each instant the newest publication, carried on to that instant."""
         self.captured: Counter[str] = Counter()
         self.delivered: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
@@ -152,6 +166,9 @@ class VirtualDeployment:
         self._used: dict[str, tuple[Frame, ...]] = {}
         """The last two frames of each camera that have images."""
         self._scored_ns: int | None = None
+        self._shown: Snapshot | None = None  # the newest publication
+        self._instants = self._shown_instants(seed)
+        self._show_ns = next(self._instants)
         self.decided_ns = updates.start_ns
         """Instant of the decision that is being carried out, or was last."""
         self._edge = self._run_edge()
@@ -164,7 +181,7 @@ class VirtualDeployment:
         while True:
             due_ns = self._origin_ns + min(link.next_event_ns for link in self._links.values())
             capture_ns = min(self._due_ns(name) for name in self._cameras)
-            now_ns = min(due_ns, capture_ns, self._wake.at_ns)
+            now_ns = min(due_ns, capture_ns, self._wake.at_ns, self._show_ns)
             if now_ns > end_ns:
                 break
             self.clock.advance_to(now_ns)
@@ -176,8 +193,10 @@ class VirtualDeployment:
                 for name in self._cameras:
                     if self._due_ns(name) == now_ns:
                         self._capture(name, now_ns)
-            else:
+            elif self._wake.at_ns == now_ns:
                 self._wake = next(self._edge)
+            else:
+                self._score_shown(now_ns)
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
@@ -345,6 +364,8 @@ class VirtualDeployment:
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)
         self.publications.append(publication)
+        if self._show_ns != NEVER_NS:
+            self._shown = self.updates.field.snapshot(publication.published_ns)
         if self._on_published is not None:
             self._on_published(publication)
 
@@ -359,3 +380,25 @@ class VirtualDeployment:
             return publication
         self._scored_ns = present_ns
         return publication.scored(score)
+
+    def _shown_instants(self, seed: int) -> Iterator[int]:
+        """Seeded random instants that have nothing to do with the cameras' phase."""
+        every_ms, truth = self.settings.shown_every_ms, self.truth
+        if every_ms is None or truth is None:
+            while True:
+                yield NEVER_NS
+        rng = np.random.default_rng(seed_sequence(seed, "shown"))
+        at_ns = self._origin_ns
+        for period in itertools.count():
+            random_ns = self._origin_ns + round((period + rng.random()) * every_ms * 1e6)
+            at_ns = max(truth.nearest_ns(random_ns), at_ns)
+            yield at_ns
+
+    def _score_shown(self, now_ns: int) -> None:
+        self._show_ns = next(self._instants)
+        if self._shown is None:
+            return
+        assert self.truth is not None
+        score = self.truth.score(self._shown.at(now_ns), now_ns)
+        if score is not None:
+            self.shown.append(score)

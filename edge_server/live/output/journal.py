@@ -1,9 +1,10 @@
-"""The files of a run, written as it goes: edge.json, series.jsonl, ages.jsonl, poses.jsonl.
+"""The files of a run, written as it goes: edge.json, series.jsonl, shown.jsonl, ages.jsonl, poses.jsonl.
 
 edge.json is replaced about twice a second (live tables read it). series.jsonl gets a line for each
-publication, once its scores are final. ages.jsonl samples every camera's age at a fixed rate, so that its
-mean is a time average. poses.jsonl gets a line for each view that the field was trained on and whose pose
-differs from its camera's last one: cameras that stand still leave one line each.
+publication, once its scores are final, shown.jsonl a line for each instant at which what was shown is scored.
+ages.jsonl samples every camera's age at a fixed rate, so that its mean is a time average. poses.jsonl gets a
+line for each view that the field was trained on and whose pose differs from its camera's last one: cameras
+that stand still leave one line each.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.fidelity.scorer import SHOWN, Score
 from edge_server.fields import View
 from edge_server.live.state import Publication
 from freshfield.files import Lines, write_json
@@ -45,6 +47,7 @@ class Journal:
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
         self._series = Lines(out / "series.jsonl")
+        self._shown = Lines(out / "shown.jsonl")
         self._ages = Lines(out / "ages.jsonl")
         self._poses = Lines(out / "poses.jsonl")
         self._last_pose: dict[str, Pose] = {}
@@ -54,7 +57,7 @@ class Journal:
     @property
     def lines_lost(self) -> int:
         """Number of lines that could not be written so far."""
-        return self._series.lost + self._ages.lost + self._poses.lost
+        return self._series.lost + self._shown.lost + self._ages.lost + self._poses.lost
 
     def published(self, publication: Publication) -> None:
         with self._lock:
@@ -71,6 +74,23 @@ class Journal:
             # Lines keep the order of publication: a final one waits for those before it.
             if final and next(iter(self._open)) == publication.number:
                 self._write_oldest()
+
+    def shown(self, t_s: float, score: Score, publication: Publication) -> None:
+        """What was shown at ``t_s``, the newest ``publication`` carried on to then, has a score. The age of
+        its views then is the sum of network, waiting, computing and display."""
+        waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
+        line = {
+            "t_s": round(t_s, 4),
+            "number": publication.number,
+            **{name: getattr(score, name) for name in SHOWN},
+            "age_ms": {
+                "network": publication.network_ms,
+                "waiting": waiting_ms,
+                "computing": publication.update_ms,
+                "display": 1e3 * (t_s - publication.t_s),
+            },
+        }
+        self._shown.write(json.dumps(line, allow_nan=False))
 
     def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
         line = {
@@ -106,6 +126,7 @@ class Journal:
             while self._open:
                 self._write_oldest()
             self._series.close()
+            self._shown.close()
             self._ages.close()
             self._poses.close()
         self.write_status()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from edge_server.fidelity.scorer import Score
 from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from tests.edge_server.report.ledgers import write
@@ -39,6 +41,9 @@ CHANNEL = {
     },
     "delay_error_ms": {"p50": 0.1, "p99": 1.2, "max": 4.0},
 }
+
+
+SHOWN = Score("cam00", 0, 24.0, 17.0, 0.8, None, 0.0, psnr_still_db=26.0)
 
 
 def publication(number: int) -> Publication:
@@ -76,6 +81,7 @@ def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
     for number in range(publications):
         journal.published(publication(number))
         journal.scored(publication(number), final=True)
+        journal.shown(publication(number).t_s + 0.1, SHOWN, replace(publication(number), network_ms=50.0))
     journal.close()
     (out / "channel.json").write_text(json.dumps(CHANNEL))
     image = np.zeros((48, 64, 3), np.uint8)

@@ -51,6 +51,18 @@ def test_frames_close(run):
     assert frames["closes"] and frames["contradiction_count"] == 0 and frames["ledgers"] == 3
 
 
+def test_what_was_shown_and_what_its_age_consists_of(run):
+    shown = run[1]["fidelity"]["shown"]
+    assert [shown[k] for k in ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")] == [
+        24.0, 17.0, 26.0, 0.8, None,
+    ]  # fmt: skip
+    late = [p for i in range(49) if (p := publication(i)).t_s + 0.1 >= 0.8 * SECONDS]
+    age = shown["age_ms"]
+    assert shown["count"] == len(late) and age["network"] == 50.0
+    assert age["display"] == pytest.approx(100.0)
+    assert sum(age.values()) == pytest.approx(np.mean([p.aaoi_ms for p in late]) + 100.0)
+
+
 def test_final_is_the_mean_of_the_last_fifth_of_the_run(run):
     late = [publication(i) for i in range(49)]
     late = [p.psnr_db for p in late if p.t_s >= 0.8 * SECONDS and p.psnr_db is not None]

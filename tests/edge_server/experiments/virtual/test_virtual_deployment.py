@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -236,3 +237,36 @@ def test_wrong_poses_reach_the_field_and_wrong_lenses_are_believed():
         wrong = run(scenario(source=world_with(effects)))
         assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in plain.publications]
         assert [p.psnr_db for p in wrong.publications] != [p.psnr_db for p in plain.publications]
+
+
+def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants() -> None:
+    settings = RunSettings(
+        steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0), shown_every_ms=70.0
+    )
+    deployment = build_deployment(scenario(), settings)
+    asked: list[tuple[int, int]] = []
+    take = deployment.updates.field.snapshot
+
+    class Watched:
+        def __init__(self, snapshot: Any, published_ns: int) -> None:
+            self._snapshot, self._published_ns = snapshot, published_ns
+
+        def at(self, present_ns: int) -> Any:
+            asked.append((self._published_ns, present_ns))
+            return self._snapshot.at(present_ns)
+
+    def snapshot(present_ns: int | None = None) -> Any:
+        return Watched(take(present_ns), present_ns or 0)
+
+    deployment.updates.field.snapshot = snapshot  # type: ignore[method-assign, assignment]
+    deployment.settings = replace(settings, score_every_ms=None)
+    published = [p.published_ns for p in deployment.run(1.5)]
+    assert len(asked) == len(deployment.shown) > 5
+    for newest_ns, at_ns in asked:
+        assert newest_ns == max(p for p in published if p <= at_ns)
+    assert [s.published_ns for s in deployment.shown] == [at for _, at in asked]
+    again = run(scenario(), settings, 1.5)
+    assert [s.published_ns for s in again.shown] == [s.published_ns for s in deployment.shown]
+    assert all(s.psnr_moving_db is not None and s.psnr_still_db is not None for s in again.shown)
+    periods = {s.published_ns // 70_000_000 for s in again.shown}
+    assert len(periods) == len(again.shown), "one in each period"

@@ -1,0 +1,86 @@
+"""The scoring thread: what was shown when a held-out frame was taken, within its share of the machine."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fields import Rendering
+from edge_server.live import scoring_thread
+from edge_server.live.scoring_thread import ScoringThread
+from edge_server.live.state import Publication
+from freshfield import payload
+from freshfield.frame import Frame
+from freshfield.geometry import Pinhole, Pose
+
+LENS = Pinhole.from_fov(32, 32, 60.0)
+MS = 1_000_000
+
+
+class Brightness:
+    """A snapshot that renders its instant, in seconds, as a brightness."""
+
+    def __init__(self, at_ns: int) -> None:
+        self.at_ns = at_ns
+
+    def at(self, present_ns: int) -> Brightness:
+        return Brightness(present_ns)
+
+    def render(self, camera_to_world: Any, intrinsics: Pinhole) -> Rendering:
+        flat = np.ones((intrinsics.height, intrinsics.width), np.float32)
+        color = np.repeat(flat[..., None] * np.float32(self.at_ns / 1e9), 3, axis=-1)
+        return Rendering(color, flat, flat)
+
+    def points(self, count: int) -> Any:
+        raise NotImplementedError
+
+
+def _frame(sequence: int, at_ns: int) -> Frame:
+    image = np.full((32, 32, 3), round(255 * at_ns / 1e9), np.uint8)
+    pose = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return Frame("cam00", "s", sequence, at_ns, pose, LENS, "png", payload.encode(image, "png"))
+
+
+def _publication(number: int, at_ns: int) -> Publication:
+    return Publication(number, at_ns / 1e9, at_ns, None, ("cam01",), (1.0,), 1.0, 1.0)
+
+
+def _run(publications: list[int], frames: list[int]) -> list[tuple[Score, Publication]]:
+    """Scores of what was shown, of publications and held-out frames at given instants in ns."""
+    shown: list[tuple[Score, Publication]] = []
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))
+    events = [(at, 0, n) for n, at in enumerate(publications)] + [(at, 1, n) for n, at in enumerate(frames)]
+    thread.start()
+    for at_ns, kind, number in sorted(events):
+        if kind:
+            thread.held_out_frame(_frame(number, at_ns))
+        else:
+            thread.published(_publication(number, at_ns), Brightness(at_ns), [])
+        time.sleep(0.002)  # nothing may fall out of its short inbox
+    thread.stop()
+    return shown
+
+
+def test_the_newest_publication_is_shown_carried_on_to_the_capture() -> None:
+    shown = _run([100 * MS, 350 * MS, 600 * MS], [k * 10 * MS for k in range(90)])
+    assert len(shown) > 1
+    for score, publication in shown:
+        newest = max(at for at in (100 * MS, 350 * MS, 600 * MS) if at <= score.published_ns)
+        assert publication.published_ns == newest
+        # Rendered at the instant of the capture: equal but for the rounding to 8 bits.
+        assert score.psnr_db > 50.0 and score.truth_gap_ms == 0.0
+    gaps = np.diff([score.published_ns for score, _ in shown]) / MS
+    assert len(set(gaps.tolist())) == len(gaps), "random instants"
+
+
+def test_nothing_was_shown_before_the_first_publication() -> None:
+    assert _run([500 * MS], [k * 10 * MS for k in range(50)]) == []
+
+
+def test_scoring_stays_within_its_share_of_the_machine(monkeypatch: Any) -> None:
+    monkeypatch.setattr(scoring_thread, "_ALLOWANCE_S", 0.0)
+    monkeypatch.setattr(scoring_thread, "_SHARE", 0.0)
+    assert _run([100 * MS], [k * 10 * MS for k in range(60)]) == []
