@@ -72,7 +72,12 @@ class Camera:
     def schedule(self, start_ns: int) -> CaptureSchedule:
         """When it captures; a recording that is played once begins at ``start_ns``."""
         source = self.source
-        return source.schedule(start_ns) if isinstance(source, ScheduledSource) else RateSchedule(self.fps)
+        return source.schedule(start_ns) if isinstance(source, ScheduledSource) else self.rate_schedule
+
+    @property
+    def rate_schedule(self) -> RateSchedule:
+        """The ticks of its rate, at its phase."""
+        return RateSchedule(self.fps, self.source.phase_ns)
 
     def cached(self, tick: int) -> EncodedShot | None:
         """The tick's shot if it is in the cache."""

@@ -54,17 +54,18 @@ class _Endless:
 
 
 class RateSchedule(_Endless):
-    """Tick k is due at k / fps since the epoch."""
+    """Tick k is due ``phase_ns`` after k / fps since the epoch."""
 
-    def __init__(self, fps: Fraction) -> None:
+    def __init__(self, fps: Fraction, phase_ns: int = 0) -> None:
         self._rate = fps.numerator
         self._per_tick = fps.denominator * 1_000_000_000
+        self._phase_ns = phase_ns
 
     def due_ns(self, tick: int) -> int:
-        return tick * self._per_tick // self._rate
+        return tick * self._per_tick // self._rate + self._phase_ns
 
     def _latest(self, now_ns: int) -> int:
-        return now_ns * self._rate // self._per_tick
+        return (now_ns - self._phase_ns) * self._rate // self._per_tick
 
 
 class LoopSchedule(_Endless):

@@ -31,13 +31,17 @@ class Shot:
 
 
 class Source(ABC):
-    """One camera. Tick k is the instant k / fps since the epoch, so that cameras in different processes look
-    at the same world. contents: number of different shots before they repeat; None if they never do."""
+    """One camera. Tick k is the instant k / fps since the epoch, and phase_ns later, so that cameras in
+    different processes look at the same world.
+
+    contents: number of different shots before they repeat; None if they never do.
+    """
 
     camera: str
     fps: Fraction
     intrinsics: Pinhole
     contents: int | None = None
+    phase_ns: int = 0
 
     def content(self, tick: int) -> int:
         """Which shot a tick shows, 0 .. contents - 1; the tick itself where nothing repeats."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from camera_node.config import LiveConfig, McapConfig, RecordedConfig, SourceConfig, WorldConfig
 from camera_node.sources.base import Source
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Effects
@@ -31,6 +31,11 @@ def open_sources(
         from camera_node.synthetic.source import open_sources as open_world
 
         return open_world(scenario, config, cameras, data, effects)
+    if scenario.phase != "locked":
+        raise ScenarioError(
+            f"{scenario.path}: cameras.phase: {scenario.phase} needs source.kind world; other cameras "
+            "capture when they can"
+        )
     sources: dict[str, Source]
     if isinstance(config, RecordedConfig):
         from camera_node.sources.datasets.streamer import open_recorded

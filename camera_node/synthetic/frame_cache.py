@@ -48,7 +48,8 @@ def default_folder() -> Path:
 
 
 class FrameCache:
-    """The frames of one camera at one rate. Frame k shows the scene at k / fps. Safe for several threads.
+    """The frames of one camera at one rate. Frame k shows the scene phase_ns after k / fps. Safe for several
+    threads.
 
     fps: frames a second, kept as a fraction (29.97 is 2997/100). effects: from load_effects. codec, quality:
     of the encoded frames. folder: default_folder() if None. on_disk: False keeps frames in memory only.
@@ -69,10 +70,11 @@ class FrameCache:
         quality: int = 92,
         folder: Path | None = None,
         on_disk: bool = True,
+        phase_ns: int = 0,
     ) -> None:
         self.scene = effects.extend(scene)
         self.camera_id, self.codec, self.quality = camera_id, codec, quality
-        self.fps = Fraction(fps).limit_denominator(1001)
+        self.fps, self.phase_ns = Fraction(fps).limit_denominator(1001), phase_ns
         if self.fps <= 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.repeats_after = _repeats_after(self.scene, self.fps)
@@ -103,7 +105,7 @@ class FrameCache:
         """What the node sends: encoded bytes or, if effects act on each frame, an image (H, W, 3) to
         encode."""
         if self._effects.image:
-            return self._effects.apply(self.frame(content), content, float(content / self.fps))
+            return self._effects.apply(self.frame(content), content, self._time_s(content))
         return self.encoded(content)
 
     def frame(self, index: int) -> Image:
@@ -141,6 +143,7 @@ class FrameCache:
             "effects": [[name, dataclasses.asdict(p)] for name, p in self._effects.rendered],
             "codec": [self._stored_codec, self.quality if self._stored_codec == "jpeg" else None],
             "renderer": renderer_version(),
+            "phase_ns": self.phase_ns,
         }
         # ``count`` decides which cameras there are, not what one sees.
         what["params"].pop("count")
@@ -153,7 +156,10 @@ class FrameCache:
 
     def _render(self, frame: int) -> Image:
         view = self._effects.with_exposure(self.scene.renderer(self.camera_id))
-        return view.image(float(frame / self.fps))
+        return view.image(self._time_s(frame))
+
+    def _time_s(self, frame: int) -> float:
+        return float(frame / self.fps) + self.phase_ns / 1e9
 
     def _stored(self, index: int) -> bytes:
         frame = self._wrapped(index)

@@ -46,7 +46,7 @@ class WorldSource(Source):
         render_in_subprocess: Callable[[Stopped], None],
     ) -> None:
         self.camera = camera
-        self.fps = frames.fps
+        self.fps, self.phase_ns = frames.fps, frames.phase_ns
         lens, matrix = frames.scene.cameras[frames.camera_id]
         self.intrinsics = effects.reported_lens(lens)
         # Frames with equal images but different reported poses are different shots.
@@ -83,6 +83,8 @@ def open_sources(
 ) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``; ``data`` is not needed."""
     config = cast(WorldConfig, config)
+    if config.arm is not None and scenario.phase != "locked":
+        raise ScenarioError(f"{scenario.path}: cameras.phase: an arm's cameras are locked to its poses")
     frames = frame_caches(scenario, config, cameras, effects)
     carried: dict[str, Source] = {}
     if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
@@ -121,6 +123,7 @@ def frame_caches(
                 quality=config.quality,
                 # A training draws hundreds of motions, each used once.
                 on_disk=config.motion_seed is None,
+                phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
             )
             for camera in cameras
         }

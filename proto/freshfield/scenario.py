@@ -5,7 +5,7 @@ The file is YAML::
     name: room
     description: one line for people
     seed: 7
-    cameras: {count: 13, held_out: [cam00]}     # or ids: [a, b, c]
+    cameras: {count: 13, held_out: [cam00]}     # or ids: [a, b, c]; phase: spread
     source:  {...}     # camera_node.config reads this
     channel: {...}     # channel_emu.model.config
     edge:    {...}     # edge_server.config
@@ -31,6 +31,7 @@ import yaml
 from freshfield.frame import valid_id
 from freshfield.limits import MAX_CAMERAS
 
+PHASES = ("locked", "spread")
 T = TypeVar("T")
 _HERE = Path(__file__).resolve()
 _CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"
@@ -48,11 +49,14 @@ class Cameras:
 
     count: of cameras, named cam00, cam01, ...; ids: their names instead.
     held_out: those never trained on.
+    phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as the thesis's do;
+        ``spread``: each at its own seeded phase, as cameras without a common trigger do.
     """
 
     count: int = 0
     ids: list[str] = field(default_factory=list)
     held_out: list[str] = field(default_factory=list)
+    phase: str = "locked"
 
 
 @dataclass(frozen=True)
@@ -68,10 +72,15 @@ class Scenario:
     source: dict[str, Any] = field(default_factory=dict)
     channel: dict[str, Any] = field(default_factory=dict)
     edge: dict[str, Any] = field(default_factory=dict)
+    phase: str = "locked"
 
     @property
     def training(self) -> tuple[str, ...]:
         return tuple(c for c in self.cameras if c not in self.held_out)
+
+    def phase_ns(self, camera: str, fps: float) -> int:
+        """How much later than the ticks of its rate a camera captures (``cameras.phase``)."""
+        return 0 if self.phase == "locked" else int(self.rng("phase", camera).random() * 1e9 / fps)
 
     def rng(self, purpose: str, camera: str | None = None) -> np.random.Generator:
         """The random stream of a purpose and camera. Streams are independent: adding a camera does not change
@@ -132,6 +141,8 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
             raise ScenarioError(f"{file}: cameras.held_out: {name!r} is not one of the cameras")
     if len(set(found.held_out)) == len(ids):
         raise ScenarioError(f"{file}: cameras.held_out: every camera is held out, none is left to train on")
+    if found.phase not in PHASES:
+        raise ScenarioError(f"{file}: cameras.phase: expected {' or '.join(PHASES)}, got {found.phase!r}")
     number = data.get("seed", 0) if seed is None else seed
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**63:
         raise ScenarioError(f"{file}: seed: expected a whole number from 0 to 2^63 - 1, got {number!r}")
@@ -145,6 +156,7 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
         source=dict(data.get("source", {})),
         channel=dict(data.get("channel", {})),
         edge=dict(data.get("edge", {})),
+        phase=found.phase,
     )
 
 

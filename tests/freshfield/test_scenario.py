@@ -132,3 +132,13 @@ def test_every_shipped_scenario_loads():
         scenario = load(file)
         assert scenario.name == file.stem and scenario.description
         assert yaml.safe_load(file.read_text())["cameras"]
+
+
+def test_phases_of_cameras(tmp_path):
+    cameras = {"count": 3}
+    assert parse({"cameras": cameras}, tmp_path / "a.yaml").phase_ns("cam01", 15.0) == 0
+    spread = parse({"cameras": {**cameras, "phase": "spread"}, "seed": 1}, tmp_path / "a.yaml")
+    phases = [spread.phase_ns(camera, 15.0) for camera in spread.cameras]
+    assert len(set(phases)) == 3 and all(0 <= phase < 1e9 / 15 for phase in phases)
+    with pytest.raises(ScenarioError, match=r"cameras\.phase: expected locked or spread, got 'shifted'"):
+        parse({"cameras": {**cameras, "phase": "shifted"}}, tmp_path / "a.yaml")

@@ -163,6 +163,7 @@ class VirtualDeployment:
         self._admission = FrameAdmission(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
+        self._due = {name: camera.rate_schedule.due_ns for name, camera in self._cameras.items()}
         self._used: dict[str, tuple[Frame, ...]] = {}
         """The last two frames of each camera that have images."""
         self._scored_ns: int | None = None
@@ -243,10 +244,8 @@ class VirtualDeployment:
     # --- cameras and channel --------------------------------------------------------------------------
 
     def _due_ns(self, name: str) -> int:
-        """Instant of a camera's next capture: tick / fps, to the nanosecond."""
-        fps = self._cameras[name].fps
-        tick_ns = self._tick[name] * 10**9 * fps.denominator // fps.numerator
-        return self._origin_ns + tick_ns
+        """Instant of a camera's next capture."""
+        return self._origin_ns + self._due[name](self._tick[name])
 
     def _capture(self, name: str, now_ns: int) -> None:
         camera, tick = self._cameras[name], self._tick[name]

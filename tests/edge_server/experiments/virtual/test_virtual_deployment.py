@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from camera_node.config import source_config
 from camera_node.synthetic.effects import NAMES
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
-from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from freshfield import payload
 from freshfield.scenario import Scenario, parse
 from tests.conftest import data_dir
 from tests.edge_server.experiments.sets import SMALL, write_recording
@@ -270,3 +272,25 @@ def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants()
     assert all(s.psnr_moving_db is not None and s.psnr_still_db is not None for s in again.shown)
     periods = {s.published_ns // 70_000_000 for s in again.shown}
     assert len(periods) == len(again.shown), "one in each period"
+
+
+def test_spread_cameras_capture_at_their_own_seeded_instants() -> None:
+    spread = scenario(cameras={"count": 5, "held_out": ["cam00"], "phase": "spread"})
+    deployment = run(spread, seconds=0.6)
+    instants = {item.frame.camera: item.generated_ns for item in deployment.updates.buffer.newest().values()}
+    period_ns = 1e9 / 15
+    phases = {camera: at % period_ns for camera, at in instants.items()}
+    for camera, phase in phases.items():
+        assert abs(phase - spread.phase_ns(camera, 15.0)) < 2
+    assert len({round(phase / 1e5) for phase in phases.values()}) == len(phases) > 2
+    # A frame shows the world at the instant that it is stamped with.
+    for camera in training_cameras(spread):
+        scene, _ = exact_scene(spread, source_config(spread))  # type: ignore[arg-type]
+        shot = camera.capture(4)
+        shown = payload.decode(shot.payload, camera.codec, 32, 32)
+        due_s = camera.schedule(0).due_ns(4) / 1e9
+        off = [
+            np.abs(shown.astype(int) - scene.renderer(camera.name).image(t_s)).mean()
+            for t_s in (due_s, due_s - 0.1, due_s + 0.1)
+        ]
+        assert off[0] < min(off[1:])
