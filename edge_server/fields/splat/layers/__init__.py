@@ -1,1 +1,1 @@
-"""Fixed cameras in layers: plates, a static field that learns from them, and a moving set over them."""
+"""What moves before fixed cameras, apart from what stands still."""

@@ -1,1 +1,1 @@
-"""Numba kernels of the layers."""
+"""Kernels of the layers."""

@@ -1,0 +1,279 @@
+"""Motion of a set of Gaussians: displacements of anchors at knots in time, estimated from every view at the
+instant at which it was taken.
+
+A Gaussian lies at p + sum_a s_a D_a(t), for its three nearest anchors a with shares s_a. D(t) is a Catmull-Rom
+spline through the displacements X_k at knots 1 / KNOTS_PER_S apart, and a straight line past the last. The last
+FREE knots are solved for together by least squares, the FIXED ones before them are given:
+
+- a view at t with the normal matrix H and the gradient g of ``kernels.align``, taken where D(t) was D_0, says
+  H D(t) = H D_0 + g;
+- an acceleration persists: X_k = X_k-1 + v + PERSISTENCE a, v and a the last differences, with a deviation of
+  ACCELERATION_M_PER_S2 dt^2;
+- neighboring anchors move alike: their X_k - X_k-1 differ by NEIGHBOR_M_PER_S dt.
+
+A late view needs no special case: it bears on older knots. The inverse of the same matrix is the covariance.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+KNOTS_PER_S = 15
+FREE, FIXED = 10, 3  # knots solved for, and older ones before them
+WINDOW = FREE + FIXED
+PERSISTENCE = 0.9  # of the acceleration, from knot to knot
+ACCELERATION_M_PER_S2 = 5.0
+NEIGHBORS, NEIGHBOR_M_PER_S = 4, 2.0
+ATTACHED = 3  # anchors of a Gaussian
+ROUNDS = 3  # of k-means
+LEAST_REACH = 1e-2  # scene units
+# x(k) = x(k-1) + v + r a as differences[0] x(k-3) + ... + differences[3] x(k) = 0
+DIFFERENCES = np.array([-PERSISTENCE, 1.0 + 2.0 * PERSISTENCE, -2.0 - PERSISTENCE, 1.0])
+
+
+class ViewRow(NamedTuple):
+    """What one view says of the displacements of the K anchors at its instant.
+
+    instant_s: when it was taken, seconds.
+    matrix: float64 (3K, 3K), normal matrix; the order is anchor by anchor, x y z.
+    vector: float64 (3K,), right side: the step from ``around`` is the solution of matrix step = vector.
+    around: float64 (3K,), displacements at which both were taken.
+    """
+
+    instant_s: float
+    matrix: NDArray[np.float64]
+    vector: NDArray[np.float64]
+    around: NDArray[np.float64]
+
+
+class Motion:
+    """Anchors and their displacements.
+
+    radius_m: meters of a scene unit.
+    rng: generator for the choice of anchors.
+    anchors: float64 (K, 3), scene units, places at which the displacement is 0; None: not chosen yet.
+    """
+
+    def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
+        self.radius_m, self.rng = radius_m, rng
+        self.anchors: NDArray[np.float64] | None = None
+        self._knots = np.zeros((WINDOW, 0, 3))  # displacements
+        self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
+        self._reach = 0.3  # typical distance from an anchor to the next
+        self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
+        self._precision = np.zeros((0, 0))  # (FREE * 3K, FREE * 3K), of the last solution
+
+    @property
+    def oldest_s(self) -> float:
+        """Views before this instant do not bear on free knots."""
+        return (self._first + FIXED - 1) / KNOTS_PER_S
+
+    @property
+    def newest_s(self) -> float:
+        """Views after this instant are too far ahead of the knots: ``slide`` first."""
+        return (self._first + WINDOW) / KNOTS_PER_S
+
+    def weights(self, instant_s: float) -> tuple[int, NDArray[np.float64]]:
+        """The displacement at an instant is a sum of four knots times weights, float64 (4,); returns the first of
+        the four, counted within the window, and the weights."""
+        last, x = WINDOW - 1, max(instant_s * KNOTS_PER_S - self._first, 0.0)
+        i = min(int(x), last)
+        f = x - i
+        base = min(max(i - 1, 0), WINDOW - 4)
+        if i == last:
+            return base, np.array([0.0, 0.0, -f, 1.0 + f])
+        # Catmull-Rom; the neighbor that is missing at an end lies on the line through the two next to it.
+        w = np.array([-f + 2 * f**2 - f**3, 2 - 5 * f**2 + 3 * f**3, f + 4 * f**2 - 3 * f**3, f**3 - f**2]) / 2
+        if i == 0:
+            w = np.array([w[1] + 2 * w[0], w[2] - w[0], w[3], 0.0])
+        elif i == last - 1:
+            w = np.array([0.0, w[0], w[1] - w[3], w[2] + 2 * w[3]])
+        return base, w
+
+    def at(self, instant_s: float) -> NDArray[np.float64]:
+        """Displacements (K, 3) of the anchors at an instant, scene units."""
+        base, w = self.weights(instant_s)
+        return np.einsum("k,kac->ac", w, self._knots[base : base + 4])
+
+    def attach(
+        self, points: NDArray[np.floating], instant_s: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The three nearest anchors of points (N, 3) at an instant, int64 (N, 3), and their shares, float32
+        (N, 3), 1 / (distance^2 + (reach / 4)^2) normalized. With fewer anchors the rest have share 0."""
+        assert self.anchors is not None
+        d2 = _square_distances(points, self.anchors + self.at(instant_s))
+        nearest = np.argsort(d2, axis=1, kind="stable")[:, :ATTACHED]
+        share = 1.0 / (np.take_along_axis(d2, nearest, axis=1) + (self._reach / 4) ** 2)
+        share /= share.sum(axis=1, keepdims=True)
+        missing = ((0, 0), (0, ATTACHED - nearest.shape[1]))
+        return np.pad(nearest, missing), np.pad(share, missing).astype(np.float32)
+
+    def displaced(
+        self, points: NDArray[np.float32], anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
+    ) -> NDArray[np.float32]:
+        """Places (N, 3) of points (N, 3) at an instant. anchor, share: see ``attach``."""
+        moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32)[anchor])
+        return (points + moved).astype(np.float32)
+
+    def choose_anchors(
+        self, points: NDArray[np.floating], opacity: NDArray[np.floating], count: int, instant_s: float
+    ) -> None:
+        """Choose anchors anew: k-means of points, begun at points that are far from each other.
+
+        points: (N, 3), places at the instant, at which the new anchors have displacement 0; their displacements
+            at other instants are carried over from the anchors before.
+        opacity: (N,), in [0, 1]: faint points do not begin a cluster.
+        count: how many; at most N are chosen. ValueError: no point is finite.
+        """
+        sound = np.isfinite(points).all(axis=1)
+        if not sound.any() or count < 1:
+            raise ValueError("anchors need at least one point, and one of them")
+        found = _cluster(points[sound].astype(np.float64), opacity[sound], count, self.rng)
+        if self.anchors is None:
+            self._knots = np.zeros((WINDOW, len(found), 3))
+            self._first = int(np.floor(instant_s * KNOTS_PER_S)) + 2 - WINDOW
+        else:
+            now = self.at(instant_s)
+            near = 1.0 / (_square_distances(found, self.anchors + now) + (self._reach / 4) ** 2) ** 2
+            near /= near.sum(axis=1, keepdims=True)
+            self._knots = np.einsum("ij,tjc->tic", near, self._knots - now)
+        self.anchors = found
+        self._link()
+
+    def _link(self) -> None:
+        """Find what depends on the anchors' places: their neighbors and how far these are."""
+        assert self.anchors is not None
+        count = len(self.anchors)
+        d2 = _square_distances(self.anchors, self.anchors)
+        np.fill_diagonal(d2, np.inf)
+        self._reach = max(float(np.sqrt(np.median(d2.min(axis=1)))), LEAST_REACH) if count > 1 else 0.3
+        near = np.argsort(d2, axis=1, kind="stable")[:, : min(NEIGHBORS, count - 1)]
+        joined = np.zeros((count, count), np.bool_)
+        np.put_along_axis(joined, near, True, axis=1)
+        joined |= joined.T
+        self._laplacian = np.diag(joined.sum(axis=1)) - joined.astype(np.float64)
+        self._precision = np.zeros((0, 0))
+
+    def slide(self, instant_s: float) -> None:
+        """Move the window on until its last knot is the one after an instant. New knots are predicted; after a
+        pause longer than the window, what moved is taken to have stopped. An earlier instant changes nothing."""
+        ahead = int(np.floor(instant_s * KNOTS_PER_S)) + 2 - WINDOW - self._first
+        for _ in range(min(ahead, FREE)):
+            x = self._knots
+            self._knots = np.concatenate([x[1:], -np.einsum("k,kac->ac", DIFFERENCES[:3], x[-3:])[None]])
+        for _ in range(min(ahead - FREE, WINDOW)):
+            self._knots = np.concatenate([self._knots[1:], self._knots[-1:]])
+        self._first += max(ahead, 0)
+
+    def solve(self, rows: Sequence[ViewRow]) -> int:
+        """Estimate the free knots from views. Returns how many views were left out: of instants that do not bear
+        on free knots, and with numbers that are not finite."""
+        assert self.anchors is not None
+        n, left_out = 3 * len(self.anchors), 0
+        a, b = np.zeros((WINDOW, WINDOW, n, n)), np.zeros((WINDOW, n))
+        for row in rows:
+            finite = np.isfinite(row.matrix).all() and np.isfinite(row.vector).all() and np.isfinite(row.around).all()
+            if not (finite and self.oldest_s <= row.instant_s <= self.newest_s):
+                left_out += 1
+                continue
+            base, w = self.weights(row.instant_s)
+            right = row.vector + np.einsum("ij,j->i", row.matrix, row.around)
+            for i in range(4):
+                b[base + i] += w[i] * right
+                for j in range(4):
+                    a[base + i, base + j] += w[i] * w[j] * row.matrix
+        steady, alike = self._prior_weights()
+        for k in range(3, WINDOW):
+            for i in range(4):
+                for j in range(4):
+                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
+        laplacian = alike * np.kron(self._laplacian, np.eye(3))
+        for k in range(1, WINDOW):
+            a[k, k] += laplacian
+            a[k - 1, k - 1] += laplacian
+            a[k, k - 1] -= laplacian
+            a[k - 1, k] -= laplacian
+        size, given = FREE * n, FIXED * n
+        right = b[FIXED:].ravel() - a[FIXED:, :FIXED].transpose(0, 2, 1, 3).reshape(size, given) @ (
+            self._knots[:FIXED].ravel())
+        self._precision = a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(size, size)
+        self._knots[FIXED:] = np.linalg.solve(self._precision, right).reshape(FREE, -1, 3)
+        return left_out
+
+    def _prior_weights(self) -> tuple[float, float]:
+        """1 / variance of the persistence of acceleration, and of neighbors moving alike, in scene units."""
+        dt = 1.0 / KNOTS_PER_S
+        steady, alike = ACCELERATION_M_PER_S2 * dt**2, NEIGHBOR_M_PER_S * dt
+        return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
+
+    def deviation(
+        self, anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
+    ) -> NDArray[np.float32]:
+        """Standard deviation (N,) of places at an instant, scene units, the root of the mean over three axes, from
+        the covariance of the last solution. It grows past the last view. anchor, share: see ``attach``."""
+        assert self.anchors is not None
+        count = len(self.anchors)
+        base, w = self.weights(instant_s)
+        knots = np.zeros(WINDOW)
+        knots[base : base + 4] = w
+        by = np.kron(knots[FIXED:], np.eye(3 * count))
+        covariance = by @ np.linalg.solve(self._precision, by.T)
+        traces = np.einsum("aibi->ab", covariance.reshape(count, 3, count, 3)) / 3.0
+        pairs = traces[anchor[:, :, None], anchor[:, None, :]]
+        return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
+
+    def copy(self) -> Motion:
+        """One that stays as it is when this one is solved again."""
+        other = copy(self)
+        other._knots = self._knots.copy()
+        return other
+
+    def state(self) -> dict[str, NDArray]:
+        """All of it as plain arrays. Without anchors there are none."""
+        if self.anchors is None:
+            return {}
+        return {
+            "anchors": self.anchors.copy(), "knots": self._knots.copy(), "first": np.array(self._first),
+            "precision": self._precision.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+        }  # fmt: skip
+
+    def load_state(self, state: dict[str, NDArray]) -> None:
+        """Continue from ``state``, bit for bit."""
+        if not state:
+            self.__init__(self.radius_m, self.rng)
+            return
+        self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
+        self._first = int(state["first"])
+        self._link()
+        self._precision = np.array(state["precision"])
+        self.rng.bit_generator.state = json.loads(str(state["rng"]))
+
+
+def _cluster(
+    points: NDArray[np.float64], opacity: NDArray[np.floating], count: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Centers (at most ``count``, 3) of clusters of points (N, 3)."""
+    count = min(count, len(points))
+    centers = [points[rng.integers(len(points))]]
+    d2 = np.full(len(points), np.inf)
+    for _ in range(count - 1):
+        d2 = np.minimum(d2, ((points - centers[-1]) ** 2).sum(axis=1))
+        centers.append(points[np.argmax(d2 * np.minimum(opacity, 0.5))])
+    found = np.array(centers)
+    for _ in range(ROUNDS):
+        nearest = _square_distances(points, found).argmin(axis=1)
+        size = np.bincount(nearest, minlength=count)
+        total = np.stack([np.bincount(nearest, points[:, c], count) for c in range(3)], axis=-1)
+        found = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], found)
+    return found
+
+
+def _square_distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(N, M), of points (N, 3) and (M, 3)."""
+    return ((a[:, None].astype(np.float64) - b[None]) ** 2).sum(axis=-1)
