@@ -7,9 +7,9 @@ Nothing that moves is written into the static field.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
+from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.motion import KNOTS_PER_S
 from edge_server.fields.splat.layers.moving_set import LEAST_FOREGROUND, MovingSet
 from edge_server.fields.splat.layers.observations import (
@@ -41,7 +42,7 @@ from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
 
-PLATE_FRAMES, PLATE_S = 8, 2.7  # of each camera, and since the first frame, before plates are learned
+PLATE_FRAMES, PLATE_S = 8, 3.2  # of each camera, and since the first frame, before plates are learned
 SHOWN_AFTER = 400  # steps of the static field, after which it replaces the first field
 EVIDENCE_S = 0.8  # age up to which frames tell of motion
 
@@ -79,9 +80,10 @@ class LayeredField:
         self.observations = Observations()
         self.moving: MovingSet | None = None
         self.layered = True  # False: a camera moved
-        self._origin_ns: int | None = None
-        self._fits = 0  # since the static field began to learn
-        self._anchors_s = self._plates_s = -np.inf  # when these were last chosen and compared
+        self.shown = False  # whether the layers are shown, and no longer the first field
+        self.origin_ns: int | None = None
+        self.fits = 0  # since the static field began to learn
+        self.anchors_s = self.plates_s = -np.inf  # when these were last chosen and compared
         self._step_time = StepTimer()
         self._published: LayeredSnapshot | None = None
 
@@ -92,15 +94,15 @@ class LayeredField:
         start = self.now()
         for view in views:
             check_view(view)
-        self.layered = self.layered and all(self._stands_still(view) for view in views)
+        if self.layered and not all(self._stands_still(view) for view in views):
+            self._give_up_layers()
         if not self.layered:
-            self._published = None
-            return self.first.fit(views, budget)
+            return self.first.fit(_newest_of_each(views), budget)
         pace = StepBudget(budget, self.now)
         arrivals = self._take_in(views)
         if self.static.step == 0 and not self._plates_are_known():
             return self.first.fit(_newest_of_each(views), _remaining(budget, self.now() - start))
-        self._fits += 1
+        self.fits += 1
         self._learn_plates()
         rays, samples = self._follow_motion(pace) if len(self.observations) else (0, 0)
         begun = self.now()
@@ -124,6 +126,41 @@ class LayeredField:
         published = self._published
         return self.first.snapshot(present_ns) if published is None else published.at(present_ns)
 
+    def warm_up(self) -> float:
+        """Compile every kernel, or load it from numba's cache; returns the seconds taken."""
+        return self.first.warm_up() + compile_ahead(self._run_kernels)
+
+    def _run_kernels(self, pool: Pool) -> None:
+        """Run every kernel of the layers once, in a small field of its own."""
+        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
+        pose[2, 3] = -3.0
+        field = LayeredField(tiny, pool)
+        views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
+        field._take_in(views)
+        field._learn_plates()
+        assert field.moving is not None
+        field.moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Everything needed to resume bit for bit."""
+        return pack(self)
+
+    def load_state(self, state: Arrays) -> None:
+        """Resume from ``state``. ValueError: it is not a state of a field of this shape."""
+        with all_or_nothing(self):
+            unpack(self, state)
+
+    def finish_loading(self) -> None:
+        """What follows from the loaded parts."""
+        self._published = None
+        if self.moving is not None:
+            self._find_rows()
+        if self.shown and self.layered:
+            self._publish()
+
     # --- intake -------------------------------------------------------------------------------
 
     def _stands_still(self, view: View) -> bool:
@@ -135,11 +172,18 @@ class LayeredField:
                 and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3))
         )  # fmt: skip
 
+    def _give_up_layers(self) -> None:
+        """Go on with the first field, until ``reset``."""
+        self.layered = self.shown = False
+        self._published, self.moving, self.observations = None, None, Observations()
+        self.cameras = {}
+        self.static.reset()
+
     def _take_in(self, views: Sequence[View]) -> int:
         """Plates and foregrounds of the views not seen before. Returns how many there are."""
         begun, arrivals = self.now(), 0
-        if self._origin_ns is None:
-            self._origin_ns = min(view.shows_ns for view in views)
+        if self.origin_ns is None:
+            self.origin_ns = min(view.shows_ns for view in views)
         for view in sorted(views, key=lambda v: v.generated_ns):
             if view.camera not in self.cameras:
                 plate = Plate(*view.image.shape[:2], self.pool)
@@ -150,15 +194,14 @@ class LayeredField:
             camera.taken.append(view.generated_ns)
             arrivals += 1
             foreground = camera.plate.take(view.image)
-            self.observations.add(Observation(self._seconds(view.shows_ns), view.camera, view, foreground))
+            self.observations.add(Observation(
+                (view.shows_ns - self.origin_ns) / 1e9, view.camera,
+                replace(view, camera_to_world=camera.view.camera_to_world), foreground,
+            ))  # fmt: skip
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
         self._spent("plates", begun)
         return arrivals
-
-    def _seconds(self, instant_ns: int) -> float:
-        assert self._origin_ns is not None
-        return (instant_ns - self._origin_ns) / 1e9
 
     def _plates_are_known(self) -> bool:
         return (
@@ -175,15 +218,18 @@ class LayeredField:
         if self.moving is None:
             self.static.learn(self.cameras)
             self.moving = MovingSet(self.settings, self.pool, self._box(), self.settings.seed)
-            self._plates_s = self._anchors_s = now_s
-        elif self.static.finished and now_s - self._plates_s >= PLATES_EVERY_S:
+            self.plates_s = self.anchors_s = now_s
+        elif self.static.finished and now_s - self.plates_s >= PLATES_EVERY_S:
             self.static.learn_again(self.cameras)
-            self._plates_s = now_s
+            self.plates_s = now_s
+        self._find_rows()
+        self._spent("static field", begun)
+
+    def _find_rows(self) -> None:
         for camera in self.cameras.values():
             if camera.row is None:
                 view = camera.view
                 camera.row = camera_rows([view.camera_to_world], [view.intrinsics], self._box())
-        self._spent("static field", begun)
 
     def _render_static(self, all_cameras: bool) -> None:
         """Depth and color of the static field for its cameras: one a fit, in turn, or all."""
@@ -193,7 +239,7 @@ class LayeredField:
         static = replace(
             self._published, gaussians=_as_gaussians(self.static.shown_params(), self.settings), moving=None
         )
-        for name in names if all_cameras else [names[self._fits % len(names)]]:
+        for name in names if all_cameras else [names[self.fits % len(names)]]:
             camera = self.cameras[name]
             rendered = static.render(camera.view.camera_to_world, camera.view.intrinsics)
             camera.depth_m = rendered.depth
@@ -218,7 +264,7 @@ class LayeredField:
         if moving.motion.anchors is not None:
             moving.motion.slide(newest_s + 1.0 / KNOTS_PER_S)
         if moving.alive:
-            if newest_s - self._anchors_s >= ANCHORS_EVERY_S:
+            if newest_s - self.anchors_s >= ANCHORS_EVERY_S:
                 self._renew_anchors(newest_s)
             for _ in range(PASSES):
                 self._solve()
@@ -226,7 +272,7 @@ class LayeredField:
                 o.fresh = False
             self._publish()
             rays, samples = self._train_appearance(pace)
-        if self._fits % BIRTHS_EVERY == 0 or not moving.alive:
+        if self.fits % BIRTHS_EVERY == 0 or not moving.alive:
             begun = self.now()
             self._births()
             self._spent("births", begun)
@@ -269,7 +315,7 @@ class LayeredField:
         assert moving is not None
         newest = self.observations.newest_knot
         frames = self.observations.of_knots(newest - 1, newest)
-        order = np.random.default_rng([self.settings.seed, self._fits, 7]).permutation(len(frames))
+        order = np.random.default_rng([self.settings.seed, self.fits, 7]).permutation(len(frames))
         parameters = self.static.moving_parameters(STEP_PROGRESS)
         begun, rays, samples = self.now(), 0, 0
         for step in range(STEPS):
@@ -304,7 +350,7 @@ class LayeredField:
     def _renew_anchors(self, instant_s: float) -> None:
         assert self.moving is not None
         self.moving.renew_anchors(instant_s)
-        self._anchors_s = instant_s
+        self.anchors_s = instant_s
         for o in self.observations:
             o.row = None
 
@@ -314,19 +360,20 @@ class LayeredField:
         """Show the layers as they are now, once the static field is better than the first one."""
         if self.static.step < SHOWN_AFTER:
             return
-        begun, begins = self.now(), self._published is None
+        begun, begins = self.now(), not self.shown
         if begins:
             self.first.reset()
+            self.shown = True
         live, moving = self.static._live(), self.moving
-        assert moving is not None and self._origin_ns is not None
+        assert moving is not None and self.origin_ns is not None
         params = self.static.shown_params()
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0)
         params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3).astype(np.float32)
         shown = None
         if moving.alive:
             shown = MovingSnapshot(
-                moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), moving.motion.copy(),
-                self._origin_ns, self.observations.newest_s,
+                moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), deepcopy(moving.motion),
+                self.origin_ns, self.observations.newest_s,
             )  # fmt: skip
         self._published = LayeredSnapshot(
             live.box, _as_gaussians(params, self.settings), live.background, live.cameras, live.pool,

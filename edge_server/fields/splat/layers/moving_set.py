@@ -102,15 +102,41 @@ class MovingSet:
         instant_s = observation.instant_s
         gaussians = self.gaussians(instant_s)
         self.raster.project_and_bin(camera.row, gaussians, [None], differentiate=False)
-        m, v, shown, opacity = align_view(self.raster, camera.row[0], gaussians.params[:, :3], observation.view.image, camera.plate.picture, observation.weight, self.anchor, self.share, len(self.motion.anchors))
+        m, v, shown, opacity = align_view(
+            self.raster,
+            camera.row[0],
+            gaussians.params[:, :3],
+            observation.view.image,
+            camera.plate.picture,
+            observation.weight,
+            self.anchor,
+            self.share,
+            len(self.motion.anchors),
+        )
         observation.row = ViewRow(instant_s, m, v, self.motion.at(instant_s).ravel())
         observation.shown = shown
         return opacity
 
+    def run_kernels(self, camera: FixedCamera, observation: Observation) -> None:
+        """Run every kernel once, whatever comes of it."""
+        params = np.zeros((LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
+        self.cloud = GaussianCloud.new(params)
+        self.renew_anchors(observation.instant_s)
+        observation.weight = np.ones(observation.foreground.shape, np.float32)
+        self.align(observation, camera)
+        rates = np.zeros(params.shape[1], np.float32)
+        one = np.float32(1.0)
+        self.train(
+            observation,
+            camera,
+            AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one),
+        )
+        self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
+
     # --- appearance ---------------------------------------------------------------------------
 
     def train(self, observation: Observation, camera: FixedCamera, parameters: AdamParameters) -> int:
-        """One optimizer step on one frame, over the camera's plate. Returns pairs of a Gaussian and a tile."""
+        """One optimizer step on one frame, over the camera's plate. Returns pairs of Gaussian and tile."""
         assert camera.row is not None and observation.weight is not None
         raster, cloud = self.raster, self.cloud
         gaussians = self.gaussians(observation.instant_s)
@@ -214,7 +240,9 @@ class MovingSet:
         square = np.ones((margin_px, margin_px), np.uint8)
         for points, o in zip(places, frames, strict=True):
             mask = cv2.dilate(o.foreground.astype(np.uint8), square)
-            self.pool.run(count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside)
+            self.pool.run(
+                count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside
+            )
         return inside / np.maximum(seen, 1)
 
     # --- state --------------------------------------------------------------------------------

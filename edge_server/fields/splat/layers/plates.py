@@ -89,7 +89,9 @@ class Plate:
         self.count += 1
         return foreground > 0
 
-    def hold(self, image: NDArray[np.uint8], shown: NDArray[np.float32], opacity: NDArray[np.float32]) -> None:
+    def hold(
+        self, image: NDArray[np.uint8], shown: NDArray[np.float32], opacity: NDArray[np.float32]
+    ) -> None:
         """Keep out of the plate, until the next call, what the moving set explains.
 
         image: uint8 (H, W, 3), the camera's newest frame.
@@ -131,7 +133,10 @@ class Plate:
         self.pool.run(count_exposure, image, self.arrays, counts)
         used = counts[:, 0]
         # The median is beyond a bound if more than half of the ratios are.
-        if used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4 or (2 * counts[:, 1:] <= used[:, None]).all():
+        if (
+            used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4
+            or (2 * counts[:, 1:] <= used[:, None]).all()
+        ):
             return
         plate = self.arrays.means[::2, ::2, 0]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)

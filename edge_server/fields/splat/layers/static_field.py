@@ -1,4 +1,4 @@
-"""The static field: Gaussians that learn from plates alone, in one schedule, and again where plates change."""
+"""The static field: Gaussians that learn from plates alone, in one schedule, again where plates change."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ class StaticField(SplatField):
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool | None = None) -> None:
-        super().__init__(replace(settings, refuse_beyond=0.0, follow=0, age_tau_ms=0.0, mask_stale_ms=0.0), pool)
+        super().__init__(
+            replace(settings, refuse_beyond=0.0, follow=0, age_tau_ms=0.0, mask_stale_ms=0.0), pool
+        )
 
     def reset(self) -> None:
         """Forget everything, the schedule included."""
@@ -145,6 +147,13 @@ class StaticField(SplatField):
         while (key := f"learned_{len(self._learned)}") + ".camera" in state:
             camera = str(state[f"{key}.camera"])
             self._learned[camera] = (np.array(state[f"{key}.plate"]), np.array(state[f"{key}.known"]))
+        with self._lock:
+            views = [
+                replace(v, weight=self._learned[v.camera][1].astype(np.float32))
+                for v in self.view_store.views
+            ]
+            if views:
+                self._ingest(views)
 
     # --- inside -------------------------------------------------------------------------------
 
