@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -372,7 +371,7 @@ class LayeredField:
         shown = None
         if moving.alive:
             shown = MovingSnapshot(
-                moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), deepcopy(moving.motion),
+                moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), moving.motion.copy(),
                 self.origin_ns, self.observations.newest_s,
             )  # fmt: skip
         self._published = LayeredSnapshot(

@@ -16,9 +16,9 @@ A late view needs no special case: it bears on older knots. The inverse of the s
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Sequence
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +89,10 @@ class Motion:
         if i == last:
             return base, np.array([0.0, 0.0, -f, 1.0 + f])
         # Catmull-Rom; the neighbor that is missing at an end lies on the line through the two next to it.
-        w = np.array([-f + 2 * f**2 - f**3, 2 - 5 * f**2 + 3 * f**3, f + 4 * f**2 - 3 * f**3, f**3 - f**2]) / 2
+        w = (
+            np.array([-f + 2 * f**2 - f**3, 2 - 5 * f**2 + 3 * f**3, f + 4 * f**2 - 3 * f**3, f**3 - f**2])
+            / 2
+        )
         if i == 0:
             w = np.array([w[1] + 2 * w[0], w[2] - w[0], w[3], 0.0])
         elif i == last - 1:
@@ -115,7 +118,11 @@ class Motion:
         return np.pad(nearest, missing), np.pad(share, missing).astype(np.float32)
 
     def displaced(
-        self, points: NDArray[np.float32], anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
+        self,
+        points: NDArray[np.float32],
+        anchor: NDArray[np.int64],
+        share: NDArray[np.float32],
+        instant_s: float,
     ) -> NDArray[np.float32]:
         """Places (N, 3) of points (N, 3) at an instant. anchor, share: see ``attach``."""
         moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32)[anchor])
@@ -178,7 +185,11 @@ class Motion:
         n, left_out = 3 * len(self.anchors), 0
         a, b = np.zeros((WINDOW, WINDOW, n, n)), np.zeros((WINDOW, n))
         for row in rows:
-            finite = np.isfinite(row.matrix).all() and np.isfinite(row.vector).all() and np.isfinite(row.around).all()
+            finite = (
+                np.isfinite(row.matrix).all()
+                and np.isfinite(row.vector).all()
+                and np.isfinite(row.around).all()
+            )
             if not (finite and self.oldest_s <= row.instant_s <= self.newest_s):
                 left_out += 1
                 continue
@@ -201,9 +212,11 @@ class Motion:
             a[k - 1, k] -= laplacian
         size, given = FREE * n, FIXED * n
         right = b[FIXED:].ravel() - a[FIXED:, :FIXED].transpose(0, 2, 1, 3).reshape(size, given) @ (
-            self._knots[:FIXED].ravel())
+            self._knots[:FIXED].ravel()
+        )
         self._precision = a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(size, size)
-        self._knots[FIXED:] = np.linalg.solve(self._precision, right).reshape(FREE, -1, 3)
+        solved = np.linalg.solve(self._precision, right).reshape(FREE, -1, 3)
+        self._knots = np.concatenate([self._knots[:FIXED], solved])
         return left_out
 
     def _prior_weights(self) -> tuple[float, float]:
@@ -229,10 +242,8 @@ class Motion:
         return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
 
     def copy(self) -> Motion:
-        """One that stays as it is when this one is solved again."""
-        other = copy(self)
-        other._knots = self._knots.copy()
-        return other
+        """A copy that later changes of this one do not reach."""
+        return copy.copy(self)  # arrays are replaced as a whole, never written into
 
     def state(self) -> dict[str, NDArray]:
         """All of it as plain arrays. Without anchors there are none."""
