@@ -183,7 +183,7 @@ class LayeredField:
         begun, arrivals = self.now(), 0
         if self.origin_ns is None:
             self.origin_ns = min(view.shows_ns for view in views)
-        for view in sorted(views, key=lambda v: v.generated_ns):
+        for view in sorted(views, key=lambda v: (v.generated_ns, v.camera)):
             if view.camera not in self.cameras:
                 plate = Plate(*view.image.shape[:2], self.pool)
                 self.cameras[view.camera] = FixedCamera(view, plate)
