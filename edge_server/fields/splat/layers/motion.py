@@ -24,6 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
+
 KNOTS_PER_S = 15
 FREE, FIXED = 10, 3  # knots solved for, and older ones before them
 WINDOW = FREE + FIXED
@@ -52,6 +55,16 @@ class ViewRow(NamedTuple):
     around: NDArray[np.float64]
 
 
+class _Span(NamedTuple):
+    """Views between the same two knots, and their sums, see ``kernels.solve.add_row``."""
+
+    key: tuple[int, int]
+    rows: list[ViewRow]
+    base: int  # the first of the four knots that they bear on, within the window
+    blocks: NDArray[np.float32]
+    right: NDArray[np.float64]
+
+
 class Motion:
     """Anchors and their displacements.
 
@@ -67,7 +80,9 @@ class Motion:
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
         self._reach = 0.3  # typical distance from an anchor to the next
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
-        self._precision = np.zeros((0, 0))  # (FREE * 3K, FREE * 3K), of the last solution
+        self._band = np.zeros((0, BAND, 0, 0), np.float32)  # see ``kernels.solve``, of the last solution
+        self._spans: list[_Span] = []
+        self._pool = CallerPool()
 
     @property
     def oldest_s(self) -> float:
@@ -165,7 +180,8 @@ class Motion:
         np.put_along_axis(joined, near, True, axis=1)
         joined |= joined.T
         self._laplacian = np.diag(joined.sum(axis=1)) - joined.astype(np.float64)
-        self._precision = np.zeros((0, 0))
+        self._spans = []
+        self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
 
     def slide(self, instant_s: float) -> None:
         """Move the window on until its last knot is the one after an instant. New knots are predicted; after a
@@ -179,45 +195,57 @@ class Motion:
         self._first += max(ahead, 0)
 
     def solve(self, rows: Sequence[ViewRow]) -> int:
-        """Estimate the free knots from views. Returns how many views were left out: of instants that do not bear
-        on free knots, and with numbers that are not finite."""
+        """Estimate the free knots from views, beginning at the last solution. Returns how many views were left
+        out: of instants that do not bear on free knots, and with numbers that are not finite."""
         assert self.anchors is not None
-        n, left_out = 3 * len(self.anchors), 0
-        a, b = np.zeros((WINDOW, WINDOW, n, n)), np.zeros((WINDOW, n))
-        for row in rows:
-            finite = (
-                np.isfinite(row.matrix).all()
-                and np.isfinite(row.vector).all()
-                and np.isfinite(row.around).all()
-            )
-            if not (finite and self.oldest_s <= row.instant_s <= self.newest_s):
-                left_out += 1
-                continue
-            base, w = self.weights(row.instant_s)
-            right = row.vector + np.einsum("ij,j->i", row.matrix, row.around)
-            for i in range(4):
-                b[base + i] += w[i] * right
-                for j in range(4):
-                    a[base + i, base + j] += w[i] * w[j] * row.matrix
+        count = len(self.anchors)
+        spans = self._sums(rows)
+        self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
+        right = np.zeros((WINDOW, 3 * count))
+        for span in spans:
+            self._pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
+        knots = np.ascontiguousarray(self._knots.transpose(0, 2, 1)).reshape(WINDOW, -1)
         steady, alike = self._prior_weights()
-        for k in range(3, WINDOW):
-            for i in range(4):
-                for j in range(4):
-                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
-        laplacian = alike * np.kron(self._laplacian, np.eye(3))
-        for k in range(1, WINDOW):
-            a[k, k] += laplacian
-            a[k - 1, k - 1] += laplacian
-            a[k, k - 1] -= laplacian
-            a[k - 1, k] -= laplacian
-        size, given = FREE * n, FIXED * n
-        right = b[FIXED:].ravel() - a[FIXED:, :FIXED].transpose(0, 2, 1, 3).reshape(size, given) @ (
-            self._knots[:FIXED].ravel()
+        iterations = np.zeros(1, np.int64)
+        self._pool.run(
+            solve_knots,
+            self._band,
+            right,
+            knots,
+            FIXED,
+            DIFFERENCES,
+            steady,
+            alike,
+            self._laplacian,
+            iterations,
         )
-        self._precision = a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(size, size)
-        solved = np.linalg.solve(self._precision, right).reshape(FREE, -1, 3)
-        self._knots = np.concatenate([self._knots[:FIXED], solved])
-        return left_out
+        self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
+        return len(rows) - sum(len(span.rows) for span in spans)
+
+    def _sums(self, rows: Sequence[ViewRow]) -> list[_Span]:
+        """Sums of the views that can be used, for each span of time between two knots. Those of spans whose views
+        are the same as in the last call are taken from there."""
+        assert self.anchors is not None
+        n, groups = 3 * len(self.anchors), dict[int, list[ViewRow]]()
+        for row in rows:
+            if self.oldest_s <= row.instant_s <= self.newest_s and row.vector.size == n and _is_finite(row):
+                groups.setdefault(min(int(row.instant_s * KNOTS_PER_S - self._first), WINDOW - 1), []).append(
+                    row
+                )
+        before = {(s.rows[0].instant_s, len(s.rows), s.key): s for s in self._spans}
+        self._spans = []
+        for i, group in sorted(groups.items()):
+            # Weights near the end of the window depend on where it ends.
+            key = (self._first + i, self._first if i >= WINDOW - 2 else -1)
+            span = before.get((group[0].instant_s, len(group), key))
+            if span is None or any(a is not b for a, b in zip(span.rows, group, strict=True)):
+                blocks, right = np.zeros((PAIRS, n, n), np.float32), np.zeros((BAND, n))
+                for row in group:
+                    weights = self.weights(row.instant_s)[1]
+                    self._pool.run(add_row, row.matrix, row.vector, row.around, weights, blocks, right)
+                span = _Span(key, group, 0, blocks, right)
+            self._spans.append(span._replace(base=min(i - 1, WINDOW - BAND)))
+        return self._spans
 
     def _prior_weights(self) -> tuple[float, float]:
         """1 / variance of the persistence of acceleration, and of neighbors moving alike, in scene units."""
@@ -236,10 +264,31 @@ class Motion:
         knots = np.zeros(WINDOW)
         knots[base : base + 4] = w
         by = np.kron(knots[FIXED:], np.eye(3 * count))
-        covariance = by @ np.linalg.solve(self._precision, by.T)
-        traces = np.einsum("aibi->ab", covariance.reshape(count, 3, count, 3)) / 3.0
+        covariance = by @ np.linalg.solve(self._precision(), by.T)
+        traces = np.einsum("iaib->ab", covariance.reshape(3, count, 3, count)) / 3.0
         pairs = traces[anchor[:, :, None], anchor[:, None, :]]
         return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
+
+    def _precision(self) -> NDArray[np.float64]:
+        """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis, then
+        anchor."""
+        n = self._band.shape[2]
+        a, (steady, alike) = np.zeros((WINDOW, WINDOW, n, n)), self._prior_weights()
+        for k in range(WINDOW):
+            for q in range(min(BAND, WINDOW - k)):
+                a[k, k + q] = self._band[k, q]
+                a[k + q, k] = self._band[k, q].T
+        for k in range(3, WINDOW):
+            for i in range(4):
+                for j in range(4):
+                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
+        laplacian = alike * np.kron(np.eye(3), self._laplacian)
+        for k in range(1, WINDOW):
+            a[k, k] += laplacian
+            a[k - 1, k - 1] += laplacian
+            a[k, k - 1] -= laplacian
+            a[k - 1, k] -= laplacian
+        return a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(FREE * n, FREE * n)
 
     def copy(self) -> Motion:
         """A copy that later changes of this one do not reach."""
@@ -251,7 +300,7 @@ class Motion:
             return {}
         return {
             "anchors": self.anchors.copy(), "knots": self._knots.copy(), "first": np.array(self._first),
-            "precision": self._precision.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+            "band": self._band.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
         }  # fmt: skip
 
     def load_state(self, state: dict[str, NDArray]) -> None:
@@ -262,7 +311,7 @@ class Motion:
         self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
         self._first = int(state["first"])
         self._link()
-        self._precision = np.array(state["precision"])
+        self._band = np.array(state["band"])
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
 
 
@@ -283,6 +332,12 @@ def _cluster(
         total = np.stack([np.bincount(nearest, points[:, c], count) for c in range(3)], axis=-1)
         found = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], found)
     return found
+
+
+def _is_finite(row: ViewRow) -> bool:
+    """Whether all numbers of a row are finite, and small enough for sums in float32."""
+    return bool(abs(row.matrix).max(initial=0.0) < 1e30 and abs(row.vector).max(initial=0.0) < 1e30
+                and abs(row.around).max(initial=0.0) < 1e6)  # fmt: skip
 
 
 def _square_distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
