@@ -63,6 +63,7 @@ class _Span(NamedTuple):
     base: int  # the first of the four knots that they bear on, within the window
     blocks: NDArray[np.float32]
     right: NDArray[np.float64]
+    used: NDArray[np.int64]  # (1,), how many of the views were finite
 
 
 class Motion:
@@ -220,31 +221,29 @@ class Motion:
             iterations,
         )
         self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
-        return len(rows) - sum(len(span.rows) for span in spans)
+        return len(rows) - sum(int(span.used[0]) for span in spans)
 
     def _sums(self, rows: Sequence[ViewRow]) -> list[_Span]:
-        """Sums of the views that can be used, for each span of time between two knots. Those of spans whose views
-        are the same as in the last call are taken from there."""
+        """Sums of the views that can be used, for each span of time between two knots. Sums of the
+        last call are kept where views were only added since."""
         assert self.anchors is not None
         n, groups = 3 * len(self.anchors), dict[int, list[ViewRow]]()
         for row in rows:
-            if self.oldest_s <= row.instant_s <= self.newest_s and row.vector.size == n and _is_finite(row):
-                groups.setdefault(min(int(row.instant_s * KNOTS_PER_S - self._first), WINDOW - 1), []).append(
-                    row
-                )
-        before = {(s.rows[0].instant_s, len(s.rows), s.key): s for s in self._spans}
-        self._spans = []
+            if self.oldest_s <= row.instant_s <= self.newest_s:
+                i = min(int(row.instant_s * KNOTS_PER_S - self._first), WINDOW - 1)
+                groups.setdefault(i, []).append(row)
+        before, self._spans = {span.key: span for span in self._spans}, []
         for i, group in sorted(groups.items()):
             # Weights near the end of the window depend on where it ends.
             key = (self._first + i, self._first if i >= WINDOW - 2 else -1)
-            span = before.get((group[0].instant_s, len(group), key))
-            if span is None or any(a is not b for a, b in zip(span.rows, group, strict=True)):
+            span = before.get(key)
+            if span is None or not _begins_with(group, span.rows):
                 blocks, right = np.zeros((PAIRS, n, n), np.float32), np.zeros((BAND, n))
-                for row in group:
-                    weights = self.weights(row.instant_s)[1]
-                    self._pool.run(add_row, row.matrix, row.vector, row.around, weights, blocks, right)
-                span = _Span(key, group, 0, blocks, right)
-            self._spans.append(span._replace(base=min(i - 1, WINDOW - BAND)))
+                span = _Span(key, [], 0, blocks, right, np.zeros(1, np.int64))
+            for row in group[len(span.rows) :]:
+                weights = self.weights(row.instant_s)[1]
+                self._pool.run(add_row, *row[1:], weights, span.blocks, span.right, span.used)
+            self._spans.append(span._replace(rows=group, base=min(i - 1, WINDOW - BAND)))
         return self._spans
 
     def _prior_weights(self) -> tuple[float, float]:
@@ -334,10 +333,9 @@ def _cluster(
     return found
 
 
-def _is_finite(row: ViewRow) -> bool:
-    """Whether all numbers of a row are finite, and small enough for sums in float32."""
-    return bool(abs(row.matrix).max(initial=0.0) < 1e30 and abs(row.vector).max(initial=0.0) < 1e30
-                and abs(row.around).max(initial=0.0) < 1e6)  # fmt: skip
+def _begins_with(rows: list[ViewRow], first: list[ViewRow]) -> bool:
+    """Whether ``rows`` begins with the very same rows."""
+    return len(rows) >= len(first) and all(a is b for a, b in zip(first, rows, strict=False))
 
 
 def _square_distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from edge_server.fields.common.kernels.simd import draw
 
 BAND = 4  # knots that one view bears on
 PAIRS = 10  # of these knots, i <= j
+MOST = 1e30  # numbers of a view, so that sums fit float32
 MOST_ITERATIONS = 60
 # The solution is found when the estimated distance to it, over all unknowns together, is this many of its
 # standard deviations.
@@ -23,16 +24,17 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 @kernel
-def add_row(counter, worker, matrix, vector, around, weights, blocks, right):
+def add_row(counter, worker, matrix, vector, around, weights, blocks, right, used):
     """Add one view to the sums of views between the same two knots.
 
     matrix, vector, around: see ``motion.ViewRow``. weights: float64 (BAND,), of the knots at its instant.
     blocks: float32 (PAIRS, n, n), normal matrix of each pair of knots. right: float64 (BAND, n).
+    used: int64 (1,), 1 is added; nothing is added for a view with numbers that are not finite.
     """
     if draw(counter, worker, 1) >= 1:
         return
     n, anchors = vector.size, vector.size // 3
-    turned = np.empty((n, n), np.float32)
+    turned, totals, good = np.empty((n, n), np.float32), np.empty(n), True
     for a in range(anchors):
         for d in range(3):
             total = vector[3 * a + d]
@@ -41,8 +43,15 @@ def add_row(counter, worker, matrix, vector, around, weights, blocks, right):
                     h = matrix[3 * a + d, 3 * b + e]
                     total += h * around[3 * b + e]
                     turned[d * anchors + a, e * anchors + b] = h
-            for i in range(BAND):
-                right[i, d * anchors + a] += weights[i] * total
+                    good &= abs(h) < MOST
+            totals[d * anchors + a] = total
+            good &= abs(total) < MOST
+    if not good:
+        return
+    used[0] += 1
+    for i in range(BAND):
+        for p in range(n):
+            right[i, p] += weights[i] * totals[p]
     pair = 0
     for i in range(BAND):
         for j in range(i, BAND):
