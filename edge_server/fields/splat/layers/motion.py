@@ -24,6 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
+
 KNOTS_PER_S = 15
 FREE, FIXED = 10, 3  # knots solved for, and older ones before them
 WINDOW = FREE + FIXED
@@ -52,6 +55,17 @@ class ViewRow(NamedTuple):
     around: NDArray[np.float64]
 
 
+class _Span(NamedTuple):
+    """Views between the same two knots, and their sums, see ``kernels.solve.add_row``."""
+
+    key: tuple[int, int]
+    rows: list[ViewRow]
+    base: int  # the first of the four knots that they bear on, within the window
+    blocks: NDArray[np.float32]
+    right: NDArray[np.float64]
+    used: NDArray[np.int64]  # (1,), how many of the views were finite
+
+
 class Motion:
     """Anchors and their displacements.
 
@@ -67,7 +81,9 @@ class Motion:
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
         self._reach = 0.3  # typical distance from an anchor to the next
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
-        self._precision = np.zeros((0, 0))  # (FREE * 3K, FREE * 3K), of the last solution
+        self._band = np.zeros((0, BAND, 0, 0), np.float32)  # see ``kernels.solve``, of the last solution
+        self._spans: list[_Span] = []
+        self._pool = CallerPool()
 
     @property
     def oldest_s(self) -> float:
@@ -165,7 +181,8 @@ class Motion:
         np.put_along_axis(joined, near, True, axis=1)
         joined |= joined.T
         self._laplacian = np.diag(joined.sum(axis=1)) - joined.astype(np.float64)
-        self._precision = np.zeros((0, 0))
+        self._spans = []
+        self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
 
     def slide(self, instant_s: float) -> None:
         """Move the window on until its last knot is the one after an instant. New knots are predicted; after a
@@ -179,45 +196,55 @@ class Motion:
         self._first += max(ahead, 0)
 
     def solve(self, rows: Sequence[ViewRow]) -> int:
-        """Estimate the free knots from views. Returns how many views were left out: of instants that do not bear
-        on free knots, and with numbers that are not finite."""
+        """Estimate the free knots from views, beginning at the last solution. Returns how many views were left
+        out: of instants that do not bear on free knots, and with numbers that are not finite."""
         assert self.anchors is not None
-        n, left_out = 3 * len(self.anchors), 0
-        a, b = np.zeros((WINDOW, WINDOW, n, n)), np.zeros((WINDOW, n))
-        for row in rows:
-            finite = (
-                np.isfinite(row.matrix).all()
-                and np.isfinite(row.vector).all()
-                and np.isfinite(row.around).all()
-            )
-            if not (finite and self.oldest_s <= row.instant_s <= self.newest_s):
-                left_out += 1
-                continue
-            base, w = self.weights(row.instant_s)
-            right = row.vector + np.einsum("ij,j->i", row.matrix, row.around)
-            for i in range(4):
-                b[base + i] += w[i] * right
-                for j in range(4):
-                    a[base + i, base + j] += w[i] * w[j] * row.matrix
+        count = len(self.anchors)
+        spans = self._sums(rows)
+        self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
+        right = np.zeros((WINDOW, 3 * count))
+        for span in spans:
+            self._pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
+        knots = np.ascontiguousarray(self._knots.transpose(0, 2, 1)).reshape(WINDOW, -1)
         steady, alike = self._prior_weights()
-        for k in range(3, WINDOW):
-            for i in range(4):
-                for j in range(4):
-                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
-        laplacian = alike * np.kron(self._laplacian, np.eye(3))
-        for k in range(1, WINDOW):
-            a[k, k] += laplacian
-            a[k - 1, k - 1] += laplacian
-            a[k, k - 1] -= laplacian
-            a[k - 1, k] -= laplacian
-        size, given = FREE * n, FIXED * n
-        right = b[FIXED:].ravel() - a[FIXED:, :FIXED].transpose(0, 2, 1, 3).reshape(size, given) @ (
-            self._knots[:FIXED].ravel()
+        iterations = np.zeros(1, np.int64)
+        self._pool.run(
+            solve_knots,
+            self._band,
+            right,
+            knots,
+            FIXED,
+            DIFFERENCES,
+            steady,
+            alike,
+            self._laplacian,
+            iterations,
         )
-        self._precision = a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(size, size)
-        solved = np.linalg.solve(self._precision, right).reshape(FREE, -1, 3)
-        self._knots = np.concatenate([self._knots[:FIXED], solved])
-        return left_out
+        self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
+        return len(rows) - sum(int(span.used[0]) for span in spans)
+
+    def _sums(self, rows: Sequence[ViewRow]) -> list[_Span]:
+        """Sums of the views that can be used, for each span of time between two knots. Sums of the
+        last call are kept where views were only added since."""
+        assert self.anchors is not None
+        n, groups = 3 * len(self.anchors), dict[int, list[ViewRow]]()
+        for row in rows:
+            if self.oldest_s <= row.instant_s <= self.newest_s:
+                i = min(int(row.instant_s * KNOTS_PER_S - self._first), WINDOW - 1)
+                groups.setdefault(i, []).append(row)
+        before, self._spans = {span.key: span for span in self._spans}, []
+        for i, group in sorted(groups.items()):
+            # Weights near the end of the window depend on where it ends.
+            key = (self._first + i, self._first if i >= WINDOW - 2 else -1)
+            span = before.get(key)
+            if span is None or not _begins_with(group, span.rows):
+                blocks, right = np.zeros((PAIRS, n, n), np.float32), np.zeros((BAND, n))
+                span = _Span(key, [], 0, blocks, right, np.zeros(1, np.int64))
+            for row in group[len(span.rows) :]:
+                weights = self.weights(row.instant_s)[1]
+                self._pool.run(add_row, *row[1:], weights, span.blocks, span.right, span.used)
+            self._spans.append(span._replace(rows=group, base=min(i - 1, WINDOW - BAND)))
+        return self._spans
 
     def _prior_weights(self) -> tuple[float, float]:
         """1 / variance of the persistence of acceleration, and of neighbors moving alike, in scene units."""
@@ -236,10 +263,31 @@ class Motion:
         knots = np.zeros(WINDOW)
         knots[base : base + 4] = w
         by = np.kron(knots[FIXED:], np.eye(3 * count))
-        covariance = by @ np.linalg.solve(self._precision, by.T)
-        traces = np.einsum("aibi->ab", covariance.reshape(count, 3, count, 3)) / 3.0
+        covariance = by @ np.linalg.solve(self._precision(), by.T)
+        traces = np.einsum("iaib->ab", covariance.reshape(3, count, 3, count)) / 3.0
         pairs = traces[anchor[:, :, None], anchor[:, None, :]]
         return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
+
+    def _precision(self) -> NDArray[np.float64]:
+        """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis, then
+        anchor."""
+        n = self._band.shape[2]
+        a, (steady, alike) = np.zeros((WINDOW, WINDOW, n, n)), self._prior_weights()
+        for k in range(WINDOW):
+            for q in range(min(BAND, WINDOW - k)):
+                a[k, k + q] = self._band[k, q]
+                a[k + q, k] = self._band[k, q].T
+        for k in range(3, WINDOW):
+            for i in range(4):
+                for j in range(4):
+                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
+        laplacian = alike * np.kron(np.eye(3), self._laplacian)
+        for k in range(1, WINDOW):
+            a[k, k] += laplacian
+            a[k - 1, k - 1] += laplacian
+            a[k, k - 1] -= laplacian
+            a[k - 1, k] -= laplacian
+        return a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(FREE * n, FREE * n)
 
     def copy(self) -> Motion:
         """A copy that later changes of this one do not reach."""
@@ -251,7 +299,7 @@ class Motion:
             return {}
         return {
             "anchors": self.anchors.copy(), "knots": self._knots.copy(), "first": np.array(self._first),
-            "precision": self._precision.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+            "band": self._band.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
         }  # fmt: skip
 
     def load_state(self, state: dict[str, NDArray]) -> None:
@@ -262,7 +310,7 @@ class Motion:
         self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
         self._first = int(state["first"])
         self._link()
-        self._precision = np.array(state["precision"])
+        self._band = np.array(state["band"])
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
 
 
@@ -283,6 +331,11 @@ def _cluster(
         total = np.stack([np.bincount(nearest, points[:, c], count) for c in range(3)], axis=-1)
         found = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], found)
     return found
+
+
+def _begins_with(rows: list[ViewRow], first: list[ViewRow]) -> bool:
+    """Whether ``rows`` begins with the very same rows."""
+    return len(rows) >= len(first) and all(a is b for a, b in zip(first, rows, strict=False))
 
 
 def _square_distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ from edge_server.fields.splat.kernels.composite import (
     composite,
 )
 from edge_server.fields.splat.kernels.project import (
-    ALPHA,
     ALPHA_MIN,
     CONIC_A,
     CONIC_B,
