@@ -85,6 +85,7 @@ class LayeredField:
         self.anchors_s = self.plates_s = -np.inf  # when these were last chosen and compared
         self._step_time = StepTimer()
         self._published: LayeredSnapshot | None = None
+        self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Take in the views not seen before, follow what moves, and train. ValueError: a view is invalid."""
@@ -108,7 +109,7 @@ class LayeredField:
         loss, static_rays, static_samples = self.static.train(pace)
         self._spent("static field", begun)
         self._publish()
-        self._render_static(all_cameras=False)
+        self._render_static(most=1)
         report = FitReport(pace.steps, pace.elapsed_s(), loss, rays + static_rays, samples + static_samples)
         return report if arrivals or pace.steps else replace(report, note="no new views")
 
@@ -154,7 +155,7 @@ class LayeredField:
 
     def finish_loading(self) -> None:
         """What follows from the loaded parts."""
-        self._published = None
+        self._published = self._still = None
         if self.moving is not None:
             self._find_rows()
         if self.shown and self.layered:
@@ -230,18 +231,20 @@ class LayeredField:
                 view = camera.view
                 camera.row = camera_rows([view.camera_to_world], [view.intrinsics], self._box())
 
-    def _render_static(self, all_cameras: bool) -> None:
-        """Depth and color of the static field for its cameras: one a fit, in turn, or all."""
-        if self._published is None:
+    def _render_static(self, most: int) -> None:
+        """Render depth and color of the static field for ``most`` of its cameras, those rendered longest ago,
+        as far as the field has learned since."""
+        step = self.static.step
+        stale = [c for c in self.cameras.values() if c.rendered_step < step]
+        if self._published is None or not stale:
             return
-        begun, names = self.now(), list(self.cameras)
+        begun = self.now()
         static = replace(
             self._published, gaussians=_as_gaussians(self.static.shown_params(), self.settings), moving=None
         )
-        for name in names if all_cameras else [names[self.fits % len(names)]]:
-            camera = self.cameras[name]
+        for camera in sorted(stale, key=lambda c: c.rendered_step)[:most]:
             rendered = static.render(camera.view.camera_to_world, camera.view.intrinsics)
-            camera.depth_m = rendered.depth
+            camera.depth_m, camera.rendered_step = rendered.depth, step
             camera.plate.stand_in(rendered.color)
         self._spent("static renders", begun)
 
@@ -265,8 +268,8 @@ class LayeredField:
         if moving.alive:
             if newest_s - self.anchors_s >= ANCHORS_EVERY_S:
                 self._renew_anchors(newest_s)
-            for _ in range(PASSES):
-                self._solve()
+            for k in range(PASSES):
+                self._solve(last=k == PASSES - 1)
             for o in self.observations:
                 o.fresh = False
             self._publish()
@@ -277,25 +280,27 @@ class LayeredField:
             self._spent("births", begun)
         return rays, samples
 
-    def _solve(self) -> None:
-        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve."""
+    def _solve(self, last: bool) -> None:
+        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve.
+
+        last: of this fit; what it explains is held out of the plates."""
         assert self.moving is not None
         motion, begun = self.moving.motion, self.now()
         newest = self.observations.newest_knot
         seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= motion.newest_s]
         due = [o for o in seen if o.row is None or o.fresh or o.knot >= newest]
         for o in due[-MOST_ALIGNED:]:
-            self._align(o)
+            self._align(o, hold=last)
         begun = self._spent("alignment", begun)
         motion.solve([o.row for o in seen if o.row is not None])
         self._spent("solving", begun)
 
-    def _align(self, observation: Observation) -> None:
+    def _align(self, observation: Observation, hold: bool) -> None:
         camera, moving = self.cameras[observation.camera], self.moving
         assert moving is not None
         self._weigh(observation, camera)
         opacity = moving.align(observation, camera)
-        if observation.instant_s >= camera.newest_s:
+        if hold and observation.instant_s >= camera.newest_s:
             camera.newest_s = observation.instant_s
             assert observation.shown is not None
             camera.plate.hold(observation.view.image, observation.shown, opacity)
@@ -343,7 +348,7 @@ class LayeredField:
         moving.remove_outside(frames, self.cameras)
         if moving.alive:
             for o in frames:
-                self._align(o)
+                self._align(o, hold=False)
         moving.seed_missing(frames, self.cameras)
 
     def _renew_anchors(self, instant_s: float) -> None:
@@ -365,22 +370,31 @@ class LayeredField:
             self.shown = True
         live, moving = self.static._live(), self.moving
         assert moving is not None and self.origin_ns is not None
-        params = self.static.shown_params()
-        gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0)
-        params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3).astype(np.float32)
         shown = None
         if moving.alive:
             shown = MovingSnapshot(
                 moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), moving.motion.copy(),
                 self.origin_ns, self.observations.newest_s,
             )  # fmt: skip
+        still = self._static_gaussians()
         self._published = LayeredSnapshot(
-            live.box, _as_gaussians(params, self.settings), live.background, live.cameras, live.pool,
-            self.static.step, planar=live.planar, static=params, moving=shown,
-        ).at(None)  # fmt: skip
+            live.box, still, live.background, live.cameras, live.pool, self.static.step, planar=live.planar,
+            static=still.params, moving=shown,
+        )  # fmt: skip
         self._spent("publication", begun)
         if begins:
-            self._render_static(all_cameras=True)
+            self._render_static(most=len(self.cameras))
+
+    def _static_gaussians(self) -> Gaussians:
+        """The static field at the cameras' present exposure; the arrays of the last publication, where
+        nothing has changed."""
+        gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
+        key = (self.static.step, gain.tobytes())
+        if self._still is None or self._still[0] != key:
+            params = self.static.shown_params()
+            params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
+            self._still = (key, _as_gaussians(params, self.settings))
+        return self._still[1]
 
     # --- inside -------------------------------------------------------------------------------
 

@@ -38,6 +38,7 @@ def pack(field: LayeredField) -> Arrays:
         view = camera.view
         cameras.append({
             **_facts(view), "taken": list(camera.taken), "newest_s": _number(camera.newest_s),
+            "rendered_step": camera.rendered_step,
             "intrinsics": asdict(view.intrinsics),
         })  # fmt: skip
         state |= {f"camera_{k}.image": view.image, f"camera_{k}.pose": view.camera_to_world}
@@ -90,7 +91,9 @@ def unpack(field: LayeredField, state: Arrays) -> None:
         depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
         newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
         taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
-        field.cameras[view.camera] = FixedCamera(view, plate, None, depth_m, newest_s, taken)
+        field.cameras[view.camera] = FixedCamera(
+            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken
+        )
     field.observations = Observations()
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))

@@ -27,6 +27,7 @@ class FixedCamera:
 
     view: its first frame. row: float32 (1, CAMERA), see ``camera_rows``; None before there is a scene box.
     depth_m: float32 (H, W), of the static field; None before it was rendered.
+    rendered_step: step of the static field at which that was.
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
     """
@@ -35,6 +36,7 @@ class FixedCamera:
     plate: Plate
     row: NDArray[np.float32] | None = None
     depth_m: NDArray[np.float32] | None = None
+    rendered_step: int = -1
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
 

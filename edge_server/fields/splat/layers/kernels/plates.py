@@ -140,6 +140,17 @@ def _join(plate, y, x, image, blurred):
 
 
 @part
+def _join_plate(plate, y, x, image, blurred):
+    """Add a vote to the plate, where there is no other mode: the usual case."""
+    weight = plate.weight[y, x, 0] + _F1
+    rate = max(_F1 / weight, np.float32(SLOWEST_RATE))
+    plate.weight[y, x, 0], plate.run[y, x] = weight, 0
+    for c in range(3):
+        plate.means[y, x, 0, c] += rate * (np.float32(image[y, x, c]) - plate.means[y, x, 0, c])
+        plate.blurred[y, x, 0, c] += rate * (blurred[y, x, c] - plate.blurred[y, x, 0, c])
+
+
+@part
 def _is_known(weight, total):
     """A plate needs KNOWN_VOTES, or nearly all of fewer arrivals, and a share of all arrivals."""
     enough = min(np.float32(KNOWN_VOTES), np.float32(EARLY_SHARE) * total)
@@ -177,7 +188,11 @@ def vote(
                     plate.total[y, x] = plate.total[y, x] * decay + _F1
                     for k in range(MODES):
                         plate.weight[y, x, k] *= decay
-                    if votes[y, x]:
+                    least = np.float32(LEAST_WEIGHT)
+                    alone = (plate.weight[y, x, 1] <= least) & (plate.weight[y, x, 2] <= least)
+                    if votes[y, x] and alone and d <= np.float32(THRESHOLD) and plate.weight[y, x, 0] > least:
+                        _join_plate(plate, y, x, image, blurred)
+                    elif votes[y, x]:
                         _join(plate, y, x, image, blurred)
                     else:
                         plate.run[y, x] = 0
