@@ -47,7 +47,7 @@ class Plate:
 
         self.pool = pool
         self.arrays = PlateArrays(
-            zeros(MODES, 3), zeros(MODES, 3), zeros(MODES), zeros(), np.zeros((height, width), np.int32),
+            np.stack([zeros(3)] * MODES), np.stack([zeros(3)] * MODES), np.stack([zeros()] * MODES), zeros(), np.zeros((height, width), np.int32),
             zeros(), np.zeros((height, width), bool),
         )  # fmt: skip
         self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
@@ -72,7 +72,7 @@ class Plate:
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
         self.pool.run(
-            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier), self._static_blurred,
+            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier), self._static_blurred[None],
             self._has_static, self._difference, self._flags,
         )  # fmt: skip
         foreground = np.zeros_like(self._flags)
@@ -107,7 +107,7 @@ class Plate:
         where there is no plate."""
         self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)
         self._static_blurred, self._has_static = cv2.blur(self._static, (3, 3)), True
-        self.picture = np.where(self.known[..., None], self.arrays.means[:, :, 0], self._static)
+        self.picture = np.where(self.known[..., None], self.arrays.means[0], self._static)
 
     def state(self) -> Arrays:
         """Everything needed to continue bit for bit."""
@@ -138,7 +138,7 @@ class Plate:
             or (2 * counts[:, 1:] <= used[:, None]).all()
         ):
             return
-        plate = self.arrays.means[::2, ::2, 0]
+        plate = self.arrays.means[0, ::2, ::2]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
         gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
         self.gain = self.gain * gain

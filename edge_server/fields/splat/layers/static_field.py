@@ -171,4 +171,4 @@ class StaticField(SplatField):
 
 def _plate(camera: FixedCamera) -> NDArray[np.float32]:
     """The plate alone, at the exposure of the first frame, float32 (H, W, 3)."""
-    return camera.plate.arrays.means[:, :, 0] / camera.plate.gain
+    return camera.plate.arrays.means[0] / camera.plate.gain

@@ -36,8 +36,8 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 class PlateArrays(NamedTuple):
     """What the pixels of a camera remember. The first mode is the plate.
 
-    means, blurred: float32 (H, W, MODES, 3), running means of the frames and of the blurred frames.
-    weight: float32 (H, W, MODES), decaying counts of votes, largest first.
+    means, blurred: float32 (MODES, H, W, 3), running means of the frames and of the blurred frames.
+    weight: float32 (MODES, H, W), decaying counts of votes, largest first.
     total: float32 (H, W), decaying count of arrivals.
     run: int32 (H, W), arrivals in a row that joined another mode than the plate.
     deviation: float32 (H, W), mean difference of background from the plate.
@@ -54,9 +54,10 @@ class PlateArrays(NamedTuple):
 
 
 @part
-def _difference(a, y, x, b):
-    """Largest difference of a channel between a[y, x] and the color b."""
-    d0, d1, d2 = abs(a[y, x, 0] - b[0]), abs(a[y, x, 1] - b[1]), abs(a[y, x, 2] - b[2])
+def _difference(a, b, k, y, x):
+    """Largest difference of a channel between a[y, x] and b[k, y, x]."""
+    d0, d1, d2 = abs(a[y, x, 0] - b[k, y, x, 0]), abs(a[y, x, 1] - b[k, y, x, 1]), (
+        abs(a[y, x, 2] - b[k, y, x, 2]))  # fmt: skip
     return max(d0, max(d1, d2))
 
 
@@ -68,7 +69,7 @@ def compare_with_plate(
 
     blurred: float32 (H, W, 3). plate: ``PlateArrays``.
     earlier: float32 (2, H, W, 3), blurred earlier frames, of which the first ``earlier_count`` count.
-    static: float32 (H, W, 3), the static field's rendering, blurred; read if ``has_static``.
+    static: float32 (1, H, W, 3), the static field's rendering, blurred; read if ``has_static``.
     difference: float32 (H, W), written: difference from the plate, of the worst channel.
     flags: uint8 (H, W), written: FOREGROUND, CHANGING (differs from an earlier frame) and LIKE_STATIC.
     """
@@ -80,13 +81,13 @@ def compare_with_plate(
             return
         for y in range(top, min(top + _ROWS, height)):
             for x in range(width):
-                d = _difference(blurred, y, x, plate.blurred[y, x, 0])
+                d = _difference(blurred, plate.blurred, 0, y, x)
                 limit = max(least, np.float32(DEVIATIONS) * plate.deviation[y, x])
                 change = _F0
                 for k in range(earlier_count):
-                    change = max(change, _difference(blurred, y, x, earlier[k, y, x]))
+                    change = max(change, _difference(blurred, earlier, k, y, x))
                 changing = change > limit
-                off = _difference(blurred, y, x, static[y, x]) if has_static else _F0
+                off = _difference(blurred, static, 0, y, x) if has_static else _F0
                 unknown = off > beyond if has_static else changing
                 foreground = d > limit if plate.known[y, x] else unknown
                 like = has_static & (off <= least)
@@ -100,13 +101,13 @@ def compare_with_plate(
 
 @part
 def _swap_modes(plate, y, x, a, b):
-    w, u = plate.weight[y, x, a], plate.weight[y, x, b]
-    plate.weight[y, x, a], plate.weight[y, x, b] = u, w
+    w, u = plate.weight[a, y, x], plate.weight[b, y, x]
+    plate.weight[a, y, x], plate.weight[b, y, x] = u, w
     for c in range(3):
-        m, n = plate.means[y, x, a, c], plate.means[y, x, b, c]
-        plate.means[y, x, a, c], plate.means[y, x, b, c] = n, m
-        m, n = plate.blurred[y, x, a, c], plate.blurred[y, x, b, c]
-        plate.blurred[y, x, a, c], plate.blurred[y, x, b, c] = n, m
+        m, n = plate.means[a, y, x, c], plate.means[b, y, x, c]
+        plate.means[a, y, x, c], plate.means[b, y, x, c] = n, m
+        m, n = plate.blurred[a, y, x, c], plate.blurred[b, y, x, c]
+        plate.blurred[a, y, x, c], plate.blurred[b, y, x, c] = n, m
 
 
 @part
@@ -114,40 +115,40 @@ def _join(plate, y, x, image, blurred):
     """Add a vote to the nearest mode, or replace the lightest mode where none is near."""
     best, nearest = -1, np.float32(1e9)
     for k in range(MODES):
-        if plate.weight[y, x, k] > np.float32(LEAST_WEIGHT):
-            d = _difference(blurred, y, x, plate.blurred[y, x, k])
+        if plate.weight[k, y, x] > np.float32(LEAST_WEIGHT):
+            d = _difference(blurred, plate.blurred, k, y, x)
             if d < nearest:
                 nearest, best = d, k
     if nearest > np.float32(THRESHOLD):
         best = 0
         for k in range(1, MODES):
-            if plate.weight[y, x, k] < plate.weight[y, x, best]:
+            if plate.weight[k, y, x] < plate.weight[best, y, x]:
                 best = k
-        plate.weight[y, x, best], plate.run[y, x], rate = _F1, 1, _F1
+        plate.weight[best, y, x], plate.run[y, x], rate = _F1, 1, _F1
     else:
-        plate.weight[y, x, best] += _F1
+        plate.weight[best, y, x] += _F1
         plate.run[y, x] = 0 if best == 0 else plate.run[y, x] + 1
-        rate = max(_F1 / plate.weight[y, x, best], np.float32(SLOWEST_RATE))
+        rate = max(_F1 / plate.weight[best, y, x], np.float32(SLOWEST_RATE))
     for c in range(3):
-        plate.means[y, x, best, c] += rate * (np.float32(image[y, x, c]) - plate.means[y, x, best, c])
-        plate.blurred[y, x, best, c] += rate * (blurred[y, x, c] - plate.blurred[y, x, best, c])
+        plate.means[best, y, x, c] += rate * (np.float32(image[y, x, c]) - plate.means[best, y, x, c])
+        plate.blurred[best, y, x, c] += rate * (blurred[y, x, c] - plate.blurred[best, y, x, c])
     if best > 0:
         if plate.run[y, x] >= RUN:
-            plate.weight[y, x, best], plate.run[y, x] = plate.weight[y, x, 0] + _F1, 0
+            plate.weight[best, y, x], plate.run[y, x] = plate.weight[0, y, x] + _F1, 0
         for k in range(best, 0, -1):
-            if plate.weight[y, x, k] > plate.weight[y, x, k - 1]:
+            if plate.weight[k, y, x] > plate.weight[k - 1, y, x]:
                 _swap_modes(plate, y, x, k, k - 1)
 
 
 @part
 def _join_plate(plate, y, x, image, blurred):
     """Add a vote to the plate, where there is no other mode: the usual case."""
-    weight = plate.weight[y, x, 0] + _F1
+    weight = plate.weight[0, y, x] + _F1
     rate = max(_F1 / weight, np.float32(SLOWEST_RATE))
-    plate.weight[y, x, 0], plate.run[y, x] = weight, 0
+    plate.weight[0, y, x], plate.run[y, x] = weight, 0
     for c in range(3):
-        plate.means[y, x, 0, c] += rate * (np.float32(image[y, x, c]) - plate.means[y, x, 0, c])
-        plate.blurred[y, x, 0, c] += rate * (blurred[y, x, c] - plate.blurred[y, x, 0, c])
+        plate.means[0, y, x, c] += rate * (np.float32(image[y, x, c]) - plate.means[0, y, x, c])
+        plate.blurred[0, y, x, c] += rate * (blurred[y, x, c] - plate.blurred[0, y, x, c])
 
 
 @part
@@ -163,11 +164,12 @@ def vote(
 ):
     """Update the plate by a frame. Tasks are runs of rows.
 
-    image: uint8 (H, W, 3). blurred, difference, static, has_static: as in ``compare_with_plate``.
+    image: uint8 (H, W, 3). blurred, difference: as in ``compare_with_plate``.
     foreground: uint8 (H, W), pixels that are not the plate: they do not count for its deviation.
     votes: uint8 (H, W), pixels that may be background.
     held: uint8 (H, W), pixels that neither vote nor forget.
     plate: ``PlateArrays``, updated.
+    static: float32 (H, W, 3), the static field's rendering; read if ``has_static``.
     picture: float32 (H, W, 3), written: the plate; where that is unknown, the static field.
     """
     height, width = difference.shape
@@ -187,19 +189,19 @@ def vote(
                         plate.deviation[y, x] = old + (d - old) * rate
                     plate.total[y, x] = plate.total[y, x] * decay + _F1
                     for k in range(MODES):
-                        plate.weight[y, x, k] *= decay
+                        plate.weight[k, y, x] *= decay
                     least = np.float32(LEAST_WEIGHT)
-                    alone = (plate.weight[y, x, 1] <= least) & (plate.weight[y, x, 2] <= least)
-                    if votes[y, x] and alone and d <= np.float32(THRESHOLD) and plate.weight[y, x, 0] > least:
+                    alone = (plate.weight[1, y, x] <= least) & (plate.weight[2, y, x] <= least)
+                    if votes[y, x] and alone and d <= np.float32(THRESHOLD) and plate.weight[0, y, x] > least:
                         _join_plate(plate, y, x, image, blurred)
                     elif votes[y, x]:
                         _join(plate, y, x, image, blurred)
                     else:
                         plate.run[y, x] = 0
-                    plate.known[y, x] = _is_known(plate.weight[y, x, 0], plate.total[y, x])
+                    plate.known[y, x] = _is_known(plate.weight[0, y, x], plate.total[y, x])
                 for c in range(3):
                     shows_plate = plate.known[y, x] | (not has_static)
-                    picture[y, x, c] = plate.means[y, x, 0, c] if shows_plate else static[y, x, c]
+                    picture[y, x, c] = plate.means[0, y, x, c] if shows_plate else static[y, x, c]
 
 
 @kernel
@@ -215,7 +217,7 @@ def count_exposure(counter, worker, image, plate, counts):
     high, low = np.float32(1.0 + GAIN_STEP), np.float32(1.0 - GAIN_STEP)
     for y in range(0, image.shape[0], 2):
         for x in range(0, image.shape[1], 2):
-            m = plate.means[y, x, 0]
+            m = plate.means[0, y, x]
             dark, bright = min(m[0], min(m[1], m[2])), max(m[0], max(m[1], m[2]))
             if plate.known[y, x] & (dark > np.float32(DARK)) & (bright < np.float32(BRIGHT)):
                 for c in range(3):

@@ -28,11 +28,11 @@ H, W = 37, 11  # more rows than a task has
 
 def _plate(seed: int) -> PlateArrays:
     rng = np.random.default_rng(seed)
-    weight = np.sort(rng.uniform(0, 12, (H, W, MODES)), axis=-1)[..., ::-1]
-    weight[..., 2] *= rng.random((H, W)) < 0.5
+    weight = np.sort(rng.uniform(0, 12, (MODES, H, W)), axis=0)[::-1]
+    weight[2] *= rng.random((H, W)) < 0.5
     return PlateArrays(
-        rng.uniform(60, 120, (H, W, MODES, 3)).astype(np.float32),
-        rng.uniform(60, 120, (H, W, MODES, 3)).astype(np.float32),
+        rng.uniform(60, 120, (MODES, H, W, 3)).astype(np.float32),
+        rng.uniform(60, 120, (MODES, H, W, 3)).astype(np.float32),
         np.ascontiguousarray(weight, np.float32),
         rng.uniform(10, 30, (H, W)).astype(np.float32),
         rng.integers(0, RUN + 2, (H, W)).astype(np.int32),
@@ -60,14 +60,22 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
         for has_static in (False, True):
             difference, flags = np.empty((H, W), np.float32), np.empty((H, W), np.uint8)
             Pool(2, 0).run(
-                compare_with_plate, blurred, plate, earlier, count, static, has_static, difference, flags
+                compare_with_plate,
+                blurred,
+                plate,
+                earlier,
+                count,
+                static[None],
+                has_static,
+                difference,
+                flags,
             )
             changing = np.zeros((H, W), bool)
             for k in range(count):
                 changing |= _off(blurred, earlier[k]) > limit
             beyond = _off(blurred, static)
             unknown = beyond > THRESHOLD_UNKNOWN if has_static else changing
-            expected = _off(blurred, plate.blurred[:, :, 0])
+            expected = _off(blurred, plate.blurred[0])
             np.testing.assert_allclose(difference, expected, rtol=1e-6)
             np.testing.assert_array_equal(
                 flags & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown)
@@ -80,9 +88,9 @@ def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np
     """One pixel that votes, by the rules of the module."""
     modes = [
         {
-            "w": p.weight[y, x, k],
-            "m": p.means[y, x, k].copy(),
-            "b": p.blurred[y, x, k].copy(),
+            "w": p.weight[k, y, x],
+            "m": p.means[k, y, x].copy(),
+            "b": p.blurred[k, y, x].copy(),
             "first": k == 0,
         }
         for k in range(MODES)
@@ -104,14 +112,14 @@ def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np
     modes.sort(key=lambda m: -m["w"])
     p.run[y, x] = run
     for k, m in enumerate(modes):
-        p.weight[y, x, k], p.means[y, x, k], p.blurred[y, x, k] = m["w"], m["m"], m["b"]
+        p.weight[k, y, x], p.means[k, y, x], p.blurred[k, y, x] = m["w"], m["m"], m["b"]
 
 
 def test_votes() -> None:
     rng = np.random.default_rng(3)
     image, blurred, _, static = _frames(2)
     found, plain = _plate(4), _plate(4)
-    difference = _off(blurred, plain.blurred[:, :, 0]).astype(np.float32)
+    difference = _off(blurred, plain.blurred[0]).astype(np.float32)
     foreground, votes, held = ((rng.random((H, W)) < share).astype(np.uint8) for share in (0.3, 0.8, 0.2))
     picture = np.empty((H, W, 3), np.float32)
     Pool(2, 0).run(
@@ -126,22 +134,22 @@ def test_votes() -> None:
             if not foreground[y, x] and plain.known[y, x] and difference[y, x] < 3 * limit:
                 plain.deviation[y, x] += 0.05 * (difference[y, x] - plain.deviation[y, x])
             plain.total[y, x] = plain.total[y, x] * (1 - 1 / MEMORY) + 1
-            plain.weight[y, x] *= 1 - 1 / MEMORY
+            plain.weight[:, y, x] *= 1 - 1 / MEMORY
             if votes[y, x]:
                 _vote_plainly(plain, y, x, image, blurred)
             else:
                 plain.run[y, x] = 0
-            w, total = plain.weight[y, x, 0], plain.total[y, x]
+            w, total = plain.weight[0, y, x], plain.total[y, x]
             plain.known[y, x] = w >= min(8, 0.9 * total) and w >= 0.3 * total
     for name, mine, theirs in zip(PlateArrays._fields, found, plain, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-5, err_msg=name)
-    np.testing.assert_array_equal(picture, np.where(found.known[..., None], found.means[:, :, 0], static))
+    np.testing.assert_array_equal(picture, np.where(found.known[..., None], found.means[0], static))
 
 
 def test_exposure_is_counted_where_the_plate_tells_it() -> None:
     plate, counts = _plate(5), np.zeros((3, 3), np.int64)
-    plate.means[:10] = 10.0  # too dark
-    image = np.clip(plate.means[:, :, 0] * [1.0, 1.1, 0.9] + 0.5, 0, 255).astype(np.uint8)
+    plate.means[:, :10] = 10.0  # too dark
+    image = np.clip(plate.means[0] * [1.0, 1.1, 0.9] + 0.5, 0, 255).astype(np.uint8)
     CallerPool().run(count_exposure, image, plate, counts)
     used = plate.known[::2, ::2][5:].sum()
     np.testing.assert_array_equal(counts, [[used, 0, 0], [used, used, 0], [used, 0, used]])
