@@ -1,9 +1,9 @@
 """Motion of a set of Gaussians: displacements of anchors at knots in time, estimated from every view at the
 instant at which it was taken.
 
-A Gaussian lies at p + sum_a s_a D_a(t), for its three nearest anchors a with shares s_a. D(t) is a Catmull-Rom
-spline through the displacements X_k at knots 1 / KNOTS_PER_S apart, and a straight line past the last. The last
-FREE knots are solved for together by least squares, the FIXED ones before them are given:
+A Gaussian lies at p + sum_a s_a D_a(t), for its three nearest anchors a with shares s_a. D(t) is a
+Catmull-Rom spline through the displacements X_k at knots 1 / KNOTS_PER_S apart, and a straight line past the
+last. The last FREE knots are solved for together by least squares, the FIXED ones before them are given:
 
 - a view at t with the normal matrix H and the gradient g of ``kernels.align``, taken where D(t) was D_0, says
   H D(t) = H D_0 + g;
@@ -96,8 +96,8 @@ class Motion:
         return (self._first + WINDOW) / KNOTS_PER_S
 
     def weights(self, instant_s: float) -> tuple[int, NDArray[np.float64]]:
-        """The displacement at an instant is a sum of four knots times weights, float64 (4,); returns the first of
-        the four, counted within the window, and the weights."""
+        """The displacement at an instant is a sum of four knots times weights, float64 (4,); returns the
+        first of the four, counted within the window, and the weights."""
         last, x = WINDOW - 1, max(instant_s * KNOTS_PER_S - self._first, 0.0)
         i = min(int(x), last)
         f = x - i
@@ -149,8 +149,8 @@ class Motion:
     ) -> None:
         """Choose anchors anew: k-means of points, begun at points that are far from each other.
 
-        points: (N, 3), places at the instant, at which the new anchors have displacement 0; their displacements
-            at other instants are carried over from the anchors before.
+        points: (N, 3), places at the instant, at which the new anchors have displacement 0; their
+            displacements at other instants are carried over from the anchors before.
         opacity: (N,), in [0, 1]: faint points do not begin a cluster.
         count: how many; at most N are chosen. ValueError: no point is finite.
         """
@@ -185,8 +185,9 @@ class Motion:
         self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
 
     def slide(self, instant_s: float) -> None:
-        """Move the window on until its last knot is the one after an instant. New knots are predicted; after a
-        pause longer than the window, what moved is taken to have stopped. An earlier instant changes nothing."""
+        """Move the window on until its last knot is the one after an instant. New knots are predicted; after
+        a pause longer than the window, what moved is taken to have stopped. An earlier instant changes
+        nothing."""
         ahead = int(np.floor(instant_s * KNOTS_PER_S)) + 2 - WINDOW - self._first
         for _ in range(min(ahead, FREE)):
             x = self._knots
@@ -196,8 +197,8 @@ class Motion:
         self._first += max(ahead, 0)
 
     def solve(self, rows: Sequence[ViewRow]) -> int:
-        """Estimate the free knots from views, beginning at the last solution. Returns how many views were left
-        out: of instants that do not bear on free knots, and with numbers that are not finite."""
+        """Estimate the free knots from views, beginning at the last solution. Returns how many views were
+        left out: of instants that do not bear on free knots, and with numbers that are not finite."""
         assert self.anchors is not None
         count = len(self.anchors)
         spans = self._sums(rows)
@@ -255,8 +256,9 @@ class Motion:
     def deviation(
         self, anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
     ) -> NDArray[np.float32]:
-        """Standard deviation (N,) of places at an instant, scene units, the root of the mean over three axes, from
-        the covariance of the last solution. It grows past the last view. anchor, share: see ``attach``."""
+        """Standard deviation (N,) of places at an instant, scene units, the root of the mean over three axes,
+        from the covariance of the last solution. It grows past the last view. anchor, share: see
+        ``attach``."""
         assert self.anchors is not None
         count = len(self.anchors)
         base, w = self.weights(instant_s)
@@ -269,8 +271,8 @@ class Motion:
         return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
 
     def _precision(self) -> NDArray[np.float64]:
-        """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis, then
-        anchor."""
+        """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis,
+        then anchor."""
         n = self._band.shape[2]
         a, (steady, alike) = np.zeros((WINDOW, WINDOW, n, n)), self._prior_weights()
         for k in range(WINDOW):

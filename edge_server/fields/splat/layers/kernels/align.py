@@ -1,10 +1,10 @@
 """Gauss-Newton of one view's photometric error in the displacements of the anchors, on strips of 16 pixels.
 
-The Gaussians are composited over the camera's plate. Then, back to front, the slope of each pixel's color by a
-Gaussian's place goes to the columns of its anchors, and a tile adds the Gram matrix of the columns that it
-touches. An anchor has two columns, not three: its Gaussians share a direction of sight (each has its own depth and
-lens), so that motion in space is a motion across it, in camera axes U = X - (x/z) Z, V = Y - (y/z) Z. The sums of
-all tiles are lifted to three axes at the end.
+The Gaussians are composited over the camera's plate. Then, back to front, the slope of each pixel's color by
+a Gaussian's place goes to the columns of its anchors, and a tile adds the Gram matrix of the columns that it
+touches. An anchor has two columns, not three: its Gaussians share a direction of sight (each has its own
+depth and lens), so that motion in space is a motion across it, in camera axes U = X - (x/z) Z, V = Y - (y/z)
+Z. The sums of all tiles are lifted to three axes at the end.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def align_view(
     matrix, vector = np.empty((3 * anchors, 3 * anchors)), np.empty(3 * anchors)
     shown, opacity = np.empty(image.shape, np.float32), np.empty(image.shape[:2], np.float32)
     raster.pool.run(
-        add_view, image, plate, weight, slot, int(raster.columns[slot]), camera[None], places, raster.projected,
-        raster.lists, anchor, share, matrix, vector, shown, opacity,
+        add_view, image, plate, weight, slot, int(raster.columns[slot]), camera[None], places,
+        raster.projected, raster.lists, anchor, share, matrix, vector, shown, opacity,
     )  # fmt: skip
     return matrix, vector, shown, opacity
 
@@ -92,7 +92,8 @@ def align_view(
 @intrinsic
 def _spread(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any, behind: Any,
             first: Any, saved: Any, scale: Any, anchor: Any, share: Any, slopes: Any) -> Any:  # fmt: skip
-    """Add a strip's slopes of color to its anchors' columns, back to front; see ``composite`` for arguments not here.
+    """Add a strip's slopes of color to its anchors' columns, back to front; see ``composite`` for arguments
+    not here.
 
     behind: float32 rows of PIXELS: red, green and blue of the plate, the root of each pixel's weight.
     scale: float32 (N, 4), see ``_prepare``.
@@ -145,7 +146,8 @@ def _spread(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, 
 
 @intrinsic
 def _multiply(typingctx: Any, slopes: Any, a0: Any, a1: Any, b0: Any, b1: Any, out: Any) -> Any:
-    """Products of the four columns of anchors a0, a1 with the four of b0, b1: float32 out[:16], row by row."""
+    """Products of the four columns of anchors a0, a1 with the four of b0, b1: float32 out[:16], row by
+    row."""
     require_contiguous(slopes, out)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -179,7 +181,8 @@ def _prepare(cam, places, projected, anchor, share, scale, across):
     """What the picture's slopes are multiplied by.
 
     scale: float32 (N, 4), written: pixels x by U and V, pixels y by U and V, for each Gaussian.
-    across: float64 (K, 2, 3), written: U and V by an anchor's displacement, where its Gaussians are on average.
+    across: float64 (K, 2, 3), written: U and V by an anchor's displacement, where its Gaussians are on
+    average.
     """
     ratios, total = np.zeros((across.shape[0], 2)), np.zeros(across.shape[0])
     for i in range(places.shape[0]):
@@ -257,8 +260,8 @@ def _heaviest(image, plate, weight, x0, y0, behind):
 
 
 @kernel
-def add_view(counter, worker, image, plate, weight, slot, columns, cams, places, projected, lists, anchor, share,
-             matrix, vector, shown, opacity):  # fmt: skip
+def add_view(counter, worker, image, plate, weight, slot, columns, cams, places, projected, lists, anchor,
+             share, matrix, vector, shown, opacity):  # fmt: skip
     """See ``align_view``; one task, so that sums do not depend on the number of threads."""
     if draw(counter, worker, 1) >= 1:
         return
@@ -306,8 +309,8 @@ def add_view(counter, worker, image, plate, weight, slot, columns, cams, places,
         for n in range(STRIPS):
             _spread(
                 strip_pairs[n], composited[n], lists.owner[slot], projected[slot], np.float32(x0),
-                np.float32(y0 + 2 * n), behind, n * STRIP, store[n * size : (n + 1) * size], scale, anchor, share,
-                slopes,
+                np.float32(y0 + 2 * n), behind, n * STRIP, store[n * size : (n + 1) * size], scale, anchor,
+                share, slopes,
             )  # fmt: skip
         for u in range(many):
             for d in range(2):

@@ -1,9 +1,9 @@
 """The least squares of motion: sums of views, and conjugate gradients for the free knots.
 
-Unknowns are float32 (T, n) of T knots, n = 3K, ordered by axis, then anchor: the loops run over anchors side by
-side. A view at one instant bears on four knots in a row, so that the matrix has a band of four blocks. The
-preconditioner is each anchor's own block over all free knots and axes, factorized for all anchors at once: the
-prior in time, which makes the system stiff, is exact in it.
+Unknowns are float32 (T, n) of T knots, n = 3K, ordered by axis, then anchor: the loops run over anchors side
+by side. A view at one instant bears on four knots in a row, so that the matrix has a band of four blocks. The
+preconditioner is each anchor's own block over all free knots and axes, factorized for all anchors at once:
+the prior in time, which makes the system stiff, is exact in it.
 """
 
 from __future__ import annotations

@@ -129,7 +129,9 @@ def test_the_gradient_is_that_of_the_rendered_image(axis):
     weight = np.ones((21, 29), np.float32)
     across = CAMS[0, 3 * axis : 3 * axis + 3].astype(float)
 
-    def at(step, image=np.zeros((21, 29, 3), np.uint8)):
+    black = np.zeros((21, 29, 3), np.uint8)
+
+    def at(step, image=black):
         moved = params.copy()
         moved[:, :3] += step * across
         return aligned(moved, anchor, share, image, plate, weight)
