@@ -186,7 +186,7 @@ class LayeredField:
             self.origin_ns = min(view.shows_ns for view in views)
         for view in sorted(views, key=lambda v: (v.generated_ns, v.camera)):
             if view.camera not in self.cameras:
-                plate = Plate(*view.image.shape[:2], self.pool)
+                plate = Plate(view.image.shape[0], view.image.shape[1], self.pool)
                 self.cameras[view.camera] = FixedCamera(view, plate)
             camera = self.cameras[view.camera]
             if view.generated_ns in camera.taken:

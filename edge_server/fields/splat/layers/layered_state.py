@@ -47,7 +47,8 @@ def pack(field: LayeredField) -> Arrays:
             state[f"camera_{k}.depth_m"] = camera.depth_m
     for k, o in enumerate(field.observations):
         observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
-        arrays = {"image": o.view.image, "foreground": o.foreground, "weight": o.weight, "shown": o.shown,
+        arrays: dict[str, NDArray[Any] | None] = {
+            "image": o.view.image, "foreground": o.foreground, "weight": o.weight, "shown": o.shown,
                   "given": o.view.weight}  # fmt: skip
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
@@ -86,7 +87,7 @@ def unpack(field: LayeredField, state: Arrays) -> None:
             facts["generated_ns"], carried_to_ns=facts["carried_to_ns"],
         )  # fmt: skip
         check_view(view)
-        plate = Plate(*view.image.shape[:2], field.pool)
+        plate = Plate(view.image.shape[0], view.image.shape[1], field.pool)
         plate.load_state(_under("plate.", arrays))
         depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
         newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]

@@ -99,6 +99,7 @@ class MovingSet:
     def align(self, observation: Observation, camera: FixedCamera) -> NDArray[np.float32]:
         """Linearize a frame's error in the anchors' displacements: fills its ``row`` and ``shown``. Returns
         the opacity of the moving set, float32 (H, W)."""
+        assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
         instant_s = observation.instant_s
         gaussians = self.gaussians(instant_s)
         self.raster.project_and_bin(camera.row, gaussians, [None], differentiate=False)

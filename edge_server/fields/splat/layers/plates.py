@@ -6,6 +6,8 @@ most votes is the plate, once it has enough of them. Colors are in steps of 255.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +49,15 @@ class Plate:
 
         self.pool = pool
         self.arrays = PlateArrays(
-            np.stack([zeros(3)] * MODES), np.stack([zeros(3)] * MODES), np.stack([zeros()] * MODES), zeros(), np.zeros((height, width), np.int32),
-            zeros(), np.zeros((height, width), bool),
+            means=np.stack([zeros(3)] * MODES), blurred=np.stack([zeros(3)] * MODES),
+            weight=np.stack([zeros()] * MODES), total=zeros(), run=np.zeros((height, width), np.int32),
+            deviation=zeros(), known=np.zeros((height, width), bool),
         )  # fmt: skip
         self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
         self._recent = np.zeros((max(LAGS), height, width, 3), np.float32)  # blurred frames, a ring
-        self._held = np.zeros((height, width), np.uint8)
-        self._static, self._static_blurred, self._has_static = zeros(3), zeros(3), False
+        self._held: NDArray[Any] = np.zeros((height, width), np.uint8)
+        self._static, self._has_static = zeros(3), False
+        self._static_blurred: NDArray[Any] = zeros(3)
         self._difference, self._flags = zeros(), np.zeros((height, width), np.uint8)
 
     @property
@@ -72,14 +76,14 @@ class Plate:
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
         self.pool.run(
-            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier), self._static_blurred[None],
-            self._has_static, self._difference, self._flags,
+            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier),
+            self._static_blurred[None], self._has_static, self._difference, self._flags,
         )  # fmt: skip
         foreground = np.zeros_like(self._flags)
         votes = np.ones_like(foreground)
         if self.count > 0:
-            foreground = clean_mask(self._flags & FOREGROUND)
-            changing = clean_mask(self._flags & CHANGING) if self.count > 1 else foreground
+            foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
+            changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
             votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
         self.pool.run(
             vote, image, blurred, self._difference, foreground, votes.astype(np.uint8), self._held,
@@ -157,7 +161,7 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if w == 0:
         return out
     left, top, right, bottom = max(x - 2, 0), max(y - 2, 0), min(x + w + 2, width), min(y + h + 2, height)
-    part = (mask[top:bottom, left:right] > 0).astype(np.uint8)
+    part: NDArray[Any] = (mask[top:bottom, left:right] > 0).astype(np.uint8)
     part = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
     keep = (stats[:, cv2.CC_STAT_AREA] >= SPECK).astype(np.uint8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ def _ball_m(instant_s: float, moves: bool) -> np.ndarray:
     return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
 
 
-@lru_cache(maxsize=None)
+@cache
 def _frame(camera: int, frame: int, moves: bool) -> View:
     """Each camera at a phase of its own."""
     view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
@@ -99,7 +99,7 @@ def test_nothing_moves_where_nothing_moves() -> None:
     assert _score(field.snapshot(), 2.0, moves=False) > 22.0
 
 
-@lru_cache(maxsize=None)
+@cache
 def _moving() -> LayeredField:
     field = LayeredField(SMALL)
     _run(field, range(42))

@@ -50,9 +50,8 @@ def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:
                 opacity[BODY, 20:30] = 1.0
                 plate.hold(image, image / np.float32(255.0), opacity)
         assert foreground[BODY, 20:30].all() == held
-        shown = plate.picture[20:28, 22:28]
-        np.testing.assert_allclose(shown, np.broadcast_to(WALL[20:28, 22:28] if held else (250, 30, 30), shown.shape),
-                                   atol=1.0)  # fmt: skip
+        expected = WALL[20:28, 22:28] if held else np.full((8, 6, 3), (250, 30, 30))
+        np.testing.assert_allclose(plate.picture[20:28, 22:28], expected, atol=1.0)
 
 
 def test_a_change_of_exposure_is_no_foreground() -> None:

@@ -42,7 +42,7 @@ def _plate(seed: int) -> PlateArrays:
 
 
 def _frames(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Image, blurred, two earlier frames, static rendering: near the plate's colors, so that all cases occur."""
+    """Image, blurred, two earlier frames, static rendering, near the plate's colors."""
     rng = np.random.default_rng(seed)
     image = rng.integers(60, 120, (H, W, 3), np.uint8)
     blurred, static = (rng.uniform(80, 100, (H, W, 3)).astype(np.float32) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Training over a plate: a plate of one color is a background, and any other plate agrees with differences."""
+"""Training over a plate: one of a single color is a background; any other agrees with differences."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def test_a_plate_of_one_color_is_a_background() -> None:
     )  # fmt: skip
     raster.pool.run(
         train_tiles, views, np.zeros(1, np.int64), tasks, raster.columns, raster.projected, raster.lists,
-        Loss(False, np.float32(0), color, False, np.uint64(0)), raster.memory, raster.saved, raster.sums, expected,
+        Loss(False, np.float32(0), color, False, np.uint64(0)), raster.memory, raster.saved, raster.sums,
+        expected,
     )  # fmt: skip
     filled = np.diff(raster.lists.first[0, : len(tasks) + 1]) > 0
     np.testing.assert_allclose(losses[filled], expected[filled, 0], rtol=1e-5)
