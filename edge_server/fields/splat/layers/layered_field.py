@@ -48,7 +48,7 @@ EVIDENCE_S = 0.8  # age up to which frames tell of motion
 PASSES = 2  # of Gauss-Newton a fit
 MOST_ALIGNED = 64  # frames aligned in one pass, newest first
 STEPS, STEP_PROGRESS = 20, 0.3  # of appearance a fit; progress at which rates are taken
-BIRTHS_EVERY = 3  # fits
+BIRTHS_EVERY, BIRTHS_AT_LEAST_EVERY = 3, 9  # fits; the second where budgets have no room for them
 ANCHORS_EVERY_S = 0.5
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
 
@@ -83,7 +83,7 @@ class LayeredField:
         self.origin_ns: int | None = None
         self.fits = 0  # since the static field began to learn
         self.anchors_s = self.plates_s = -np.inf  # when these were last chosen and compared
-        self._step_time = StepTimer()
+        self._step_time, self._birth_time = StepTimer(), StepTimer()
         self._published: LayeredSnapshot | None = None
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
@@ -274,9 +274,11 @@ class LayeredField:
                 o.fresh = False
             self._publish()
             rays, samples = self._train_appearance(pace)
-        if self.fits % BIRTHS_EVERY == 0 or not moving.alive:
-            begun = self.now()
+        begun, due = self.now(), self.fits % BIRTHS_EVERY == 0 or not moving.alive
+        room = pace.has_room(self._birth_time.seconds, 1.0, 0.0) or self.fits % BIRTHS_AT_LEAST_EVERY == 0
+        if due and room:
             self._births()
+            self._birth_time.add(self.now() - begun)
             self._spent("births", begun)
         return rays, samples
 
