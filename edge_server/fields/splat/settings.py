@@ -59,6 +59,9 @@ class SplatSettings:
         0.0, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3); 0: none"
     )
     align_every: int = _option(5, "steps between two alignments")
+    layers: bool = _option(
+        False, "plates, a static field and a moving set instead of one field, where cameras stand still"
+    )
     age_tau_ms: float = copy_option("age_tau_ms")
     mask_stale_ms: float = copy_option("mask_stale_ms")
     mask_grow_px_s: float = copy_option("mask_grow_px_s")
@@ -99,6 +102,8 @@ class SplatSettings:
                 "splat: background must be auto, white, black, random or a color like '#80c0ff', "
                 f"not {self.background!r}"
             )
+        if self.layers and self.device == "cuda":
+            raise ValueError("splat: layers work on the CPU: device must be cpu or auto, not cuda")
         for name in ("radius_m", "near_m"):
             if getattr(self, name) is not None and not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"splat: {name} must be positive, not {getattr(self, name)}")

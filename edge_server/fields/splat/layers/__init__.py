@@ -1,0 +1,1 @@
+"""What moves before fixed cameras, apart from what stands still."""

@@ -1,0 +1,136 @@
+"""The state of a ``LayeredField`` as plain arrays: its parts, its cameras, the frames of the last second."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.field_state import unpack_meta
+from edge_server.fields.common.supervision import check_view
+from edge_server.fields.splat.cpu_field import SplatField
+from edge_server.fields.splat.layers.motion import ViewRow
+from edge_server.fields.splat.layers.moving_set import MovingSet
+from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
+from edge_server.fields.splat.layers.plates import Plate
+from edge_server.fields.splat.layers.static_field import StaticField
+from freshfield.geometry import Pinhole
+
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.layered_field import LayeredField
+
+Arrays = dict[str, NDArray[Any]]
+
+NAME = "splat in layers"
+COUNTERS = ("layered", "shown", "origin_ns", "fits", "anchors_s", "plates_s")  # attributes
+
+
+def pack(field: LayeredField) -> Arrays:
+    """Everything in one dictionary of copies."""
+    state: Arrays = {}
+    cameras, observations = [], []
+    for k, camera in enumerate(field.cameras.values()):
+        view = camera.view
+        cameras.append({
+            **_facts(view), "taken": list(camera.taken), "newest_s": _number(camera.newest_s),
+            "rendered_step": camera.rendered_step,
+            "intrinsics": asdict(view.intrinsics),
+        })  # fmt: skip
+        state |= {f"camera_{k}.image": view.image, f"camera_{k}.pose": view.camera_to_world}
+        state |= _prefixed(f"camera_{k}.plate.", camera.plate.state())
+        if camera.depth_m is not None:
+            state[f"camera_{k}.depth_m"] = camera.depth_m
+    for k, o in enumerate(field.observations):
+        observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
+        arrays: dict[str, NDArray[Any] | None] = {
+            "image": o.view.image, "foreground": o.foreground, "weight": o.weight, "shown": o.shown,
+                  "given": o.view.weight}  # fmt: skip
+        if o.row is not None:
+            arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
+        state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
+    state |= _prefixed("first.", field.first.state()) | _prefixed("static.", field.static.state())
+    if field.moving is not None:
+        state |= _prefixed("moving.", field.moving.state())
+    counters = {name: _number(getattr(field, name)) for name in COUNTERS}
+    meta = {"version": 1, "field": NAME, "settings": asdict(field.settings), **counters,
+            "moving": field.moving is not None, "cameras": cameras, "frames": observations}  # fmt: skip
+    return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
+
+
+def unpack(field: LayeredField, state: Arrays) -> None:
+    """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
+    meta = unpack_meta(field.settings, state, NAME, ("harmonics",))
+    field.first, field.static = (
+        SplatField(field.settings, field.pool),
+        StaticField(field.settings, field.pool),
+    )
+    field.first.load_state(_under("first.", state))
+    field.static.load_state(_under("static.", state))
+    field.moving = None
+    if meta["moving"]:
+        box = field.static.view_store.box
+        if box is None:
+            raise ValueError("the state has a moving set but no scene box")
+        field.moving = MovingSet(field.settings, field.pool, box, field.settings.seed)
+        field.moving.load_state(_under("moving.", state))
+    field.cameras = {}
+    for k, facts in enumerate(meta["cameras"]):
+        arrays = _under(f"camera_{k}.", state)
+        lens = {**facts["intrinsics"], "distortion": tuple(facts["intrinsics"]["distortion"])}
+        view = View(
+            facts["camera"], np.array(arrays["image"]), np.array(arrays["pose"]), Pinhole(**lens),
+            facts["generated_ns"], carried_to_ns=facts["carried_to_ns"],
+        )  # fmt: skip
+        check_view(view)
+        plate = Plate(view.image.shape[0], view.image.shape[1], field.pool)
+        plate.load_state(_under("plate.", arrays))
+        depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
+        newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
+        taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
+        field.cameras[view.camera] = FixedCamera(
+            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken
+        )
+    field.observations = Observations()
+    for k, facts in enumerate(meta["frames"]):
+        field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
+    for name in COUNTERS:
+        value = meta[name]
+        setattr(field, name, -np.inf if value is None and name.endswith("_s") else value)
+    field.finish_loading()
+
+
+def _observation(field: LayeredField, facts: dict[str, Any], arrays: Arrays) -> Observation:
+    found = {name: np.array(array) for name, array in arrays.items()}
+    view = replace(
+        field.cameras[facts["camera"]].view, image=found["image"], generated_ns=facts["generated_ns"],
+        carried_to_ns=facts["carried_to_ns"], weight=found.get("given"),
+    )  # fmt: skip
+    row = None
+    if "matrix" in found:
+        row = ViewRow(facts["instant_s"], found["matrix"], found["vector"], found["around"])
+    return Observation(
+        facts["instant_s"], view.camera, view, found["foreground"], found.get("weight"), row,
+        found.get("shown"), facts["fresh"],
+    )  # fmt: skip
+
+
+def _facts(view: View) -> dict[str, Any]:
+    return {"camera": view.camera, "generated_ns": view.generated_ns, "carried_to_ns": view.carried_to_ns}
+
+
+def _number(value: float | int | bool | None) -> float | int | bool | None:
+    """What JSON can hold: None for an infinite number."""
+    return None if value is None or not np.isfinite(value) else value
+
+
+def _prefixed(prefix: str, arrays: Arrays) -> Arrays:
+    return {prefix + name: array for name, array in arrays.items()}
+
+
+def _under(prefix: str, state: Arrays) -> Arrays:
+    return {name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)}

@@ -1,0 +1,278 @@
+"""The moving set: Gaussians that hang on anchors, learned over the plates of the cameras that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune, opacity
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, adam_step
+from edge_server.fields.splat.kernels.project import BLOCK, Gaussians
+from edge_server.fields.splat.layers.kernels.align import align_view
+from edge_server.fields.splat.layers.kernels.train_over import train_over
+from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
+from edge_server.fields.splat.layers.motion import Motion, ViewRow
+from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
+from edge_server.fields.splat.seeding import seed_gaussians
+from edge_server.fields.splat.settings import SplatSettings
+
+Arrays = dict[str, NDArray]
+
+GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels
+USUAL_SHARE = 0.062
+MOST_CROWD, CROWD_DECAY = 2.5, 0.998  # see ``follow_foreground``
+LEAST_ALIVE = 16  # Gaussians, below which nothing is aligned
+GAUSSIANS_AN_ANCHOR = 8  # at least
+GROW_EVERY = 80  # steps
+
+# Births, at an instant that most cameras have seen.
+CAMERA_SHARES = (0.58, 0.42)  # of the cameras, the first that is reached
+BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
+LEAST_FOREGROUND = 0.001  # share of all pixels
+KEEP_INSIDE, KEEP_MARGIN_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
+SEED_INSIDE, SEED_MARGIN_PX = 0.7, 3  # the same for a new one
+MISSING_ERROR = 0.12  # color error, in the worst channel, above which foreground needs new Gaussians
+SEEDS_A_PIXEL = 0.1
+FEW = 32  # Gaussians: all foreground needs new ones below this
+
+
+class MovingSet:
+    """Gaussians whose parameters hold where the anchors' displacements are 0.
+
+    cloud: the Gaussians. motion: displacements of the anchors.
+    anchor, share: int64 and float32 (N, 3), see ``Motion.attach``.
+    crowd: factor by which the capacity exceeds that of a usual foreground.
+    """
+
+    def __init__(self, settings: SplatSettings, pool: Pool, box: SceneBox, seed: int) -> None:
+        self.settings, self.pool, self.box, self.seed = settings, pool, box, seed
+        self.cloud = GaussianCloud.empty(settings)
+        self.anchor, self.share = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
+        self.crowd, self.steps, self._grown, self._draws = 1.0, 0, 0, 0
+        self.motion = Motion(box.radius_m, self._rng(0))
+        self.raster = RasterBuffers(pool)
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+    @property
+    def alive(self) -> bool:
+        """Whether there are enough Gaussians to be aligned."""
+        return len(self.cloud) >= LEAST_ALIVE
+
+    @property
+    def capacity(self) -> int:
+        """Largest number of Gaussians."""
+        return round(GAUSSIANS * (1.0 + (self.crowd - 1.0) / 3.0))
+
+    def follow_foreground(self, share: float) -> None:
+        """Let the capacity follow the foreground's share of the pixels: up at once, down slowly."""
+        self.crowd = max(CROWD_DECAY * self.crowd, min(max(share / USUAL_SHARE, 1.0), MOST_CROWD))
+
+    # --- at an instant ------------------------------------------------------------------------
+
+    def places(self, instant_s: float) -> NDArray[np.float32]:
+        """Where the Gaussians are at an instant, float32 (N, 3), scene units."""
+        return self.motion.displaced(self.cloud.params[:, :3], self.anchor, self.share, instant_s)
+
+    def gaussians(self, instant_s: float) -> Gaussians:
+        """The Gaussians of an instant, copied."""
+        params = self.cloud.params.copy()
+        params[:, :3] = self.places(instant_s)
+        return Gaussians(params, self.settings.harmonics, np.zeros((len(params), 3), np.float32))
+
+    def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
+        """From a camera to the middle of the Gaussians."""
+        middle = np.median(self.places(instant_s), axis=0)
+        apart = middle - self.box.normalise(camera.view.camera_to_world[:3, 3])
+        return float(np.linalg.norm(apart)) * self.box.radius_m
+
+    # --- motion -------------------------------------------------------------------------------
+
+    def align(self, observation: Observation, camera: FixedCamera) -> NDArray[np.float32]:
+        """Linearize a frame's error in the anchors' displacements: fills its ``row`` and ``shown``. Returns
+        the opacity of the moving set, float32 (H, W)."""
+        assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
+        instant_s = observation.instant_s
+        gaussians = self.gaussians(instant_s)
+        self.raster.project_and_bin(camera.row, gaussians, [None], differentiate=False)
+        m, v, shown, opacity = align_view(
+            self.raster,
+            camera.row[0],
+            gaussians.params[:, :3],
+            observation.view.image,
+            camera.plate.picture,
+            observation.weight,
+            self.anchor,
+            self.share,
+            len(self.motion.anchors),
+        )
+        observation.row = ViewRow(instant_s, m, v, self.motion.at(instant_s).ravel())
+        observation.shown = shown
+        return opacity
+
+    def run_kernels(self, camera: FixedCamera, observation: Observation) -> None:
+        """Run every kernel once, whatever comes of it."""
+        params = np.zeros((LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
+        self.cloud = GaussianCloud.new(params)
+        self.renew_anchors(observation.instant_s)
+        observation.weight = np.ones(observation.foreground.shape, np.float32)
+        self.align(observation, camera)
+        rates = np.zeros(params.shape[1], np.float32)
+        one = np.float32(1.0)
+        self.train(
+            observation,
+            camera,
+            AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one),
+        )
+        self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
+
+    # --- appearance ---------------------------------------------------------------------------
+
+    def train(self, observation: Observation, camera: FixedCamera, parameters: AdamParameters) -> int:
+        """One optimizer step on one frame, over the camera's plate. Returns pairs of Gaussian and tile."""
+        assert camera.row is not None and observation.weight is not None
+        raster, cloud = self.raster, self.cloud
+        gaussians = self.gaussians(observation.instant_s)
+        before = gaussians.params[:, :3].copy()
+        raster.project_and_bin(camera.row, gaussians, [None])
+        tasks = raster.tasks()
+        self.pool.run(
+            train_over, observation.view.image, camera.plate.picture, observation.weight, tasks,
+            raster.columns, raster.projected, raster.lists, raster.memory, raster.saved, raster.sums,
+            np.zeros(len(tasks)),
+        )  # fmt: skip
+        dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
+        self.pool.run(
+            adam_step, camera.row, gaussians, len(cloud), raster.projected, raster.lists.own_first,
+            raster.lists.own_count, raster.sums, cloud.optimizer_state(), parameters, dropped,
+        )  # fmt: skip
+        rest = cloud.params[:, :3] + (gaussians.params[:, :3] - before)
+        cloud.params[:] = gaussians.params
+        cloud.params[:, :3] = rest
+        self.steps += 1
+        if self.steps - self._grown >= GROW_EVERY:
+            self._grow(camera.view.intrinsics.width)
+        return int(raster.lists.needed[0])
+
+    def _grow(self, pixels: int) -> None:
+        """Split and prune; what is split keeps its anchors."""
+        self._grown = self.steps
+        self.cloud.guest[:] = np.arange(len(self.cloud))  # which Gaussian each comes from
+        densify_and_prune(self.cloud, replace(self.settings, gaussians=self.capacity), pixels, self._rng(1))
+        self.anchor, self.share = self.anchor[self.cloud.guest], self.share[self.cloud.guest]
+        self.cloud.guest[:] = 0
+
+    # --- births and removals ------------------------------------------------------------------
+
+    def birth_frames(self, observations: Observations, cameras: int) -> list[Observation]:
+        """The frames of the newest knot that most cameras have seen; none if there is no such knot."""
+        last = observations.newest_knot
+        for share in CAMERA_SHARES:
+            for knot in range(last, last - BIRTH_KNOTS, -1):
+                found = observations.of_knots(knot, knot)
+                if len(found) >= max(1, round(share * cameras)):
+                    return found
+        return []
+
+    def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
+        """Remove the Gaussians that lie outside the foregrounds that should hold them."""
+        if len(self.cloud):
+            places = [self.places(o.instant_s) for o in frames]
+            self._keep(self._inside(places, frames, cameras, KEEP_MARGIN_PX) >= KEEP_INSIDE)
+
+    def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
+        """Seed Gaussians in foreground that is not rendered as it is. Frames that show the moving set
+        (``Observation.shown``) tell where that is."""
+        missing = [o.foreground & _is_wrong(o) if len(self.cloud) > FEW else o.foreground for o in frames]
+        pixels = sum(int(mask.sum()) for mask in missing)
+        count = min(int(SEEDS_A_PIXEL * pixels), self.capacity - len(self.cloud))
+        if count <= 4:
+            return
+        instant_s = float(np.mean([o.instant_s for o in frames]))
+        params = seed_gaussians(
+            self.settings, self.pool, self.box, [o.view for o in frames], missing, np.zeros(0, np.float32),
+            count, self._rng(2), [o.foreground for o in frames],
+        )  # fmt: skip
+        places = [params[:, :3]] * len(frames)
+        if len(params) and self.motion.anchors is not None:
+            anchor, share = self.motion.attach(params[:, :3], instant_s)
+            shift = self.motion.displaced(np.zeros_like(params[:, :3]), anchor, share, instant_s)
+            params[:, :3] -= shift
+            places = [self.motion.displaced(params[:, :3], anchor, share, o.instant_s) for o in frames]
+        inside = self._inside(places, frames, cameras, SEED_MARGIN_PX) >= SEED_INSIDE
+        if not inside.any():
+            return
+        self.cloud.add(GaussianCloud.new(params[inside]))
+        if self.motion.anchors is None:
+            self.renew_anchors(instant_s)
+        else:
+            self.anchor = np.concatenate([self.anchor, anchor[inside]])
+            self.share = np.concatenate([self.share, share[inside]])
+
+    def renew_anchors(self, instant_s: float) -> None:
+        """Choose anchors anew; parameters then hold at ``instant_s``. All frames must be aligned again."""
+        if self.motion.anchors is not None:
+            self.cloud.params[:, :3] = self.places(instant_s)
+        places = self.cloud.params[:, :3]
+        count = min(round(ANCHORS * self.crowd), max(1, len(places) // GAUSSIANS_AN_ANCHOR))
+        self.motion.choose_anchors(places, opacity(self.cloud.params), count, instant_s)
+        self.anchor, self.share = self.motion.attach(places, instant_s)
+
+    def _keep(self, which: NDArray[np.bool_]) -> None:
+        self.cloud.keep(which)
+        self.anchor, self.share = self.anchor[which], self.share[which]
+
+    def _inside(
+        self, places: Sequence[NDArray[np.float32]], frames: Sequence[Observation],
+        cameras: dict[str, FixedCamera], margin_px: int,
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Share (N,) of the frames that see a point in whose foreground, grown, it lies.
+
+        places: for each frame (N, 3), the points at its instant."""
+        seen, inside = (np.zeros(len(places[0]), np.int32) for _ in range(2))
+        square = np.ones((margin_px, margin_px), np.uint8)
+        for points, o in zip(places, frames, strict=True):
+            mask = cv2.dilate(o.foreground.astype(np.uint8), square)
+            self.pool.run(
+                count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside
+            )
+        return inside / np.maximum(seen, 1)
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Everything needed to continue bit for bit."""
+        cloud = {f"cloud.{f.name}": getattr(self.cloud, f.name).copy() for f in fields(self.cloud)}
+        motion = {f"motion.{name}": array for name, array in self.motion.state().items()}
+        counters = np.array([self.steps, self._grown, self._draws], np.int64)
+        return {**cloud, **motion, "anchor": self.anchor.copy(), "share": self.share.copy(),
+                "crowd": np.array(self.crowd), "counters": counters}  # fmt: skip
+
+    def load_state(self, state: Arrays) -> None:
+        """Continue from ``state``. KeyError: it lacks something."""
+        self.cloud = GaussianCloud(*(np.array(state[f"cloud.{f.name}"]) for f in fields(GaussianCloud)))
+        prefix = "motion."
+        self.motion.load_state({n[len(prefix) :]: a for n, a in state.items() if n.startswith(prefix)})
+        self.anchor, self.share = np.array(state["anchor"]), np.array(state["share"])
+        self.crowd = float(state["crowd"])
+        self.steps, self._grown, self._draws = (int(n) for n in state["counters"])
+
+    def _rng(self, purpose: int) -> np.random.Generator:
+        self._draws += 1
+        return np.random.default_rng(np.random.SeedSequence([self.seed, self._draws, purpose, 6]))
+
+
+def _is_wrong(observation: Observation) -> NDArray[np.bool_]:
+    """The pixels of a frame that the moving set does not show as they are, bool (H, W)."""
+    if observation.shown is None:
+        return np.ones(observation.foreground.shape, bool)
+    error = np.abs(observation.shown - observation.view.image[..., :3] * np.float32(1.0 / 255.0))
+    return np.asarray(error.max(axis=2) > MISSING_ERROR)

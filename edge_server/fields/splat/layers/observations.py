@@ -1,0 +1,126 @@
+"""What the layers keep of cameras and of the frames of the last second."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.splat.layers.motion import KNOTS_PER_S, ViewRow
+from edge_server.fields.splat.layers.plates import Plate
+
+NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
+BACKGROUND_WEIGHT = 0.5  # of other pixels
+OCCLUDED_M = 0.15  # pixels do not count where the static field is nearer than the moving set by this
+FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
+
+
+@dataclass
+class FixedCamera:
+    """A camera that stands still.
+
+    view: its first frame. row: float32 (1, CAMERA), see ``camera_rows``; None before there is a scene box.
+    depth_m: float32 (H, W), of the static field; None before it was rendered.
+    rendered_step: step of the static field at which that was.
+    newest_s: instant of the newest frame that was aligned.
+    taken: ``generated_ns`` of the latest frames taken in.
+    """
+
+    view: View
+    plate: Plate
+    row: NDArray[np.float32] | None = None
+    depth_m: NDArray[np.float32] | None = None
+    rendered_step: int = -1
+    newest_s: float = -np.inf
+    taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
+
+
+@dataclass(order=True)
+class Observation:
+    """A frame, and its linearization in the anchors' displacements.
+
+    instant_s: what it shows, seconds from the field's origin.
+    foreground: bool (H, W). weight: float32 (H, W), how much each pixel counts.
+    row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
+    shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
+    """
+
+    instant_s: float
+    camera: str
+    view: View = field(compare=False)
+    foreground: NDArray[np.bool_] = field(compare=False)
+    weight: NDArray[np.float32] | None = field(default=None, compare=False)
+    row: ViewRow | None = field(default=None, compare=False)
+    shown: NDArray[np.float32] | None = field(default=None, compare=False)
+    fresh: bool = field(default=True, compare=False)
+
+    @property
+    def knot(self) -> int:
+        """The knot at or before the instant."""
+        return knot_of(self.instant_s)
+
+
+def knot_of(instant_s: float) -> int:
+    """The number of the knot at or before an instant. A frame taken at a knot counts there, however its
+    nanoseconds are rounded."""
+    return int(np.floor(instant_s * KNOTS_PER_S + 1e-3))
+
+
+class Observations:
+    """The frames of the last second, by instant and camera."""
+
+    def __init__(self) -> None:
+        self._sorted: list[Observation] = []
+
+    def __iter__(self) -> Iterator[Observation]:
+        return iter(self._sorted)
+
+    def __len__(self) -> int:
+        return len(self._sorted)
+
+    @property
+    def newest_s(self) -> float:
+        """The instant of the newest frame."""
+        return self._sorted[-1].instant_s
+
+    @property
+    def newest_knot(self) -> int:
+        """The knot at or before that."""
+        return self._sorted[-1].knot
+
+    def add(self, observation: Observation) -> None:
+        insort(self._sorted, observation)
+
+    def forget_before(self, instant_s: float) -> None:
+        """Drop the frames before ``instant_s``."""
+        self._sorted = [o for o in self._sorted if o.instant_s >= instant_s]
+
+    def of_knots(self, first: int, last: int) -> list[Observation]:
+        """The frames from knot ``first`` to knot ``last``, both included."""
+        return [o for o in self._sorted if first <= o.knot <= last]
+
+
+def pixel_weights(
+    foreground: NDArray[np.bool_],
+    depth_m: NDArray[np.float32] | None,
+    distance_m: float,
+    given: NDArray | None,
+) -> NDArray[np.float32]:
+    """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
+    field hides what moves.
+
+    foreground: bool (H, W). depth_m: float32 (H, W), of the static field, or None.
+    distance_m: of the moving set. given: float32 (H, W), ``View.weight``, or None.
+    """
+    square = np.ones((NEAR_FOREGROUND_PX, NEAR_FOREGROUND_PX), np.uint8)
+    near = cv2.dilate(foreground.astype(np.uint8), square)
+    weight = np.where(near > 0, np.float32(1.0), np.float32(BACKGROUND_WEIGHT))
+    if depth_m is not None:
+        weight[~foreground & (depth_m > 0.0) & (depth_m < distance_m - OCCLUDED_M)] = 0.0
+    return weight if given is None else weight * given

@@ -1,0 +1,182 @@
+"""The plate of a fixed camera: what it sees where nothing moves; and the foreground, what is not the plate.
+
+Each pixel remembers a few colors that it has shown while it held still, with decaying votes. The color with
+most votes is the plate, once it has enough of them. Colors are in steps of 255.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.layers.kernels.plates import (
+    BRIGHT,
+    CHANGING,
+    DARK,
+    FOREGROUND,
+    LIKE_STATIC,
+    MODES,
+    PlateArrays,
+    compare_with_plate,
+    count_exposure,
+    vote,
+)
+
+Arrays = dict[str, NDArray]
+
+LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
+GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
+CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
+HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
+
+
+class Plate:
+    """The plate of one camera.
+
+    arrays: ``PlateArrays``.
+    picture: float32 (H, W, 3), the plate; where it is unknown, the static field's rendering.
+    gain: float32 (3,), exposure of the newest frame over that of the first, by channel.
+    count: number of frames taken in.
+    """
+
+    def __init__(self, height: int, width: int, pool: Pool) -> None:
+        def zeros(*shape: int) -> NDArray[np.float32]:
+            return np.zeros((height, width, *shape), np.float32)
+
+        self.pool = pool
+        self.arrays = PlateArrays(
+            means=np.stack([zeros(3)] * MODES), blurred=np.stack([zeros(3)] * MODES),
+            weight=np.stack([zeros()] * MODES), total=zeros(), run=np.zeros((height, width), np.int32),
+            deviation=zeros(), known=np.zeros((height, width), bool),
+        )  # fmt: skip
+        self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
+        self._recent = np.zeros((max(LAGS), height, width, 3), np.float32)  # blurred frames, a ring
+        self._held: NDArray[Any] = np.zeros((height, width), np.uint8)
+        self._static, self._has_static = zeros(3), False
+        self._static_blurred: NDArray[Any] = zeros(3)
+        self._difference, self._flags = zeros(), np.zeros((height, width), np.uint8)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """bool (H, W), where there is a plate."""
+        return self.arrays.known
+
+    def at_first_exposure(self) -> NDArray[np.float32]:
+        """The plate as the camera would see it with the exposure of its first frame, float32 (H, W, 3)."""
+        return self.picture / self.gain
+
+    def take(self, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W)."""
+        self._follow_exposure(image)
+        blurred = cv2.boxFilter(image, cv2.CV_32F, (3, 3))
+        earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
+        earlier_frames = np.stack(earlier or [blurred])
+        self.pool.run(
+            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier),
+            self._static_blurred[None], self._has_static, self._difference, self._flags,
+        )  # fmt: skip
+        foreground = np.zeros_like(self._flags)
+        votes = np.ones_like(foreground)
+        if self.count > 0:
+            foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
+            changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
+            votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
+        self.pool.run(
+            vote, image, blurred, self._difference, foreground, votes.astype(np.uint8), self._held,
+            self.arrays, self._static, self._has_static, self.picture,
+        )  # fmt: skip
+        self._recent[self.count % len(self._recent)] = blurred
+        self.count += 1
+        return foreground > 0
+
+    def hold(
+        self, image: NDArray[np.uint8], shown: NDArray[np.float32], opacity: NDArray[np.float32]
+    ) -> None:
+        """Keep out of the plate, until the next call, what the moving set explains.
+
+        image: uint8 (H, W, 3), the camera's newest frame.
+        shown: float32 (H, W, 3) in [0, 1], the moving set over the plate. opacity: float32 (H, W), its own.
+        """
+        error = cv2.blur(cv2.absdiff(shown, image * np.float32(1.0 / 255.0)), (3, 3))
+        worst = np.maximum(np.maximum(error[..., 0], error[..., 1]), error[..., 2])
+        explained = ((opacity > HELD_OPACITY) & (worst < HELD_ERROR)).astype(np.uint8)
+        self._held = cv2.dilate(explained, np.ones((3, 3), np.uint8))
+
+    def stand_in(self, color: NDArray[np.float32]) -> None:
+        """Use the static field's rendering, float32 (H, W, 3) in [0, 1] at the exposure of the first frame,
+        where there is no plate."""
+        self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)
+        self._static_blurred, self._has_static = cv2.blur(self._static, (3, 3)), True
+        self.picture = np.where(self.known[..., None], self.arrays.means[0], self._static)
+
+    def state(self) -> Arrays:
+        """Everything needed to continue bit for bit."""
+        mine = {**self.arrays._asdict(), "picture": self.picture, "gain": self.gain, "recent": self._recent,
+                "held": self._held, "static": self._static, "static_blurred": self._static_blurred,
+                "counters": np.array([self.count, int(self._has_static)])}  # fmt: skip
+        return {name: array.copy() for name, array in mine.items()}
+
+    def load_state(self, state: Arrays) -> None:
+        """Continue from ``state``. KeyError: it lacks something."""
+        mine = {name: np.array(array) for name, array in state.items()}
+        self.arrays = PlateArrays(*(mine[name] for name in PlateArrays._fields))
+        self.picture, self.gain, self._recent = mine["picture"], mine["gain"], mine["recent"]
+        self._held, self._static, self._static_blurred = mine["held"], mine["static"], mine["static_blurred"]
+        self.count, self._has_static = int(mine["counters"][0]), bool(mine["counters"][1])
+
+    def _follow_exposure(self, image: NDArray[np.uint8]) -> None:
+        """Scale everything remembered when light or exposure change: by the median ratio of frame and plate,
+        for each channel, where that is off by more than GAIN_STEP for one."""
+        if self.count == 0:
+            return
+        counts = np.zeros((3, 3), np.int64)
+        self.pool.run(count_exposure, image, self.arrays, counts)
+        used = counts[:, 0]
+        # The median is beyond a bound if more than half of the ratios are.
+        if (
+            used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4
+            or (2 * counts[:, 1:] <= used[:, None]).all()
+        ):
+            return
+        plate = self.arrays.means[0, ::2, ::2]
+        use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
+        gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
+        self.gain = self.gain * gain
+        for array in (self.arrays.means, self.arrays.blurred):
+            np.clip(array * gain, 0.0, 255.0, out=array)
+        for array in (self._recent, self._static, self._static_blurred):
+            array *= gain
+
+
+def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Remove specks of fewer than SPECK pixels, close gaps of CLOSE pixels, fill holes of up to HOLE of the
+    image. mask: uint8 (H, W), 0 or not. Returns 0 or 1."""
+    height, width = mask.shape
+    x, y, w, h = cv2.boundingRect(mask)
+    out = np.zeros_like(mask)
+    if w == 0:
+        return out
+    left, top, right, bottom = max(x - 2, 0), max(y - 2, 0), min(x + w + 2, width), min(y + h + 2, height)
+    part: NDArray[Any] = (mask[top:bottom, left:right] > 0).astype(np.uint8)
+    part = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
+    keep = (stats[:, cv2.CC_STAT_AREA] >= SPECK).astype(np.uint8)
+    keep[0] = 0
+    part = cv2.copyMakeBorder(keep[label], CLOSE, CLOSE, CLOSE, CLOSE, cv2.BORDER_CONSTANT, value=0)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE))
+    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, ellipse)[CLOSE:-CLOSE, CLOSE:-CLOSE]
+    _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
+    x0, y0 = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    x1, y1 = x0 + stats[:, cv2.CC_STAT_WIDTH], y0 + stats[:, cv2.CC_STAT_HEIGHT]
+    goes_on = (  # beyond the bounding box: no hole
+        ((x0 == 0) & (left > 0)) | ((y0 == 0) & (top > 0))
+        | ((x1 == right - left) & (right < width)) | ((y1 == bottom - top) & (bottom < height))
+    )  # fmt: skip
+    fill = ((stats[:, cv2.CC_STAT_AREA] <= HOLE * mask.size) & ~goes_on).astype(np.uint8)
+    fill[0] = 0
+    out[top:bottom, left:right] = part | fill[label]
+    return out

@@ -1,0 +1,66 @@
+"""An immutable picture of both layers, at any instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.splat.cpu_field import MAX_AHEAD_S
+from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.layers.motion import Motion
+from edge_server.fields.splat.snapshot import SplatSnapshot
+
+
+@dataclass(frozen=True)
+class MovingSnapshot:
+    """The moving set, never written after construction.
+
+    params: float32 (N, P), where displacements are 0. anchor, share: (N, 3), see ``Motion.attach``.
+    motion: a copy of its own.
+    origin_ns: where the motion's seconds begin. newest_s: instant of the newest frame.
+    """
+
+    params: NDArray[np.float32]
+    anchor: NDArray[np.int64]
+    share: NDArray[np.float32]
+    motion: Motion
+    origin_ns: int
+    newest_s: float
+
+    def ahead_s(self, present_ns: int | None) -> float:
+        """How much later than the newest frame to show: no farther than motion can be extrapolated."""
+        if present_ns is None:
+            return 0.0
+        return min((present_ns - self.origin_ns) / 1e9 - self.newest_s, MAX_AHEAD_S)
+
+    def params_at(self, ahead_s: float) -> NDArray[np.float32]:
+        """Parameters, float32 (N, P), so much later than the newest frame."""
+        params = self.params.copy()
+        params[:, :3] = self.motion.displaced(
+            self.params[:, :3], self.anchor, self.share, self.newest_s + ahead_s
+        )
+        return params
+
+
+@dataclass(frozen=True)
+class LayeredSnapshot(SplatSnapshot):
+    """The static field and the moving set at one instant; ``at`` shows another.
+
+    static: float32 (N, P), the Gaussians of the static field. moving: None where nothing moves.
+    """
+
+    static: NDArray[np.float32] | None = None
+    moving: MovingSnapshot | None = None
+
+    def at(self, present_ns: int | None) -> LayeredSnapshot:
+        """The snapshot of another instant; None: that of the newest frame."""
+        if self.moving is None or self.static is None:
+            return self
+        ahead_s = self.moving.ahead_s(present_ns)
+        params = np.concatenate([self.static, self.moving.params_at(ahead_s)])
+        still = np.zeros((len(params), 3), np.float32)
+        return replace(
+            self, gaussians=Gaussians(params, self.gaussians.harmonics, still), ahead_s=ahead_s, raster=None
+        )

@@ -1,0 +1,187 @@
+"""The field in layers: a ball that moves before fixed cameras, a scene at rest, and cameras that move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import make_field
+from edge_server.fields.splat.cpu_field import SplatField
+from edge_server.fields.splat.layers import layered_field, static_field
+from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.settings import SplatSettings
+from tests.edge_server.fields.scenes import picture, psnr, ring
+
+SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
+CAMERAS, HELD = ring(12)[:11], ring(12)[11]
+FRAME_S = 1.0 / 15.0
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plates of one second, and a short schedule."""
+    monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
+    monkeypatch.setattr(layered_field, "SHOWN_AFTER", 60)
+    monkeypatch.setattr(static_field, "SCHEDULE", 200)
+    monkeypatch.setattr(static_field, "ROUNDS_FIRST", 5)
+    monkeypatch.setattr(static_field, "ROUNDS_AGAIN", 3)
+
+
+def _ball_m(instant_s: float, moves: bool) -> np.ndarray:
+    """The ball comes from aside after a second and a half and goes around."""
+    if not moves or instant_s < 1.5:
+        return np.array([5.0, 0.0, 0.5])
+    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+
+
+@cache
+def _frame(camera: int, frame: int, moves: bool) -> View:
+    """Each camera at a phase of its own."""
+    view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
+    image = picture(view.intrinsics, view.camera_to_world, _ball_m(instant_s, moves))
+    return replace(view, image=image, generated_ns=round(instant_s * 1e9))
+
+
+def _run(field: Any, frames: range, moves: bool = True, steps: int = 30) -> None:
+    for frame in frames:
+        field.fit([_frame(k, frame, moves) for k in range(len(CAMERAS))], Budget(steps=steps))
+
+
+def _same_state(a: Any, b: Any) -> None:
+    """Both hold the same numbers, bit for bit."""
+    one, two = a.state(), b.state()
+    assert one.keys() == two.keys()
+    for name in one:
+        if not name.endswith("meta"):  # settings are in it: threads may differ
+            np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+
+
+def _score(shown: Any, instant_s: float, moves: bool = True) -> float:
+    truth = picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(instant_s, moves))
+    return psnr(shown.render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
+
+
+def test_the_option_makes_it() -> None:
+    assert type(make_field("splat", {"layers": True, "threads": 1})) is LayeredField
+    assert type(make_field("splat", {"threads": 1})) is SplatField
+    with pytest.raises(ValueError, match="layers work on the CPU"):
+        make_field("splat", {"layers": True, "device": "cuda"})
+
+
+def test_it_is_the_plain_field_at_first_and_where_a_camera_moves() -> None:
+    layered, plain = LayeredField(SMALL), SplatField(SMALL)
+    for field in (layered, plain):
+        _run(field, range(4))
+    _same_state(layered.first, plain)
+    turned = replace(_frame(0, 4, True), camera_to_world=CAMERAS[1].camera_to_world)
+    for field in (layered, plain):
+        field.fit([turned, _frame(2, 4, True)], Budget(steps=10))
+    assert not layered.layered
+    _run(layered, range(20, 40), steps=2)
+    _run(plain, range(20, 40), steps=2)
+    _same_state(layered.first, plain)
+    shown, expected = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (layered, plain))
+    np.testing.assert_array_equal(shown, expected)
+
+
+def test_nothing_moves_where_nothing_moves() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(36), moves=False)
+    assert field.shown and field.moving is not None and len(field.moving) == 0
+    assert field.static.finished
+    report = field.fit([_frame(0, 40, False)], Budget(steps=30))
+    assert report.steps == 0  # all is learned
+    assert _score(field.snapshot(), 2.0, moves=False) > 22.0
+
+
+@cache
+def _moving() -> LayeredField:
+    field = LayeredField(SMALL)
+    _run(field, range(42))
+    return field
+
+
+def test_what_moves_is_shown_at_any_instant() -> None:
+    field = _moving()
+    assert field.moving is not None and field.moving.alive
+    instant_s = 42 * FRAME_S
+    now = field.snapshot(round(instant_s * 1e9))
+    assert _score(now, instant_s) > 22.0
+    ahead = now.at(round((instant_s + 0.2) * 1e9))
+    assert _score(ahead, instant_s + 0.2) > _score(now, instant_s + 0.2) + 0.5
+    earlier = now.at(round((instant_s - 0.3) * 1e9))
+    assert _score(earlier, instant_s - 0.3) > _score(now, instant_s - 0.3) + 1.0
+    again = earlier.at(round(instant_s * 1e9))
+    np.testing.assert_array_equal(again.gaussians.params, now.gaussians.params)
+
+
+def test_a_snapshot_stays_as_it_is() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    shown = field.snapshot()
+    before = shown.render(HELD.camera_to_world, HELD.intrinsics).color
+    _run(field, range(42, 45))
+    np.testing.assert_array_equal(shown.render(HELD.camera_to_world, HELD.intrinsics).color, before)
+    np.testing.assert_array_equal(shown.at(None).render(HELD.camera_to_world, HELD.intrinsics).color, before)
+
+
+def test_a_state_continues_bit_for_bit() -> None:
+    field, other = LayeredField(SMALL), LayeredField(SMALL)
+    field.load_state(_moving().state())
+    _same_state(field, _moving())
+    _run(field, range(42, 44))
+    other.load_state(field.state())
+    for one in (field, other):
+        _run(one, range(44, 50))
+    _same_state(field, other)
+    one, two = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (field, other))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_the_order_and_the_threads_change_nothing() -> None:
+    one, two = LayeredField(SMALL), LayeredField(replace(SMALL, threads=1))
+    for field in (one, two):
+        field.load_state(_moving().state())
+    views = [_frame(k, frame, True) for frame in (42, 43) for k in range(len(CAMERAS))]
+    one.fit(views, Budget(steps=5))
+    two.fit(views[::-1], Budget(steps=5))
+    two.fit(views, Budget(steps=0))
+    one.fit(views[:3], Budget(steps=0))
+    _same_state(one, two)
+
+
+def test_a_refused_state_changes_nothing() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(2))
+    before = field.state()
+    for wrong in (
+        SplatField(SMALL).state(),
+        {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
+    ):
+        with pytest.raises(ValueError):
+            field.load_state(wrong)
+    after = field.state()
+    assert all(np.array_equal(after[name], array) for name, array in before.items())
+
+
+def test_reset_forgets() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    field.reset()
+    _same_state(field, LayeredField(SMALL))
+
+
+def test_it_warms_up() -> None:
+    assert LayeredField(SMALL).warm_up() > 0.0
+
+
+def test_seconds_are_kept_and_motion_goes_first() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    report = field.fit([_frame(k, 42, True) for k in range(len(CAMERAS))], Budget(seconds=0.5))
+    assert report.seconds < 0.8

@@ -1,0 +1,118 @@
+"""What becomes a plate, and what is foreground: a body that passes, stays, or hides in a change of light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.layers.plates import CLOSE, HOLE, SPECK, Plate, clean_mask
+
+SIZE = 48
+WALL = cv2.resize(np.random.default_rng(0).integers(60, 180, (12, 12, 3), np.uint8), (SIZE, SIZE))
+BODY = slice(16, 32)
+
+
+def _frame(at: int | None = None) -> np.ndarray:
+    """The wall, with a body at column ``at``."""
+    image = WALL.copy()
+    if at is not None:
+        image[BODY, at : at + 10] = (250, 30, 30)
+    return image
+
+
+def _seen(frames: int = 12) -> Plate:
+    plate = Plate(SIZE, SIZE, CallerPool())
+    for _ in range(frames):
+        assert not plate.take(_frame()).any()
+    return plate
+
+
+def test_a_body_that_passes_is_foreground_and_leaves_no_trace() -> None:
+    plate = _seen()
+    for at in range(0, 36, 4):
+        expected = np.zeros((SIZE, SIZE), bool)
+        expected[BODY, at : at + 10] = True
+        foreground = plate.take(_frame(at))
+        assert (foreground != expected).sum() < 60 and foreground[expected].mean() > 0.95
+    np.testing.assert_allclose(plate.picture, WALL, atol=1.0)
+
+
+def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:
+    for held in (False, True):
+        plate = _seen()
+        for _ in range(20):
+            image = _frame(20)
+            foreground = plate.take(image)
+            if held:
+                opacity = np.zeros((SIZE, SIZE), np.float32)
+                opacity[BODY, 20:30] = 1.0
+                plate.hold(image, image / np.float32(255.0), opacity)
+        assert foreground[BODY, 20:30].all() == held
+        expected = WALL[20:28, 22:28] if held else np.full((8, 6, 3), (250, 30, 30))
+        np.testing.assert_allclose(plate.picture[20:28, 22:28], expected, atol=1.0)
+
+
+def test_a_change_of_exposure_is_no_foreground() -> None:
+    plate = _seen()
+    darker = (WALL * 0.8 + 0.5).astype(np.uint8)
+    assert not plate.take(darker).any()
+    np.testing.assert_allclose(plate.gain, 0.8, atol=0.02)
+    np.testing.assert_allclose(plate.at_first_exposure(), WALL, atol=3.0)
+
+
+def test_what_is_unknown_is_compared_with_the_static_field() -> None:
+    plate = Plate(SIZE, SIZE, CallerPool())
+    for k in range(20):  # a curtain that never holds still
+        image = _frame()
+        image[:, 30:] = (40, 220)[k % 2]
+        plate.take(image)
+    assert not plate.known[5:-5, 36:-5].any() and plate.known[:, :26].all()
+    plate.stand_in(WALL / np.float32(255.0))
+    np.testing.assert_allclose(plate.picture[5:-5, 36:-5], WALL[5:-5, 36:-5], atol=0.1)
+    assert not plate.take(_frame()).any()
+    assert plate.take(_frame(34))[BODY, 35:43].all()
+
+
+def test_a_state_continues_bit_for_bit() -> None:
+    plate = _seen()
+    plate.take(_frame(4))
+    plate.stand_in(WALL / np.float32(255.0))
+    other = Plate(SIZE, SIZE, CallerPool())
+    other.load_state(plate.state())
+    for at in (8, 12, 40):
+        np.testing.assert_array_equal(plate.take(_frame(at)), other.take(_frame(at)))
+    for name, array in plate.state().items():
+        np.testing.assert_array_equal(array, other.state()[name], err_msg=name)
+
+
+def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
+    """``clean_mask`` without cutting out what is not empty."""
+    part = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
+    keep = stats[:, 4] >= SPECK
+    keep[0] = False
+    part = cv2.copyMakeBorder(keep[label].astype(np.uint8), *[CLOSE] * 4, cv2.BORDER_CONSTANT, value=0)
+    part = cv2.morphologyEx(
+        part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE))
+    )
+    part = np.ascontiguousarray(part[CLOSE:-CLOSE, CLOSE:-CLOSE])
+    _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
+    fill = stats[:, 4] <= HOLE * mask.size
+    fill[0] = False
+    return part | fill[label]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_mask_is_cleaned_as_a_whole(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((40, 52), np.uint8)
+    y, x = rng.integers(3, 10, 2)
+    noise = cv2.resize(rng.random((8, 9)), (26, 22)) > 0.45
+    mask[y : y + 22, x : x + 26] = noise
+    np.testing.assert_array_equal(clean_mask(mask), _cleaned_whole(mask))
+
+
+def test_an_empty_mask_stays_empty() -> None:
+    assert not clean_mask(np.zeros((9, 9), np.uint8)).any()
