@@ -8,7 +8,7 @@ import pytest
 from camera_node.pose.providers import read_tum
 from camera_node.sources.datasets.formats import open_dataset
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import Shot
+from edge_server.export import PosedImage
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.run_source import write_images
 from edge_server.export.trajectory import write_tum
@@ -20,11 +20,11 @@ BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
 NEAR_PX = 0.01
 
 
-def shots() -> list[Shot]:
+def shots() -> list[PosedImage]:
     """One picture a camera, half of the lenses bent."""
     straight, bent = sets.rig(3), sets.rig(3, BENT)
     cameras = [straight[0], bent[1], straight[2], bent[0]]
-    return [Shot(f"view{k}", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
+    return [PosedImage(f"view{k}", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
 
 
 def pixels(camera_to_world: np.ndarray, lens: Pinhole, points: np.ndarray = sets.POINTS) -> np.ndarray:

@@ -108,7 +108,8 @@ class SplatField:
         while (progress := pace.begin_step(self._step_time)) is not None:
             with self._lock:
                 loss, seen, pairs, lost = self._one_step(progress)
-            losses.append(loss)
+            if loss is not None:
+                losses.append(loss)
             rays, samples, dropped = rays + seen, samples + pairs, dropped + lost
             pace.end_step()
         self.dropped += dropped
@@ -364,9 +365,12 @@ class SplatField:
             wanted.append(mask)
         return picked, wanted
 
-    def _one_step(self, progress: float) -> tuple[float, int, int, int]:
-        """One optimizer step at ``progress`` of the fit, in [0, 1]; returns the mean squared error, pixels,
-        pairs of a Gaussian and a tile, and how many tiles and gradients were not finite."""
+    def _one_step(self, progress: float) -> tuple[float | None, int, int, int]:
+        """One optimizer step at ``progress`` of the fit, in [0, 1].
+
+        Returns the mean squared error (None where a view was refused and the step left out), pixels, pairs of
+        a Gaussian and a tile, and how many tiles and gradients were not finite.
+        """
         s, box = self.settings, self.view_store.box
         assert box is not None
         key = step_key(s.seed, self.step)
@@ -395,7 +399,7 @@ class SplatField:
             by_view = [float(np.median(by_tile[tasks[:, 0] == b])) for b in range(len(picked))]
             if self._refuses(picked, by_view):
                 self._finish_step()
-                return float(losses[:, 1].sum()) / (3 * pixels), pixels, pairs, 0
+                return None, pixels, pairs, 0
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
         self.pool.run(
             adam_step, cams, gaussians, len(cloud), raster.projected, raster.lists.own_first,

@@ -62,7 +62,7 @@ class GsplatField(SplatField):
                 )
         return super()._ingest(views)
 
-    def _one_step(self, progress: float) -> tuple[float, int, int, int]:
+    def _one_step(self, progress: float) -> tuple[float | None, int, int, int]:
         s, cloud = self.settings, self.cloud
         picked, _ = self._choose_tiles(step_key(s.seed, self.step))
         params = torch.tensor(cloud.params, device=self._device, requires_grad=True)
@@ -86,7 +86,7 @@ class GsplatField(SplatField):
             square += float((weight * error.detach().square()).sum())
         if self._unjudged and self._refuses(picked, np.nan_to_num(errors, nan=1.0).tolist()):
             self._finish_step()
-            return square / (3 * max(pixels, 1)), pixels, 0, lost
+            return None, pixels, 0, lost
         gradient = np.zeros_like(cloud.params) if params.grad is None else params.grad.cpu().numpy()
         lost += int((~np.isfinite(gradient)).sum())
         self._adam(np.nan_to_num(gradient, posinf=0.0, neginf=0.0), drawn.cpu().numpy() > 0, progress)

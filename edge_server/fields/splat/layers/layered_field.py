@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, FitReport, Renderer, Rendering, View
+from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.field_state import all_or_nothing
 from edge_server.fields.common.supervision import check_view
@@ -35,7 +35,7 @@ from edge_server.fields.splat.layers.observations import (
 )
 from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
-from edge_server.fields.splat.layers.static_field import StaticField
+from edge_server.fields.splat.layers.static_field import SCHEDULE, StaticField
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole
 
@@ -104,7 +104,9 @@ class LayeredField:
             return self.first.fit(_newest_of_each(views), _remaining(budget, self.now() - start))
         self.fits += 1
         self._learn_plates()
-        rays, samples = self._follow_motion(pace) if len(self.observations) else (0, 0)
+        # On the wall clock, following motion would leave the first schedule of the static field no time.
+        follows = len(self.observations) and (budget.seconds is None or self.static.step >= SCHEDULE)
+        rays, samples = self._follow_motion(pace) if follows else (0, 0)
         begun = self.now()
         loss, static_rays, static_samples = self.static.train(pace)
         self._spent("static field", begun)
@@ -121,7 +123,7 @@ class LayeredField:
         """Surface points in world meters and their colors; none before the first fit."""
         return self.snapshot().points(count)
 
-    def snapshot(self, present_ns: int | None = None) -> Renderer:
+    def snapshot(self, present_ns: int | None = None) -> Snapshot:
         """The scene at an instant; None: that of the newest view."""
         published = self._published
         return self.first.snapshot(present_ns) if published is None else published.at(present_ns)

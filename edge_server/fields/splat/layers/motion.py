@@ -76,6 +76,10 @@ class Motion:
 
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
+        self._pool = CallerPool()
+        self._clear()
+
+    def _clear(self) -> None:
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
@@ -83,7 +87,6 @@ class Motion:
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
         self._band = np.zeros((0, BAND, 0, 0), np.float32)  # see ``kernels.solve``, of the last solution
         self._spans: list[_Span] = []
-        self._pool = CallerPool()
 
     @property
     def oldest_s(self) -> float:
@@ -307,7 +310,7 @@ class Motion:
     def load_state(self, state: dict[str, NDArray]) -> None:
         """Continue from ``state``, bit for bit."""
         if not state:
-            self.__init__(self.radius_m, self.rng)
+            self._clear()
             return
         self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
         self._first = int(state["first"])

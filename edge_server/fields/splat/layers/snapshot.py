@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.splat.cpu_field import MAX_AHEAD_S
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import Motion
-from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.fields.splat.snapshot import MAX_AHEAD_S, SplatSnapshot
 
 
 @dataclass(frozen=True)
@@ -61,6 +60,5 @@ class LayeredSnapshot(SplatSnapshot):
         ahead_s = self.moving.ahead_s(present_ns)
         params = np.concatenate([self.static, self.moving.params_at(ahead_s)])
         still = np.zeros((len(params), 3), np.float32)
-        return replace(
-            self, gaussians=Gaussians(params, self.gaussians.harmonics, still), ahead_s=ahead_s, raster=None
-        )
+        gaussians = Gaussians(params, self.gaussians.harmonics, still)
+        return replace(self, gaussians=gaussians, ahead_s=ahead_s)

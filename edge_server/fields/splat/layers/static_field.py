@@ -96,7 +96,8 @@ class StaticField(SplatField):
                 self.dropped += lost
                 if not growing:
                     self._finish_round_step()
-            losses.append(loss)
+            if loss is not None:
+                losses.append(loss)
             rays, samples = rays + seen, samples + pairs
             pace.end_step()
         return float(np.mean(losses[-32:])), rays, samples
