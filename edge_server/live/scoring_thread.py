@@ -3,10 +3,11 @@ the field waits for it.
 
 A publication's renderer is kept until the held-out capture nearest to its present has arrived; it then
 renders that capture's pose, and the two images are compared. If scoring falls behind, publications stay
-unscored (nulls in the series) and nothing queues up. The thread uses a bounded share of the machine.
+unscored (nulls in the series) and nothing queues up. The thread's own computing, without the
+rendering in the field's workers, is a bounded share of the machine's.
 
-What is shown: at random held-out captures, the newest publication of that instant, carried on to it as the
-page does (``Snapshot.at``).
+What is shown: at random captures of each held-out camera, the newest publication of that instant, carried on
+to it (``Snapshot.at``), as the page renders it for a visitor who moves.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class ScoringThread:
         self._on_shown = on_shown
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
         self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
-        self._next_shown_ns = 0
+        self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._started_s = time.monotonic()
         self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
@@ -149,9 +150,9 @@ class ScoringThread:
         """Score what was shown when a held-out frame was taken, if it is time for that."""
         taken_ns = frame.generated_edge_ns
         found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
-        if found is None or taken_ns < self._next_shown_ns or not self._affordable():
+        if found is None or taken_ns < self._next_shown_ns[frame.camera] or not self._affordable():
             return
-        self._next_shown_ns = taken_ns + round(self._rng.exponential(_SHOWN_EVERY_S) * 1e9)
+        self._next_shown_ns[frame.camera] = taken_ns + round(self._rng.exponential(_SHOWN_EVERY_S) * 1e9)
         publication, snapshot = found
         score = self._scorer.newest(
             frame.camera,

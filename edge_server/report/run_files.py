@@ -47,7 +47,7 @@ def read_run_files(out: Path) -> RunFiles:
     files.channel = _read_json(out / "channel.json", files.notes)
     files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
     files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
-    if (out / "shown.jsonl").exists():  # not of a fit, nor where nothing is held out
+    if (out / "shown.jsonl").exists():  # not of a fit
         files.shown = _continuous(_read_lines(out / "shown.jsonl", files.notes))
     if (out / "processes.jsonl").exists():  # written only where one command started all processes
         files.processes = _continuous(_read_lines(out / "processes.jsonl", files.notes))

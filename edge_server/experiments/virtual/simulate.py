@@ -226,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
     add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
     add("--score-every-ms", type=float, default=250.0, metavar="MS",
-        help="publications, and what is shown at a random instant of each period [%(default)g]")  # fmt: skip
+        help="publications (0: all), and what is shown at random instants [%(default)g]")  # fmt: skip
     add_folders(parser)
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip

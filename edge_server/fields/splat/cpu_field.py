@@ -52,7 +52,7 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole
 
 _AGES = 4096  # steps after which Adam's bias correction no longer matters
-RESEED_AFTER = 30  # steps of learning since the last time
+RESEED_AFTER = 30  # least number of steps between two reseedings
 TRACKING_SHARE = 0.35  # largest share of an update that tracks what moved
 CHANGED_SLOTS = 4  # largest number of views whose changed tiles one step trains on
 
@@ -218,8 +218,8 @@ class SplatField:
         self._views: tuple[View, ...] = ()
         self._given = ()
         self._refused, self._unsure = set(), set()
-        self._unjudged: set[int] = set()  # views of this fit that no step has judged yet
-        self._errors: dict[str, float] = {}  # of each camera's newest judged view
+        self._unjudged: set[str] = set()  # cameras whose newest view no step has judged yet
+        self._errors: dict[str, float] = {}  # of each camera, when a step last saw it whole
         self._reseeded = 0  # step of the last reseeding
         self._epoch = -1
 
@@ -274,14 +274,13 @@ class SplatField:
         return min(most, int(TRACKING_SHARE * budget.seconds / usual_s)) if usual_s else most
 
     def _await_judgement(self, views: Sequence[View], news: set[str]) -> None:
-        """New views are judged by the first steps that see them. The next view of a refused one's camera says
+        """New views are judged by the first step that sees them whole. The view after a refused one says
         nothing about motion, because it would be compared with a wrong one."""
         self._unsure = (self._unsure - news) | (self._refused & news)
         self._refused -= news
-        judges = (
-            self.settings.refuse_beyond > 0.0 and self.step >= SETTLED_STEPS and len(views) >= LEAST_VIEWS
-        )
-        self._unjudged = {k for k, v in enumerate(views) if v.camera in news} if judges else set()
+        given = {v.camera for v in views}
+        judges = self.settings.refuse_beyond > 0.0 and self.step >= SETTLED_STEPS
+        self._unjudged = (self._unjudged | news) & given if judges else set()
 
     def _leave_out_refused(self, views: Sequence[View]) -> Views:
         """Set what the kernels read: the packed views, the refused ones without weight."""
@@ -289,25 +288,30 @@ class SplatField:
         self._data = without_views(self._packed, refused)
         # All of them, where every weight is 0.
         self._asked = supervising_views(self._data) or list(range(len(views)))
+        self._epoch = -1  # their order is drawn anew
         return self._data
 
-    def _refuses(self, picked: NDArray[np.int64], errors: Sequence[float]) -> bool:
-        """Judge the views of a step by its errors, before it is applied: whether any is refused.
+    def _judge_step(self, picked: NDArray[np.int64], errors: Sequence[float]) -> bool:
+        """Judge the views of a step by its errors, before it is applied. Returns whether any is refused.
 
         errors: of each picked view, the median over its tiles of the root mean square error, in [0, 1].
         """
-        news = [(self._views[k].camera, e) for k, e in zip(picked.tolist(), errors) if k in self._unjudged]
-        if not news:
+        seen = [(int(k), self._views[k].camera, error) for k, error in zip(picked, errors)]
+        new = [one for one in seen if one[1] in self._unjudged]
+        self._errors.update((camera, error) for _, camera, error in seen)
+        if not new:
             return False
-        self._unjudged.difference_update(picked.tolist())
-        self._errors.update(news)
-        beyond, given = self.settings.refuse_beyond, {v.camera for v in self._views}
-        usual = usual_error([e for camera, e in self._errors.items() if camera in given], beyond)
+        given, beyond = {v.camera for v in self._views}, self.settings.refuse_beyond
+        known = [error for camera, error in self._errors.items() if camera in given]
+        self._unjudged -= {camera for _, camera, _ in new}
+        if len(known) < LEAST_VIEWS:
+            return False
         refused = self._refused & given
-        for camera, error in news:
+        for k, camera, error in new:
             few = 4 * (len(refused) + 1) <= len(given)
-            if refuse(self.view_store.memory[camera], error, usual, beyond, few):
+            if refuse(self.view_store.memory[camera], error, usual_error(known, beyond), beyond, few):
                 refused.add(camera)
+                self._changed[k] = None
         if refused <= self._refused:
             return False
         self._refused |= refused
@@ -336,7 +340,8 @@ class SplatField:
                 reseed(s, self._tracking_raster, self.cloud, change, self._rng(2))
                 self._reseeded = self.step
             self._reseed_time.add(pace.elapsed_s() - began)
-        self._snapshot = None
+        with self._lock:
+            self._snapshot = None
         return rays, samples
 
     def _choose_tiles(self, key: np.uint64) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
@@ -350,7 +355,7 @@ class SplatField:
             self._order = np.random.default_rng(pick).permutation(n)
         picked = np.array(self._asked, np.int64)[self._order[(first + np.arange(slots)) % n]]
         moving = [k for k, tiles in enumerate(self._changed) if tiles is not None]
-        if moving and not self._unjudged and int(key) * 2.0**-64 < s.changed_share:
+        if moving and int(key) * 2.0**-64 < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
             return some, [self._changed[k] for k in some]
         if s.tile_share >= 1.0:
@@ -394,10 +399,10 @@ class SplatField:
         )  # fmt: skip
         pixels, room = TILE * TILE * len(tasks), raster.lists.pair.shape[1]
         pairs = sum(min(needed, room) for needed in raster.lists.needed[: len(picked)].tolist())
-        if self._unjudged and wanted[0] is None:
+        if wanted[0] is None or wanted[0] is not self._changed[picked[0]]:  # not of changed tiles alone
             by_tile = np.sqrt(losses[:, 1] / (3 * TILE * TILE))
             by_view = [float(np.median(by_tile[tasks[:, 0] == b])) for b in range(len(picked))]
-            if self._refuses(picked, by_view):
+            if self._judge_step(picked, by_view):
                 self._finish_step()
                 return None, pixels, pairs, 0
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)

@@ -84,7 +84,7 @@ class GsplatField(SplatField):
             drawn += self._record_statistics(info, float(self._cams[k, SIZE]))
             pixels += error.shape[0] * error.shape[1]
             square += float((weight * error.detach().square()).sum())
-        if self._unjudged and self._refuses(picked, np.nan_to_num(errors, nan=1.0).tolist()):
+        if self._judge_step(picked, np.nan_to_num(errors, nan=1.0).tolist()):
             self._finish_step()
             return None, pixels, 0, lost
         gradient = np.zeros_like(cloud.params) if params.grad is None else params.grad.cpu().numpy()

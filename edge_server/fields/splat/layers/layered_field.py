@@ -369,9 +369,7 @@ class LayeredField:
         if self.static.step < SHOWN_AFTER:
             return
         begun, begins = self.now(), not self.shown
-        if begins:
-            self.first.reset()
-            self.shown = True
+        self.shown = True
         live, moving = self.static._live(), self.moving
         assert moving is not None and self.origin_ns is not None
         shown = None
@@ -387,6 +385,7 @@ class LayeredField:
         )  # fmt: skip
         self._spent("publication", begun)
         if begins:
+            self.first.reset()
             self._render_static(most=len(self.cameras))
 
     def _static_gaussians(self) -> Gaussians:

@@ -29,6 +29,7 @@ from edge_server.fields.splat.layers.kernels.plates import (
 Arrays = dict[str, NDArray]
 
 LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
+GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
 HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
@@ -145,6 +146,8 @@ class Plate:
         plate = self.arrays.means[0, ::2, ::2]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
         gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
+        if not ((gain > 1.0 / GAIN_MOST) & (gain < GAIN_MOST)).all():
+            return  # a black or broken frame
         self.gain = self.gain * gain
         for array in (self.arrays.means, self.arrays.blurred):
             np.clip(array * gain, 0.0, 255.0, out=array)

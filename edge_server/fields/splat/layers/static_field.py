@@ -87,7 +87,8 @@ class StaticField(SplatField):
     def train(self, pace: StepBudget) -> tuple[float, int, int]:
         """Spend what is left of a budget, or less where all is learned. Returns mean loss of the last steps,
         pixels, and pairs of a Gaussian and a tile."""
-        losses, rays, samples = [0.0], 0, 0
+        losses: list[float] = []
+        rays = samples = 0
         while not self.finished and pace.begin_step(self._step_time) is not None:
             with self._lock:
                 growing = self.step < SCHEDULE
@@ -100,7 +101,7 @@ class StaticField(SplatField):
                 losses.append(loss)
             rays, samples = rays + seen, samples + pairs
             pace.end_step()
-        return float(np.mean(losses[-32:])), rays, samples
+        return float(np.mean(losses[-32:])) if losses else 0.0, rays, samples
 
     def _finish_round_step(self) -> None:
         self._round_step += 1

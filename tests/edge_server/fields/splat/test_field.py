@@ -21,7 +21,7 @@ from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.motion import extrapolate
 from edge_server.fields.splat.seeding import seed_gaussians
-from tests.edge_server.fields.scenes import mean_psnr, picture
+from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
 from tests.edge_server.fields.splat.small import SMALL
 
@@ -327,3 +327,26 @@ def test_a_random_background_keeps_transparent_pixels_empty() -> None:
     out = field.render(views[0].camera_to_world, views[0].intrinsics)
     clear = views[0].image[..., 3] == 0
     assert out.opacity[clear].mean() < 0.2 < 0.8 < out.opacity[~clear].mean()
+
+
+@pytest.mark.parametrize("steps", [1, 40])
+def test_a_wrong_view_is_refused_in_short_updates_too_and_a_state_resumes_there(steps: int) -> None:
+    """With more cameras than an update has steps, views are judged over several updates."""
+    views = ring(36, size=24)
+    field = SplatField(replace(SMALL, start=200, gaussians=400))
+    field.fit(views, Budget(steps=100))
+    noise = np.random.default_rng(1).integers(0, 256, views[3].image.shape, dtype=np.uint8)
+    refused = []
+    for update in range(1, 240 // steps):
+        now = [replace(v, generated_ns=update * 10**8) for v in views]
+        now[3] = replace(now[3], image=noise)
+        refused.append(field.fit(now, Budget(steps=steps)).refused)
+    assert ("cam03",) in refused and set(refused) <= {(), ("cam03",)}
+    other = SplatField(field.settings)
+    other.load_state(field.state())
+    later = [replace(v, generated_ns=10**12) for v in views]
+    for one in (field, other):
+        one.fit(later, Budget(steps=steps))
+        one.fit(later, Budget(steps=steps))
+    same = [np.array_equal(a, b) for a, b in zip(field.state().values(), other.state().values())]
+    assert all(same)
