@@ -339,7 +339,8 @@ def test_a_wrong_view_is_refused_in_short_updates_too_and_a_state_resumes_there(
     refused = []
     for update in range(1, 240 // steps):
         now = [replace(v, generated_ns=update * 10**8) for v in views]
-        now[3] = replace(now[3], image=noise)
+        if update > 120 // steps:  # it has agreed with the field before
+            now[3] = replace(now[3], image=noise)
         refused.append(field.fit(now, Budget(steps=steps)).refused)
     assert ("cam03",) in refused and set(refused) <= {(), ("cam03",)}
     other = SplatField(field.settings)
