@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,13 @@ from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.static_field import StaticField
 from freshfield.geometry import Pinhole
 
-if TYPE_CHECKING:
-    from edge_server.fields.splat.layers.layered_field import LayeredField
-
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
 COUNTERS = ("layered", "shown", "origin_ns", "fits", "anchors_s", "plates_s")  # attributes
 
 
-def pack(field: LayeredField) -> Arrays:
+def pack(field: Any) -> Arrays:
     """Everything in one dictionary of copies."""
     state: Arrays = {}
     cameras, observations = [], []
@@ -62,7 +59,7 @@ def pack(field: LayeredField) -> Arrays:
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
 
-def unpack(field: LayeredField, state: Arrays) -> None:
+def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
     meta = unpack_meta(field.settings, state, NAME, ("harmonics",))
     field.first, field.static = (
@@ -104,7 +101,7 @@ def unpack(field: LayeredField, state: Arrays) -> None:
     field.finish_loading()
 
 
-def _observation(field: LayeredField, facts: dict[str, Any], arrays: Arrays) -> Observation:
+def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observation:
     found = {name: np.array(array) for name, array in arrays.items()}
     view = replace(
         field.cameras[facts["camera"]].view, image=found["image"], generated_ns=facts["generated_ns"],
