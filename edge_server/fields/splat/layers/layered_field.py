@@ -88,7 +88,11 @@ class LayeredField:
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Take in the views not seen before, follow what moves, and train. ValueError: a view is invalid."""
+        """Take in the views not seen before, follow what moves, and train. ValueError: a view is invalid.
+
+        A budget in steps bounds the steps of the static field; those of the moving set come on top, and the
+        report counts both.
+        """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         start = self.now()
@@ -106,14 +110,17 @@ class LayeredField:
         self._learn_plates()
         # On the wall clock, following motion would leave the first schedule of the static field no time.
         follows = len(self.observations) and (budget.seconds is None or self.static.step >= SCHEDULE)
+        appearance = 0 if self.moving is None else -self.moving.steps
         rays, samples = self._follow_motion(pace) if follows else (0, 0)
+        appearance += 0 if self.moving is None else self.moving.steps
         begun = self.now()
         loss, static_rays, static_samples = self.static.train(pace)
         self._spent("static field", begun)
         self._publish()
         self._render_static(most=1)
-        report = FitReport(pace.steps, pace.elapsed_s(), loss, rays + static_rays, samples + static_samples)
-        return report if arrivals or pace.steps else replace(report, note="no new views")
+        steps = pace.steps + appearance
+        report = FitReport(steps, pace.elapsed_s(), loss, rays + static_rays, samples + static_samples)
+        return report if arrivals or steps else replace(report, note="no new views")
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -175,7 +182,10 @@ class LayeredField:
         )  # fmt: skip
 
     def _give_up_layers(self) -> None:
-        """Go on with the first field, until ``reset``."""
+        """Go on with the first field, until ``reset``, with what the static field has learned if that is
+        shown."""
+        if self.shown:
+            self.first.load_state(self.static.state())
         self.layered = self.shown = False
         self._published, self.moving, self.observations = None, None, Observations()
         self.cameras = {}

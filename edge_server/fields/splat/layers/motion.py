@@ -76,7 +76,7 @@ class Motion:
 
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
-        self._pool = CallerPool()
+        self.pool = CallerPool()
         self._clear()
 
     def _clear(self) -> None:
@@ -208,11 +208,11 @@ class Motion:
         self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
         right = np.zeros((WINDOW, 3 * count))
         for span in spans:
-            self._pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
+            self.pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
         knots = np.ascontiguousarray(self._knots.transpose(0, 2, 1)).reshape(WINDOW, -1)
         steady, alike = self._prior_weights()
         iterations = np.zeros(1, np.int64)
-        self._pool.run(
+        self.pool.run(
             solve_knots,
             self._band,
             right,
@@ -246,7 +246,7 @@ class Motion:
                 span = _Span(key, [], 0, blocks, right, np.zeros(1, np.int64))
             for row in group[len(span.rows) :]:
                 weights = self.weights(row.instant_s)[1]
-                self._pool.run(add_row, *row[1:], weights, span.blocks, span.right, span.used)
+                self.pool.run(add_row, *row[1:], weights, span.blocks, span.right, span.used)
             self._spans.append(span._replace(rows=group, base=min(i - 1, WINDOW - BAND)))
         return self._spans
 

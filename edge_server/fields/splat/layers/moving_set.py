@@ -18,7 +18,7 @@ from edge_server.fields.splat.kernels.project import BLOCK, Gaussians
 from edge_server.fields.splat.layers.kernels.align import align_view
 from edge_server.fields.splat.layers.kernels.train_over import train_over
 from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
-from edge_server.fields.splat.layers.motion import Motion, ViewRow
+from edge_server.fields.splat.layers.motion import KNOTS_PER_S, Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
@@ -133,6 +133,10 @@ class MovingSet:
             AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one),
         )
         self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
+        self.motion.pool = self.pool
+        assert observation.row is not None
+        self.motion.slide(observation.instant_s + 1.0 / KNOTS_PER_S)
+        self.motion.solve([observation.row])
 
     # --- appearance ---------------------------------------------------------------------------
 
