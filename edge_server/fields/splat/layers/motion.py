@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
 
 KNOTS_PER_S = 15
@@ -76,7 +76,7 @@ class Motion:
 
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
-        self.pool = CallerPool()
+        self.pool: Pool = CallerPool()
         self._clear()
 
     def _clear(self) -> None:
