@@ -351,3 +351,21 @@ def test_a_wrong_view_is_refused_in_short_updates_too_and_a_state_resumes_there(
         one.fit(later, Budget(steps=steps))
     same = [np.array_equal(a, b) for a, b in zip(field.state().values(), other.state().values())]
     assert all(same)
+
+
+def test_learning_goes_on_with_the_views_that_are_left_after_a_refusal() -> None:
+    """Whichever is refused: the order in which views are visited is drawn anew."""
+    views = ring(36, size=24)
+    field = SplatField(replace(SMALL, start=200, gaussians=400))
+    field.fit(views, Budget(steps=100))
+    field.fit([replace(v, generated_ns=10**8) for v in views], Budget(steps=44))
+    state = field.state()
+    rng = np.random.default_rng(1)
+    for wrong in range(0, 36, 2):
+        field.load_state(state)
+        now = [replace(v, generated_ns=2 * 10**8) for v in views]
+        noise = rng.integers(0, 256, views[wrong].image.shape, dtype=np.uint8)
+        now[wrong] = replace(now[wrong], image=noise)
+        assert field.fit(now, Budget(steps=80)).refused == (views[wrong].camera,)
+        visited = set(field._order[: len(field._asked)].tolist())
+        assert visited == set(range(35)), "each of them as often as the others"
