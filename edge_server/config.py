@@ -42,19 +42,22 @@ class LearnConfig:
 @dataclass(frozen=True)
 class ComputeConfig:
     """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server frontier``
-    measures what a machine takes. ms_per_treated_view: of policies that treat views."""
+    measures what a machine takes. ms_per_treated_view: of policies that treat views. ms_per_view: of each
+    frame that has arrived since the last update."""
 
     ms_per_step: float = 0.0
     ms_per_update: float = 0.0
     ms_per_treated_view: float = 0.0
+    ms_per_view: float = 0.0
 
     def __post_init__(self) -> None:
         if not all(0.0 <= ms < 1e9 for ms in dataclasses.astuple(self)):
             raise ValueError("compute: milliseconds must be finite and not negative")
 
-    def charge_ns(self, steps: int, treated: int = 0) -> int:
-        """Nanoseconds of an update of ``steps`` optimizer steps and ``treated`` treated views."""
-        views_ms = self.ms_per_treated_view * treated
+    def charge_ns(self, steps: int, treated: int = 0, arrivals: int = 0) -> int:
+        """Nanoseconds of an update of ``steps`` optimizer steps, ``treated`` treated views and ``arrivals``
+        new frames."""
+        views_ms = self.ms_per_treated_view * treated + self.ms_per_view * arrivals
         return round((self.ms_per_update + self.ms_per_step * steps + views_ms) * 1e6)
 
 
@@ -101,6 +104,8 @@ class EdgeConfig:
 
     field, field_options: the representation and its settings (edge_server.fields.registry).
     policy: which views an update uses.
+    updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame
+    has arrived since.
     update_ms: fitting time of an update.
     deadline_ms: instead of it, the time from decision to publication. The setting that spends it best is
     looked up in ``frontier``, and the fitting time follows how busy the machine is.
@@ -122,6 +127,7 @@ class EdgeConfig:
     field: str = "ngp"
     field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
+    updates: str = "cycle"
     update_ms: float = 800.0
     deadline_ms: float | None = None
     frontier: str | None = None
@@ -142,6 +148,8 @@ class EdgeConfig:
             value = getattr(self, name)
             if value is not None and not least <= value <= 3_600_000.0:
                 raise ValueError(f"{name}: expected {least:g} to 3600000, got {value:g}")
+        if self.updates not in ("cycle", "arrivals"):
+            raise ValueError(f"updates: expected cycle or arrivals, got {self.updates!r}")
         if self.frontier is not None and self.deadline_ms is None:
             raise ValueError("frontier: it is read for a deadline_ms, which is not given")
         if not 1 <= self.steps <= 10_000_000:

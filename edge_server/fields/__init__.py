@@ -107,7 +107,12 @@ class Snapshot(Renderer, Protocol):
 
 
 class Field(Renderer, Protocol):
-    """A radiance field. Every implementation is deterministic for one seed and one sequence of calls."""
+    """A radiance field. Every implementation is deterministic for one seed and one sequence of calls.
+
+    every_frame: ``fit`` wants every frame since the last one, not only the newest of each camera.
+    """
+
+    every_frame: bool
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""

@@ -7,11 +7,14 @@ frames form the temporally inconsistent set Omega(t) of (5.6).
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from freshfield.frame import Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
+
+MOST_UNSELECTED = 8  # frames of a camera that wait for a field that wants every frame
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,10 @@ class BufferedFrame:
 class FrameBuffer:
     """The newest frame of each training camera. Thread-safe.
 
-    Memory is one encoded frame a camera, whatever arrives; two with ``keep_earlier``.
+    Memory is one encoded frame a camera, whatever arrives; two with ``keep_earlier``, MOST_UNSELECTED more
+    with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
+    shed: those that made room for newer ones before anything had selected them, with ``keep_every_frame``.
     """
 
     def __init__(self, cameras: Sequence[str]) -> None:
@@ -41,6 +46,8 @@ class FrameBuffer:
         self._arrived = threading.Condition()
         self.arrivals = 0
         self.stale_on_arrival = 0
+        self.shed = 0
+        self._unselected: dict[str, deque[BufferedFrame]] | None = None
 
     def put(self, frame: Frame, received_ns: int) -> None:
         """Keep ``frame`` unless a newer one of its camera is here.
@@ -61,6 +68,10 @@ class FrameBuffer:
                     self._earlier.pop(frame.camera, None)
                 elif known is not None:
                     self._put_earlier(item, known)
+            if self._unselected is not None:
+                waiting = self._unselected[frame.camera]
+                self.shed += len(waiting) == MOST_UNSELECTED
+                waiting.append(item)
             self.arrivals += 1
             self._arrived.notify_all()
 
@@ -78,6 +89,25 @@ class FrameBuffer:
             self._keep_earlier = wanted
             if not wanted:
                 self._earlier.clear()
+
+    def keep_every_frame(self) -> None:
+        """Keep, from now on, every frame until it is taken by ``take_unselected``."""
+        with self._arrived:
+            self._unselected = {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras}
+
+    def take_unselected(self, selected: Sequence[BufferedFrame]) -> list[BufferedFrame]:
+        """Drop what has arrived up to the newest of ``selected``; of that, return the other frames of their
+        cameras, in the order of their arrival. Nothing without ``keep_every_frame``."""
+        until_ns = max((item.received_ns for item in selected), default=0)
+        found: list[BufferedFrame] = []
+        with self._arrived:
+            for camera, waiting in (self._unselected or {}).items():
+                cameras_own = next((item for item in selected if item.frame.camera == camera), None)
+                while waiting and waiting[0].received_ns <= until_ns:
+                    item = waiting.popleft()
+                    if cameras_own is not None and item is not cameras_own:
+                        found.append(item)
+        return sorted(found, key=lambda item: item.received_ns)
 
     def newest_and_earlier(self) -> tuple[dict[str, BufferedFrame], dict[str, BufferedFrame]]:
         """``newest`` and, at the same instant, the frames before them by camera (see ``keep_earlier``)."""

@@ -35,12 +35,17 @@ class Selection:
     now_ns: instant of the selection.
     items: selected frames.
     earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
+    others: all other frames that these cameras delivered since the last selection, where the field wants
+    every frame.
+    arrivals: number of frames of all cameras since the last selection.
     """
 
     plan: SelectionWindow
     now_ns: int
     items: tuple[BufferedFrame, ...]
     earlier: tuple[BufferedFrame, ...] = ()
+    others: tuple[BufferedFrame, ...] = ()
+    arrivals: int = 0
 
 
 @dataclass
@@ -61,6 +66,7 @@ class FieldUpdater:
     embedder: for policies that look at what the cameras see.
     keyframes: earlier viewpoints of moving cameras.
     foreground: cuts the background out of views.
+    on_arrivals: nothing is selected before a frame has arrived since the last selection.
     number: of the next update.
     materialize: gives buffered frames their images and poses where these are made late (virtual time).
     """
@@ -74,8 +80,13 @@ class FieldUpdater:
         embedder: EmbedderLike | None = None,
         keyframes: Keyframes | None = None,
         foreground: Foreground | None = None,
+        on_arrivals: bool = False,
     ) -> None:
         self.buffer = buffer
+        self.on_arrivals = on_arrivals
+        self._selected_of = 0  # arrivals at the last selection
+        if field.every_frame:
+            buffer.keep_every_frame()
         self.decoder = ViewDecoder(foreground)
         self.embedder = embedder
         self.embeddings: EmbeddingCache | None = None
@@ -143,14 +154,18 @@ class FieldUpdater:
 
     def select(self, plan: SelectionWindow, now_ns: int) -> Selection | None:
         """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on."""
-        if now_ns < plan.wait_until_ns:
+        arrivals = self.buffer.arrivals - self._selected_of
+        if now_ns < plan.wait_until_ns or (self.on_arrivals and not arrivals):
             return None
         newest, earlier = self.buffer.newest_and_earlier()
         cameras = self.policy.select(self._epoch(newest, now_ns), plan)
         if not cameras:
             return None
         before = tuple(earlier[c] for c in cameras if c in earlier)
-        return Selection(plan, now_ns, tuple(newest[c] for c in cameras), before)
+        self._selected_of += arrivals
+        items = tuple(newest[c] for c in cameras)
+        others = tuple(self.buffer.take_unselected(items))
+        return Selection(plan, now_ns, items, before, others, arrivals)
 
     def fit(
         self, selection: Selection, budget: Budget, publishes_ns: int | None = None
@@ -167,7 +182,7 @@ class FieldUpdater:
             return None
         treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
         if self.keyframes is None:
-            return views, self.field.fit(treated, budget)
+            return views, self.field.fit([*self.decoder.others(selection.others), *treated], budget)
         supervision = self.keyframes.with_earlier(treated)
         if self.keyframes.should_restart(len(supervision)):
             self.field.reset()
@@ -242,6 +257,7 @@ def open_updater(
     try:
         embedder = open_embedder(embedding_for(config, policy))
         buffer = FrameBuffer(scenario.training)
-        return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground)
+        on_arrivals = config.updates == "arrivals"
+        return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground, on_arrivals)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None

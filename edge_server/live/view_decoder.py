@@ -45,6 +45,11 @@ class ViewDecoder:
         self._views[frame.camera] = (frame, view)
         return view
 
+    def others(self, items: Iterable[BufferedFrame]) -> list[View]:
+        """Views of frames that are not their cameras' newest and are used once, without those that cannot be
+        decoded."""
+        return [view for item in items if (view := self._decode(item)) is not None]
+
     def earlier(self, items: Iterable[BufferedFrame]) -> dict[str, View]:
         """Views of the frames before the newest, by camera, without those that cannot be decoded.
 

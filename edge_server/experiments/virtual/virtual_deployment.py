@@ -329,14 +329,17 @@ class VirtualDeployment:
             if settings.scratch:
                 updates.field.reset()
             treated = len(selection.items) if updates.policy.treatment is not None else 0
-            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(steps, treated)
+            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(
+                steps, treated, selection.arrivals
+            )
             fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps), publishes_ns)
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
             steps = settings.steps
-            yield WakeCondition(self.clock.now_ns() + settings.compute.charge_ns(report.steps, treated))
+            charged_ns = settings.compute.charge_ns(report.steps, treated, selection.arrivals)
+            yield WakeCondition(self.clock.now_ns() + charged_ns)
             published_ns = self.clock.now_ns()
             self._publish(updates.publication(selection, views, report, published_ns))
             next_ns = settings.next_ns(decided_ns, published_ns, self._origin_ns)
@@ -358,7 +361,10 @@ class VirtualDeployment:
         """The selection with images."""
         # Earlier ones first: of a camera's frames the one made last is kept longest.
         earlier = self.with_images(selection.earlier)
-        return dataclasses.replace(selection, items=self.with_images(selection.items), earlier=earlier)
+        return dataclasses.replace(
+            selection, others=self.with_images(selection.others), earlier=earlier,
+            items=self.with_images(selection.items),
+        )  # fmt: skip
 
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)

@@ -70,6 +70,8 @@ class TrainedField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
+    every_frame = False
+
     name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, see ``kernels.radiance_model``

@@ -93,6 +93,11 @@ class StepBudget:
         whole = self._budget.seconds
         return whole is None or (seconds <= share * whole and self.elapsed_s() + seconds + then_s <= whole)
 
+    def within(self, share: float) -> bool:
+        """Whether less than a share of the budget is spent; always of a budget in steps."""
+        whole = self._budget.seconds
+        return whole is None or self.elapsed_s() < share * whole
+
     def begin_step(self, timer: StepTimer, then_s: float = 0.0) -> float | None:
         """Progress, in [0, 1], of this kind of step through what the budget had left when the first was made;
         None when the budget is spent.

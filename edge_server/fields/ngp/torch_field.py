@@ -184,6 +184,8 @@ class TorchSnapshot:
 class NgpTorchField:
     """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
+    every_frame = False
+
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
         self.settings = settings or NgpSettings()
         if missing := unsupported_options(self.settings):

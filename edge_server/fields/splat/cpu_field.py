@@ -64,6 +64,8 @@ class SplatField:
     meanwhile: these wait for the end of the current step, a few milliseconds.
     """
 
+    every_frame = False
+
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)

@@ -61,6 +61,8 @@ class VoxelField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
+    every_frame = False
+
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or VoxelSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import threading
 
-from edge_server.live.buffer import FrameBuffer
+from edge_server.live.buffer import MOST_UNSELECTED, BufferedFrame, FrameBuffer
 from tests.edge_server.frames import frame
 
 MS = 1_000_000
@@ -93,3 +93,33 @@ def test_wait_returns_on_arrival_and_on_timeout():
     assert buffer.wait(0, 0.01) == 0
     threading.Timer(0.05, lambda: buffer.put(frame(), 0)).start()
     assert buffer.wait(0, 5.0) == 1
+
+
+def _sequences(items: list[BufferedFrame]) -> list[tuple[str, int]]:
+    return [(item.frame.camera, item.frame.sequence) for item in items]
+
+
+def test_every_frame_is_taken_once_and_the_oldest_make_room():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    for sequence in range(2):  # nobody has asked for every frame yet
+        buffer.put(frame("cam01", sequence=sequence, generated_ns=sequence * MS), sequence * MS)
+    assert buffer.take_unselected(list(buffer.newest().values())) == []
+    buffer.keep_every_frame()
+    for sequence in range(2, 5):
+        for k, camera in enumerate(("cam02", "cam01")):
+            at = sequence * MS + k
+            buffer.put(frame(camera, sequence=sequence, generated_ns=at), at)
+    selected = [buffer.newest()["cam01"]]
+    buffer.put(frame("cam01", sequence=5, generated_ns=9 * MS), 9 * MS)  # after the selection
+    assert _sequences(buffer.take_unselected(selected)) == [("cam01", 2), ("cam01", 3)]
+    assert buffer.take_unselected(selected) == []
+    late = frame("cam01", sequence=1, generated_ns=MS)
+    buffer.put(late, 10 * MS)  # overtaken on its way: it is evidence all the same
+    buffer.put(frame("cam02", sequence=6, generated_ns=11 * MS), 11 * MS)
+    both = list(buffer.newest().values())
+    assert _sequences(buffer.take_unselected(both)) == [("cam01", 1)]
+    for sequence in range(20, 20 + MOST_UNSELECTED + 3):
+        buffer.put(frame("cam01", sequence=sequence, generated_ns=sequence * MS), sequence * MS)
+    assert buffer.shed == 3
+    taken = _sequences(buffer.take_unselected([buffer.newest()["cam01"]]))
+    assert taken == [("cam01", k) for k in range(23, 20 + MOST_UNSELECTED + 2)]

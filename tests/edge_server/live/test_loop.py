@@ -82,6 +82,27 @@ def test_an_empty_buffer_selects_nothing():
     assert u.select(u.plan(5), 5) is None
 
 
+def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
+    made = make_policy("all", None, np.random.default_rng(0))
+    field = tiny_field()
+    field.every_frame = True
+    u = FieldUpdater(FrameBuffer(("cam01", "cam02")), made, field, start_ns=0, on_arrivals=True)
+    fed = []
+    field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
+    for at in (10, 20, 30):
+        u.buffer.put(frame("cam01", sequence=at, generated_ns=at * MS), at * MS)
+    u.buffer.put(frame("cam02", generated_ns=25 * MS), 31 * MS)
+    selection = u.select(u.plan(40 * MS), 40 * MS)
+    assert selection.arrivals == 4
+    views, _ = u.fit(selection, Budget(steps=1))
+    assert [v.camera for v in views] == ["cam01", "cam02"]
+    assert fed == [[("cam01", 10), ("cam01", 20), ("cam01", 30), ("cam02", 25)]]
+    assert u.select(u.plan(50 * MS), 50 * MS) is None
+    u.buffer.put(frame("cam02", sequence=1, generated_ns=45 * MS), 60 * MS)
+    again = u.select(u.plan(60 * MS), 60 * MS)
+    assert again.arrivals == 1 and again.others == () and len(again.items) == 2
+
+
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 

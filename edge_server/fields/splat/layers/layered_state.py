@@ -15,16 +15,16 @@ from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.layers.motion import ViewRow
-from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import Plate
-from edge_server.fields.splat.layers.static_field import StaticField
+from edge_server.fields.splat.layers.static_layer import StaticLayer
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-COUNTERS = ("layered", "shown", "origin_ns", "fits", "anchors_s", "plates_s")  # attributes
+COUNTERS = ("layered", "shown", "origin_ns", "plates_s")  # attributes of the field
+TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 
 def pack(field: Any) -> Arrays:
@@ -50,32 +50,25 @@ def pack(field: Any) -> Arrays:
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
-    state |= _prefixed("first.", field.first.state()) | _prefixed("static.", field.static.state())
-    if field.moving is not None:
-        state |= _prefixed("moving.", field.moving.state())
+    state |= _prefixed("first.", field.first.state()) | _prefixed("static.", field.static.field.state())
     counters = {name: _number(getattr(field, name)) for name in COUNTERS}
+    tracked = None
+    if field.tracker is not None:
+        state |= _prefixed("moving.", field.tracker.moving.state())
+        tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
     meta = {"version": 1, "field": NAME, "settings": asdict(field.settings), **counters,
-            "moving": field.moving is not None, "cameras": cameras, "frames": observations}  # fmt: skip
+            "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
 
 def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
     meta = unpack_meta(field.settings, state, NAME, ("harmonics",))
-    field.first, field.static = (
-        SplatField(field.settings, field.pool),
-        StaticField(field.settings, field.pool),
-    )
+    field.first = SplatField(field.settings, field.pool)
+    field.static = StaticLayer(field.settings, field.pool)
     field.first.load_state(_under("first.", state))
-    field.static.load_state(_under("static.", state))
-    field.moving = None
-    if meta["moving"]:
-        box = field.static.view_store.box
-        if box is None:
-            raise ValueError("the state has a moving set but no scene box")
-        field.moving = MovingSet(field.settings, field.pool, box, field.settings.seed)
-        field.moving.load_state(_under("moving.", state))
-    field.cameras = {}
+    field.static.field.load_state(_under("static.", state))
+    field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
         lens = {**facts["intrinsics"], "distortion": tuple(facts["intrinsics"]["distortion"])}
@@ -84,7 +77,7 @@ def unpack(field: Any, state: Arrays) -> None:
             facts["generated_ns"], carried_to_ns=facts["carried_to_ns"],
         )  # fmt: skip
         check_view(view)
-        plate = Plate(view.image.shape[0], view.image.shape[1], field.pool)
+        plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
         depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
         newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
@@ -92,13 +85,22 @@ def unpack(field: Any, state: Arrays) -> None:
         field.cameras[view.camera] = FixedCamera(
             view, plate, None, depth_m, facts["rendered_step"], newest_s, taken
         )
-    field.observations = Observations()
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
-    for name in COUNTERS:
-        value = meta[name]
-        setattr(field, name, -np.inf if value is None and name.endswith("_s") else value)
+    _set(field, COUNTERS, meta)
+    if meta["tracked"] is not None:
+        if field.static.field.view_store.box is None:
+            raise ValueError("the state has a moving set but no scene box")
+        field.make_tracker()
+        field.tracker.moving.load_state(_under("moving.", state))
+        _set(field.tracker, TRACKED, meta["tracked"])
     field.finish_loading()
+
+
+def _set(owner: Any, names: tuple[str, ...], values: dict[str, Any]) -> None:
+    for name in names:
+        value = values[name]
+        setattr(owner, name, -np.inf if value is None and name.endswith("_s") else value)
 
 
 def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observation:

@@ -27,12 +27,12 @@ Arrays = dict[str, NDArray]
 
 GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels
 USUAL_SHARE = 0.062
-MOST_CROWD, CROWD_DECAY = 2.5, 0.998  # see ``follow_foreground``
+MOST_FOREGROUND, FOREGROUND_DECAY = 2.5, 0.998  # see ``follow_foreground``
 LEAST_ALIVE = 16  # Gaussians, below which nothing is aligned
 GAUSSIANS_AN_ANCHOR = 8  # at least
 GROW_EVERY = 80  # steps
 
-# Births, at an instant that most cameras have seen.
+# Seeding, at an instant that most cameras have seen.
 CAMERA_SHARES = (0.58, 0.42)  # of the cameras, the first that is reached
 BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
 LEAST_FOREGROUND = 0.001  # share of all pixels
@@ -48,14 +48,14 @@ class MovingSet:
 
     cloud: the Gaussians. motion: displacements of the anchors.
     anchor, share: int64 and float32 (N, 3), see ``Motion.attach``.
-    crowd: factor by which the capacity exceeds that of a usual foreground.
+    capacity_factor: factor by which the capacity exceeds that of a usual foreground.
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool, box: SceneBox, seed: int) -> None:
         self.settings, self.pool, self.box, self.seed = settings, pool, box, seed
         self.cloud = GaussianCloud.empty(settings)
         self.anchor, self.share = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
-        self.crowd, self.steps, self._grown, self._draws = 1.0, 0, 0, 0
+        self.capacity_factor, self.steps, self._grown, self._draws = 1.0, 0, 0, 0
         self.motion = Motion(box.radius_m, self._rng(0))
         self.raster = RasterBuffers(pool)
 
@@ -70,11 +70,13 @@ class MovingSet:
     @property
     def capacity(self) -> int:
         """Largest number of Gaussians."""
-        return round(GAUSSIANS * (1.0 + (self.crowd - 1.0) / 3.0))
+        return round(GAUSSIANS * (1.0 + (self.capacity_factor - 1.0) / 3.0))
 
     def follow_foreground(self, share: float) -> None:
         """Let the capacity follow the foreground's share of the pixels: up at once, down slowly."""
-        self.crowd = max(CROWD_DECAY * self.crowd, min(max(share / USUAL_SHARE, 1.0), MOST_CROWD))
+        self.capacity_factor = max(
+            FOREGROUND_DECAY * self.capacity_factor, min(max(share / USUAL_SHARE, 1.0), MOST_FOREGROUND)
+        )
 
     # --- at an instant ------------------------------------------------------------------------
 
@@ -174,9 +176,9 @@ class MovingSet:
         self.anchor, self.share = self.anchor[self.cloud.guest], self.share[self.cloud.guest]
         self.cloud.guest[:] = 0
 
-    # --- births and removals ------------------------------------------------------------------
+    # --- seeding and removal -------------------------------------------------------------------
 
-    def birth_frames(self, observations: Observations, cameras: int) -> list[Observation]:
+    def seeding_frames(self, observations: Observations, cameras: int) -> list[Observation]:
         """The frames of the newest knot that most cameras have seen; none if there is no such knot."""
         last = observations.newest_knot
         for share in CAMERA_SHARES:
@@ -226,7 +228,7 @@ class MovingSet:
         if self.motion.anchors is not None:
             self.cloud.params[:, :3] = self.places(instant_s)
         places = self.cloud.params[:, :3]
-        count = min(round(ANCHORS * self.crowd), max(1, len(places) // GAUSSIANS_AN_ANCHOR))
+        count = min(round(ANCHORS * self.capacity_factor), max(1, len(places) // GAUSSIANS_AN_ANCHOR))
         self.motion.choose_anchors(places, opacity(self.cloud.params), count, instant_s)
         self.anchor, self.share = self.motion.attach(places, instant_s)
 
@@ -258,7 +260,7 @@ class MovingSet:
         motion = {f"motion.{name}": array for name, array in self.motion.state().items()}
         counters = np.array([self.steps, self._grown, self._draws], np.int64)
         return {**cloud, **motion, "anchor": self.anchor.copy(), "share": self.share.copy(),
-                "crowd": np.array(self.crowd), "counters": counters}  # fmt: skip
+                "capacity_factor": np.array(self.capacity_factor), "counters": counters}  # fmt: skip
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. KeyError: it lacks something."""
@@ -266,7 +268,7 @@ class MovingSet:
         prefix = "motion."
         self.motion.load_state({n[len(prefix) :]: a for n, a in state.items() if n.startswith(prefix)})
         self.anchor, self.share = np.array(state["anchor"]), np.array(state["share"])
-        self.crowd = float(state["crowd"])
+        self.capacity_factor = float(state["capacity_factor"])
         self.steps, self._grown, self._draws = (int(n) for n in state["counters"])
 
     def _rng(self, purpose: int) -> np.random.Generator:

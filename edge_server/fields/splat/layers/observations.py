@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import View
+from edge_server.fields import Rendering, View
 from edge_server.fields.splat.layers.motion import KNOTS_PER_S, ViewRow
 from edge_server.fields.splat.layers.plates import Plate
+from edge_server.fields.splat.layers.static_field import PlateImage
 
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
 BACKGROUND_WEIGHT = 0.5  # of other pixels
@@ -40,13 +41,23 @@ class FixedCamera:
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
 
+    def plate_image(self) -> PlateImage:
+        """The plate as it is now, copied."""
+        return PlateImage(self.view, self.plate.at_first_exposure(), self.plate.known.copy())
+
+    def take_rendering(self, step: int, rendering: Rendering) -> None:
+        """Take over what the static field shows from here, and the step at which it does."""
+        self.depth_m, self.rendered_step = rendering.depth, step
+        self.plate.fill_unknown(rendering.color)
+
 
 @dataclass(order=True)
 class Observation:
     """A frame, and its linearization in the anchors' displacements.
 
     instant_s: what it shows, seconds from the field's origin.
-    foreground: bool (H, W). weight: float32 (H, W), how much each pixel counts.
+    foreground: bool (H, W). share: of the pixels, of the foreground.
+    weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
     """
@@ -59,6 +70,10 @@ class Observation:
     row: ViewRow | None = field(default=None, compare=False)
     shown: NDArray[np.float32] | None = field(default=None, compare=False)
     fresh: bool = field(default=True, compare=False)
+    share: float = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self.share = float(self.foreground.mean())
 
     @property
     def knot(self) -> int:

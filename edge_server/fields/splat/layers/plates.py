@@ -94,7 +94,7 @@ class Plate:
         self.count += 1
         return foreground > 0
 
-    def hold(
+    def exclude_explained(
         self, image: NDArray[np.uint8], shown: NDArray[np.float32], opacity: NDArray[np.float32]
     ) -> None:
         """Keep out of the plate, until the next call, what the moving set explains.
@@ -107,7 +107,7 @@ class Plate:
         explained = ((opacity > HELD_OPACITY) & (worst < HELD_ERROR)).astype(np.uint8)
         self._held = cv2.dilate(explained, np.ones((3, 3), np.uint8))
 
-    def stand_in(self, color: NDArray[np.float32]) -> None:
+    def fill_unknown(self, color: NDArray[np.float32]) -> None:
         """Use the static field's rendering, float32 (H, W, 3) in [0, 1] at the exposure of the first frame,
         where there is no plate."""
         self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)

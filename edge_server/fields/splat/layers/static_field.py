@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.layers.observations import FixedCamera
 from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings
 
@@ -26,6 +26,18 @@ ROUNDS_FIRST, RATE_FIRST = 60, 0.05  # after the schedule; least weight of a rou
 ROUNDS_AGAIN, RATE_AGAIN = 20, 0.1  # where plates have changed
 CHANGED = 8.0  # of 255, after blurring, by which a plate must differ from what was learned
 CHANGED_PIXELS = 40  # a camera, above which the field is trained again
+
+
+class PlateImage(NamedTuple):
+    """A plate as it was at one moment.
+
+    view: the camera's first frame. color: float32 (H, W, 3), at the exposure of that frame, steps of 255.
+    known: bool (H, W), where there is a plate.
+    """
+
+    view: View
+    color: NDArray[np.float32]
+    known: NDArray[np.bool_]
 
 
 class StaticField(SplatField):
@@ -54,35 +66,32 @@ class StaticField(SplatField):
         """Whether there is nothing more to learn from these plates."""
         return self.rounds >= self._rounds_wanted
 
-    def learn(self, cameras: dict[str, FixedCamera]) -> None:
-        """Take the plates of ``cameras`` as what to learn, at the exposure of the first frames. What is not
-        known has no weight."""
+    def learn(self, plates: Sequence[PlateImage]) -> None:
+        """Take plates as what to learn. What is not known has no weight."""
         views = []
-        for camera in cameras.values():
-            color = np.clip(camera.plate.at_first_exposure() + 0.5, 0, 255).astype(np.uint8)
-            known = camera.plate.known
-            views.append(replace(camera.view, image=color, weight=known.astype(np.float32)))
-            self._learned[camera.view.camera] = (_plate(camera), known.copy())
+        for view, color, known in plates:
+            image = np.clip(color + 0.5, 0, 255).astype(np.uint8)
+            views.append(replace(view, image=image, weight=known.astype(np.float32)))
+            self._learned[view.camera] = (color, known)
         with self._lock:
             self._ingest(views)
 
-    def learn_again(self, cameras: dict[str, FixedCamera]) -> bool:
+    def learn_again(self, plates: Sequence[PlateImage]) -> bool:
         """``learn`` if the plates have changed since, and begin rounds of training. Returns whether."""
-        changed = sum(self._changed_pixels(camera) for camera in cameras.values())
-        if changed <= CHANGED_PIXELS * len(cameras):
+        if sum(self._changed_pixels(plate) for plate in plates) <= CHANGED_PIXELS * len(plates):
             return False
-        self.learn(cameras)
+        self.learn(plates)
         self.rounds, self._rounds_wanted, self._rate = 0, ROUNDS_AGAIN, RATE_AGAIN
         self._round_step, self._mean = 0, None
         return True
 
-    def _changed_pixels(self, camera: FixedCamera) -> int:
-        known = camera.plate.known
-        if camera.view.camera not in self._learned:
-            return int(known.sum())
-        before, was_known = self._learned[camera.view.camera]
-        differs = cv2.blur(cv2.absdiff(_plate(camera), before), (3, 3)).max(axis=2) > CHANGED
-        return int((known & (differs | ~was_known)).sum())
+    def _changed_pixels(self, plate: PlateImage) -> int:
+        if plate.view.camera not in self._learned:
+            return int(plate.known.sum())
+        before, was_known = self._learned[plate.view.camera]
+        both = plate.known & was_known
+        differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > CHANGED
+        return int((plate.known & (differs | ~was_known)).sum())
 
     def train(self, pace: StepBudget) -> tuple[float, int, int]:
         """Spend what is left of a budget, or less where all is learned. Returns mean loss of the last steps,
@@ -169,8 +178,3 @@ class StaticField(SplatField):
             super()._finish_step()
         else:
             self.step += 1
-
-
-def _plate(camera: FixedCamera) -> NDArray[np.float32]:
-    """The plate alone, at the exposure of the first frame, float32 (H, W, 3)."""
-    return camera.plate.arrays.means[0] / camera.plate.gain

@@ -48,7 +48,7 @@ def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:
             if held:
                 opacity = np.zeros((SIZE, SIZE), np.float32)
                 opacity[BODY, 20:30] = 1.0
-                plate.hold(image, image / np.float32(255.0), opacity)
+                plate.exclude_explained(image, image / np.float32(255.0), opacity)
         assert foreground[BODY, 20:30].all() == held
         expected = WALL[20:28, 22:28] if held else np.full((8, 6, 3), (250, 30, 30))
         np.testing.assert_allclose(plate.picture[20:28, 22:28], expected, atol=1.0)
@@ -69,7 +69,7 @@ def test_what_is_unknown_is_compared_with_the_static_field() -> None:
         image[:, 30:] = (40, 220)[k % 2]
         plate.take(image)
     assert not plate.known[5:-5, 36:-5].any() and plate.known[:, :26].all()
-    plate.stand_in(WALL / np.float32(255.0))
+    plate.fill_unknown(WALL / np.float32(255.0))
     np.testing.assert_allclose(plate.picture[5:-5, 36:-5], WALL[5:-5, 36:-5], atol=0.1)
     assert not plate.take(_frame()).any()
     assert plate.take(_frame(34))[BODY, 35:43].all()
@@ -78,7 +78,7 @@ def test_what_is_unknown_is_compared_with_the_static_field() -> None:
 def test_a_state_continues_bit_for_bit() -> None:
     plate = _seen()
     plate.take(_frame(4))
-    plate.stand_in(WALL / np.float32(255.0))
+    plate.fill_unknown(WALL / np.float32(255.0))
     other = Plate(SIZE, SIZE, CallerPool())
     other.load_state(plate.state())
     for at in (8, 12, 40):

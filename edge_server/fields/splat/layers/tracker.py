@@ -1,0 +1,166 @@
+"""Follows what moves: motion from every frame of the last second, then the appearance of the moving set.
+
+In a fit of a given number of seconds the newest frames come first. What does not fit is left out, or waits
+for the next fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
+from edge_server.fields.splat.layers.motion import KNOTS_PER_S
+from edge_server.fields.splat.layers.moving_set import LEAST_FOREGROUND, MovingSet
+from edge_server.fields.splat.layers.observations import (
+    FixedCamera,
+    Observation,
+    Observations,
+    pixel_weights,
+)
+
+PASSES = 2  # of Gauss-Newton a fit
+ALIGNING_SHARE = 0.5  # of a budget in seconds
+LEAST_ALIGNED = 4  # frames a pass, however short the budget is
+MOST_ALIGNED = 64  # frames a pass, newest first
+STEPS = 10  # of appearance a fit, at most
+SEED_EVERY_S = 0.1
+SEED_AT_LEAST_EVERY_S = 0.3  # where budgets have no room for it
+ANCHORS_EVERY_S = 0.5
+
+
+class PartTimes(dict[str, float]):
+    """Seconds spent by part of the work, in all fits."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        super().__init__()
+        self.now = now
+
+    def add(self, part: str, begun: float) -> float:
+        """Add the time since ``begun`` to a part's; returns now."""
+        now = self.now()
+        self[part] = self.get(part, 0.0) + now - begun
+        return now
+
+
+class MotionTracker:
+    """Keeps a ``MovingSet`` at what the frames show.
+
+    anchors_s, seeded_s: instants of the frames at which anchors were last chosen, and Gaussians seeded.
+    fits: how many there were. left_out: frames that were not aligned for lack of time.
+    """
+
+    def __init__(
+        self,
+        moving: MovingSet,
+        observations: Observations,
+        cameras: dict[str, FixedCamera],
+        times: PartTimes,
+    ) -> None:
+        self.moving, self.observations, self.cameras, self.times = moving, observations, cameras, times
+        self.anchors_s = self.seeded_s = -np.inf
+        self.fits = self.left_out = 0
+        self._step_time, self._seed_time = StepTimer(), StepTimer()
+
+    def follow(
+        self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters
+    ) -> tuple[int, int, int]:
+        """Motion, then what calls for new Gaussians, then appearance. Returns steps, pixels and pairs.
+
+        publish: called when motion is known. parameters: of an optimizer step.
+        """
+        moving, newest_s = self.moving, self.observations.newest_s
+        self.fits += 1
+        moving.follow_foreground(float(np.mean([o.share for o in self.observations])))
+        if moving.motion.anchors is not None:
+            moving.motion.slide(newest_s + 1.0 / KNOTS_PER_S)
+        if moving.alive:
+            if newest_s - self.anchors_s >= ANCHORS_EVERY_S:
+                self._renew_anchors(newest_s)
+            for k in range(PASSES):
+                self._solve(pace, (k + 1) / PASSES, last=k == PASSES - 1)
+            for o in self.observations:
+                o.fresh = False
+            publish()
+        since_s, begun = newest_s - self.seeded_s, self.times.now()
+        has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= SEED_AT_LEAST_EVERY_S
+        if not moving.alive or (since_s >= SEED_EVERY_S and has_room):
+            self.seeded_s = newest_s
+            self._seed()
+            self._seed_time.add(self.times.add("seeding", begun) - begun)
+        return self._train_appearance(pace, parameters)
+
+    def _solve(self, pace: StepBudget, share: float, last: bool) -> None:
+        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve.
+
+        share: of the time for aligning, at which this pass ends.
+        last: of this fit; what it explains is kept out of the plates.
+        """
+        motion, begun = self.moving.motion, self.times.now()
+        newest = self.observations.newest_knot
+        seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= motion.newest_s]
+        due = [o for o in seen if o.row is None or o.fresh or o.knot >= newest]
+        for k, o in enumerate(reversed(due)):
+            if k >= MOST_ALIGNED or not (k < LEAST_ALIGNED or pace.within(share * ALIGNING_SHARE)):
+                self.left_out += len(due) - k
+                break
+            self._align(o, exclude=last)
+        begun = self.times.add("alignment", begun)
+        motion.solve([o.row for o in seen if o.row is not None])
+        self.times.add("solving", begun)
+
+    def _align(self, observation: Observation, exclude: bool) -> None:
+        camera = self.cameras[observation.camera]
+        self._weigh(observation, camera)
+        opacity = self.moving.align(observation, camera)
+        if exclude and observation.instant_s >= camera.newest_s:
+            camera.newest_s = observation.instant_s
+            assert observation.shown is not None
+            camera.plate.exclude_explained(observation.view.image, observation.shown, opacity)
+
+    def _weigh(self, observation: Observation, camera: FixedCamera) -> None:
+        if observation.weight is None:
+            distance_m = self.moving.distance_m(camera, observation.instant_s)
+            observation.weight = pixel_weights(
+                observation.foreground, camera.depth_m, distance_m, observation.view.weight
+            )
+
+    def _train_appearance(self, pace: StepBudget, parameters: AdamParameters) -> tuple[int, int, int]:
+        """Steps on the frames of the last two knots, one frame a step, each as often as the others."""
+        moving, newest = self.moving, self.observations.newest_knot
+        frames = self.observations.of_knots(newest - 1, newest)
+        order = np.random.default_rng([moving.seed, self.fits, 7]).permutation(len(frames))
+        begun, rays, samples, steps = self.times.now(), 0, 0, 0
+        while steps < STEPS and moving.alive and pace.has_room(self._step_time.seconds, 1.0, 0.0):
+            step_begun = self.times.now()
+            frame = frames[order[steps % len(frames)]]
+            self._weigh(frame, self.cameras[frame.camera])
+            samples += moving.train(frame, self.cameras[frame.camera], parameters)
+            rays, steps = rays + frame.foreground.size, steps + 1
+            self._step_time.add(self.times.now() - step_begun)
+        self.times.add("appearance", begun)
+        return steps, rays, samples
+
+    def _seed(self) -> None:
+        """Remove what lies outside foregrounds, and seed what is missing, at the newest instant that most
+        cameras have seen."""
+        moving = self.moving
+        frames = moving.seeding_frames(self.observations, len(self.cameras))
+        if not frames:
+            return
+        pixels = sum(int(o.foreground.sum()) for o in frames)
+        if pixels < LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
+            return
+        moving.remove_outside(frames, self.cameras)
+        if moving.alive:
+            for o in frames:
+                self._align(o, exclude=False)
+        moving.seed_missing(frames, self.cameras)
+
+    def _renew_anchors(self, instant_s: float) -> None:
+        self.moving.renew_anchors(instant_s)
+        self.anchors_s = instant_s
+        for o in self.observations:
+            o.row = None
