@@ -123,11 +123,7 @@ class Engine:
             raise StudyError("--ray needs Ray: pip install 'freshfield[cluster]'") from None
         assert self.ray is not None
         if not ray.is_initialized():
-            address = None if self.ray == "local" else self.ray
-            try:
-                ray.init(address=address, log_to_driver=False, include_dashboard=False)
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                raise StudyError(f"--ray {self.ray}: no cluster can be reached: {error}") from None
+            _start_ray(ray, self.ray)
         remote = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
         running = {remote.remote(mappings, self.folders): task for task, mappings in zip(tasks, sent)}
         try:
@@ -139,6 +135,21 @@ class Engine:
             for reference in running:
                 ray.cancel(reference, force=True)
             raise
+
+
+def _start_ray(ray: Any, where: str) -> None:
+    """Join the cluster at an address, or start one here ("local"). Raises StudyError."""
+    attempts = 2 if where == "local" else 1  # the first start on a cold disk may exceed Ray's 30 seconds
+    for left in reversed(range(attempts)):
+        try:
+            ray.init(
+                address=None if where == "local" else where, log_to_driver=False, include_dashboard=False
+            )
+            return
+        except Exception as error:  # Ray raises this very class where a node starts too slowly
+            ray.shutdown()
+            if not left:
+                raise StudyError(f"--ray {where}: no cluster can be reached: {error}") from None
 
 
 def content_key(trial: Trial, folders: Folders) -> str:

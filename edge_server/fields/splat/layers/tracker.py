@@ -21,14 +21,14 @@ from edge_server.fields.splat.layers.observations import (
     pixel_weights,
 )
 
-PASSES = 2  # of Gauss-Newton a fit
+PASSES = 1  # of Gauss-Newton a fit
 ALIGNING_SHARE = 0.5  # of a budget in seconds
 LEAST_ALIGNED = 4  # frames a pass, however short the budget is
-MOST_ALIGNED = 64  # frames a pass, newest first
+MOST_ALIGNED = 24  # frames a pass, newest first
 STEPS = 10  # of appearance a fit, at most
-SEED_EVERY_S = 0.1
-SEED_AT_LEAST_EVERY_S = 0.3  # where budgets have no room for it
-ANCHORS_EVERY_S = 0.5
+SEED_EVERY_S = 0.2
+SEED_AT_LEAST_EVERY_S = 0.6  # where budgets have no room for it
+ANCHORS_EVERY_S = 1.0
 
 
 class PartTimes(dict[str, float]):

@@ -97,6 +97,28 @@ def test_ray_gives_what_one_process_gives(tmp_path: Path):
         ray.shutdown()
 
 
+def test_a_local_ray_that_starts_too_slowly_is_started_again():
+    class Slow:
+        fails, begun, ended = 1, 0, 0
+
+        def init(self, **options):
+            self.begun += 1
+            if self.begun <= self.fails:
+                raise Exception("The current node timed out during startup.")
+
+        def shutdown(self):
+            self.ended += 1
+
+    ray = Slow()
+    engine_module._start_ray(ray, "local")
+    assert (ray.begun, ray.ended) == (2, 1)
+    ray.fails = 9
+    for where, begun in (("local", 4), ("10.0.0.1:6379", 5)):
+        with pytest.raises(StudyError, match=f"--ray {where}: no cluster.*timed out"):
+            engine_module._start_ray(ray, where)
+        assert ray.begun == begun
+
+
 def test_what_is_known_is_not_run_again_and_a_stop_loses_only_what_runs(tmp_path: Path, monkeypatch):
     ran: list[int] = []
 
