@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
+_SHED_EVERY_S = 30.0  # between two warnings that frames are left out
 
 
 class UpdateLoop:
@@ -56,6 +57,7 @@ class UpdateLoop:
         self._reset = False
         self._last_update_ms = 0.0
         self._made_no_step = False
+        self._shed, self._offered, self._shed_since_s = 0, 0, clock.now_ns() / 1e9
         self.paused = False
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -131,6 +133,7 @@ class UpdateLoop:
             return
         views, report = fitted
         self._warn_without_steps(report)
+        self._warn_of_shed(report, len(selection.items) + len(selection.others))
         renderer = self._updater.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updater.publication(selection, views, report, self._clock.now_ns())
         self._last_update_ms = publication.update_ms
@@ -150,13 +153,29 @@ class UpdateLoop:
 
     def _warn_without_steps(self, report: FitReport) -> None:
         """Log once, and again if it recurs, that updates are too short to learn anything."""
-        if report.steps == 0 and not self._made_no_step:
+        made_none = report.steps == 0 and not report.note
+        if made_none and not self._made_no_step:
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Give "
                 "updates more (edge.update_ms or edge.deadline_ms), or take a field that needs less of it",
                 report.seconds * 1e3,
             )
-        self._made_no_step = report.steps == 0
+        self._made_no_step = made_none
+
+    def _warn_of_shed(self, report: FitReport, offered: int) -> None:
+        """Log now and then what share of the frames was left out for lack of time."""
+        self._shed += report.shed
+        self._offered += offered
+        now_s = self._clock.now_ns() / 1e9
+        if now_s - self._shed_since_s < _SHED_EVERY_S:
+            return
+        if self._shed:
+            log.warning(
+                "%d of %d frames were left out, the oldest first: the field has no time for them. Send fewer "
+                "or smaller ones, or give updates more (edge.update_ms)",
+                self._shed, self._offered,
+            )  # fmt: skip
+        self._shed, self._offered, self._shed_since_s = 0, 0, now_s
 
     def _write_checkpoints(self) -> None:
         while True:

@@ -25,7 +25,7 @@ from edge_server.fields.common.field_state import all_or_nothing
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.common.threads.precompile import compile_ahead
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, shared_pool
-from edge_server.fields.common.training_schedule import StepBudget
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.layered_state import pack, unpack
@@ -45,6 +45,8 @@ EVIDENCE_S = 0.8  # age up to which frames tell of motion
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
+INTAKE_SHARE = 0.4  # of a budget in seconds: older frames are left out
+LEAST_TAKEN = 4  # frames, however short the budget is
 
 
 class LayeredField:
@@ -66,6 +68,7 @@ class LayeredField:
         self.first = SplatField(self.settings, self.pool)
         self.static = StaticLayer(self.settings, self.pool)
         self.part_s = PartTimes(self.now)
+        self._take_time = StepTimer()  # of taking in a frame
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -104,9 +107,10 @@ class LayeredField:
             self._give_up_layers()
         if not self.layered:
             return self.first.fit(_newest_of_each(views), budget)
-        arrivals = self._take_in(views)
+        arrivals, shed = self._take_in(views, budget)
         if self.tracker is None and not self._plates_are_known():
-            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            return replace(report, shed=shed)
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
         self._compare_plates(beside)
@@ -122,10 +126,11 @@ class LayeredField:
             self.part_s.add("static field", begun)
         self._publish()
         if beside and not self.shown:
-            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            return replace(report, shed=shed)
         self._take_renderings(beside)
         note = "" if steps or pace.steps else "nothing is left to learn" if arrivals else "no new views"
-        return FitReport(steps, pace.elapsed_s(), loss, rays, samples, note=note)
+        return FitReport(steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -151,7 +156,7 @@ class LayeredField:
         pose[2, 3] = -3.0
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
-        field._take_in(views)
+        field._take_in(views, Budget(steps=1))
         moving = field._begin_layers().moving
         field._find_rows()
         moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
@@ -200,29 +205,41 @@ class LayeredField:
         self.cameras = {}
         self.static.reset()
 
-    def _take_in(self, views: Sequence[View]) -> int:
-        """Plates and foregrounds of the views not seen before. Returns how many there are."""
-        begun, arrivals = self.now(), 0
+    def _take_in(self, views: Sequence[View], budget: Budget) -> tuple[int, int]:
+        """Plates and foregrounds of the views not seen before. Returns how many were taken in, and how many
+        left out because they would take too much of the budget: the newest of each camera come first."""
+        begun = self.now()
         if self.origin_ns is None:
             self.origin_ns = min(view.shows_ns for view in views)
-        for view in sorted(views, key=lambda v: (v.generated_ns, v.camera)):
-            if view.camera not in self.cameras:
-                plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
-                self.cameras[view.camera] = FixedCamera(view, plate)
-            camera = self.cameras[view.camera]
-            if view.generated_ns in camera.taken:
-                continue
-            camera.taken.append(view.generated_ns)
-            arrivals += 1
-            foreground = camera.plate.take(view.image)
-            self.observations.add(Observation(
-                (view.shows_ns - self.origin_ns) / 1e9, view.camera,
-                replace(view, camera_to_world=camera.view.camera_to_world), foreground,
-            ))  # fmt: skip
+        news = {(v.generated_ns, v.camera): v for v in views if not self._has_seen(v)}
+        chosen = _newest_first(list(news.values()))
+        if budget.seconds is not None and self._take_time.seconds:
+            room = int(INTAKE_SHARE * budget.seconds / self._take_time.seconds)
+            chosen = chosen[: max(room, LEAST_TAKEN)]
+        for view in sorted(chosen, key=lambda v: (v.generated_ns, v.camera)):
+            self._take(view)
+        if chosen:
+            self._take_time.add((self.now() - begun) / len(chosen))
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
         self.part_s.add("plates", begun)
-        return arrivals
+        return len(chosen), len(news) - len(chosen)
+
+    def _has_seen(self, view: View) -> bool:
+        return view.camera in self.cameras and view.generated_ns in self.cameras[view.camera].taken
+
+    def _take(self, view: View) -> None:
+        assert self.origin_ns is not None
+        if view.camera not in self.cameras:
+            plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
+            self.cameras[view.camera] = FixedCamera(view, plate)
+        camera = self.cameras[view.camera]
+        camera.taken.append(view.generated_ns)
+        foreground = camera.plate.take(view.image)
+        self.observations.add(Observation(
+            (view.shows_ns - self.origin_ns) / 1e9, view.camera,
+            replace(view, camera_to_world=camera.view.camera_to_world), foreground,
+        ))  # fmt: skip
 
     def _plates_are_known(self) -> bool:
         return (
@@ -338,6 +355,16 @@ def _newest_of_each(views: Sequence[View]) -> list[View]:
         if view.camera not in newest or view.shows_ns > newest[view.camera].shows_ns:
             newest[view.camera] = view
     return list(newest.values())
+
+
+def _newest_first(views: Sequence[View]) -> list[View]:
+    """The newest of each camera, newest first; then the second newest of each, and so on."""
+    older = dict[str, int]()
+    ranked = []
+    for view in sorted(views, key=lambda v: (-v.generated_ns, v.camera)):
+        ranked.append((older.get(view.camera, 0), view))
+        older[view.camera] = older.get(view.camera, 0) + 1
+    return [view for _, view in sorted(ranked, key=lambda one: one[0])]
 
 
 def _remaining(budget: Budget, spent_s: float) -> Budget:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import threading
@@ -218,6 +219,21 @@ def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
     assert field.moving is not None and field.moving.steps > 0
     assert field.static.field.finished and field.shown
     assert _score(field.snapshot(round(50 * FRAME_S * 1e9)), 50 * FRAME_S) > 20.0
+
+
+def test_what_there_is_no_time_for_is_left_out_the_oldest_first() -> None:
+    field, ticks = LayeredField(SMALL), itertools.count()
+    views = [_frame(k, frame, True) for frame in range(3) for k in range(len(CAMERAS))]
+    assert field.fit(views[: len(CAMERAS)], Budget(seconds=0.05)).shed == 0  # not known yet how long it takes
+    field.now = lambda: float(next(ticks))  # now it takes a second
+    field.fit(views[:1], Budget(seconds=0.05))
+    for _ in range(3):
+        field._take_time.add(1.0)
+    report = field.fit(views[::-1], Budget(seconds=17.5))
+    assert report.shed == 2 * len(CAMERAS) - 7
+    taken = {(o.camera, o.view.generated_ns) for o in field.observations}
+    newest = {(v.camera, v.generated_ns) for v in views[-7:]}
+    assert taken == newest | {(v.camera, v.generated_ns) for v in views[: len(CAMERAS)]}
 
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(
