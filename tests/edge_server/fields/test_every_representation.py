@@ -163,10 +163,9 @@ def test_a_state_of_another_kind_is_refused(name: str) -> None:
     field, other = small(name), "ngp" if name != "ngp" else "voxel"
     with pytest.raises(ValueError, match=f"a field called {other}, this one is {name}"):
         field.load_state(small(other).state())
-    state = field.state()
-    state.pop("meta")
+    arrays = {name: array for name, array in field.state().items() if name != "meta"}
     with pytest.raises(ValueError, match="not a state"):
-        field.load_state(state)
+        field.load_state(arrays)
 
 
 @every_field
