@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -91,17 +89,3 @@ def test_effects_that_take_the_camera_to_stand_still_are_refused():
     scenario = at(own_address(), effects={"motion_blur": None})
     with pytest.raises(ScenarioError, match=r"motion_blur: not for a camera that an arm carries \(hand\)"):
         build_cameras(scenario, source_config(scenario), ["hand"])
-
-
-def test_a_world_without_an_arm_loads_nothing_of_one():
-    code = """
-import sys
-from camera_node.build import build_cameras
-from camera_node.config import source_config
-from freshfield.scenario import load
-build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
-unasked = ("camera_node.pose", "camera_node.robot.hand_camera", "camera_node.sources.devices.live", "rtde",
-           "depthai")
-print([name for name in sys.modules if name.startswith(unasked)])
-"""
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -5,8 +5,6 @@ import json
 import math
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from unittest.mock import MagicMock
 
@@ -30,7 +28,6 @@ from tests.camera_node.robot.arm.simulated import (
     write_cell,
 )
 from tests.camera_node.robot.teleop.checks import HOME, sample
-from tests.conftest import ROOT
 
 
 def free_port() -> int:
@@ -156,11 +153,3 @@ def test_wrong_settings_are_one_line(tmp_path, capsys, section, part):
     assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}", "--dry-run", out]) == 2
     said = capsys.readouterr().err
     assert part in said and said.count("\n") == 1
-
-
-def test_a_node_that_streams_imports_nothing_of_teleoperation():
-    code = (
-        "import sys; import camera_node.node, camera_node.build, camera_node.cli; "
-        "sys.exit(any(name.startswith('camera_node.robot.teleop') for name in sys.modules))"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
