@@ -31,7 +31,7 @@ class Segmenter(Protocol):
 
 
 def make_segmenter(config: ForegroundConfig) -> Segmenter:
-    """Raises ForegroundError."""
+    """Create the segmenter that ``config.segment`` names. ForegroundError: its model is unusable."""
     if config.segment == BOX:
         return WholeBox()
     if config.segment == GRABCUT:
