@@ -190,15 +190,15 @@ def _thing(
 
 
 def _texture(rng: np.random.Generator) -> tx.Texture:
-    def colour() -> tx.Color:
+    def color() -> tx.Color:
         r, g, b = rng.uniform(0.08, 0.98, 3)
         return float(r), float(g), float(b)
 
     period = float(rng.choice([1 / 3, 1 / 4, 1 / 6]))
     made: list[tx.Texture] = [
-        tx.Plain(colour()),
-        tx.Stripes(colour(), colour(), period, soft=0.04),
-        tx.Checker(colour(), colour(), 1 / 8, 0.5, 0.05),
+        tx.Plain(color()),
+        tx.Stripes(color(), color(), period, soft=0.04),
+        tx.Checker(color(), color(), 1 / 8, 0.5, 0.05),
     ]
     return made[int(rng.integers(len(made)))]
 
