@@ -18,7 +18,7 @@ from camera_node.robot.hand_camera import TruthClient
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, ScenarioError, load
-from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.robot.arm.simulated import own_address, simulated_arm
 
 CELL = load("cell")
 LOOKING = (-95.90, 9.29, -109.38, 0.72, 262.47, 38.48)  # degrees, from a viewpoint of the cell's tour
@@ -41,9 +41,7 @@ def take(camera):
     return camera.capture(int(time.time() * camera.fps))
 
 
-def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
-    require_ur_rtde()
-    host = own_address()
+def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
     scenario = at(host)
     with simulated_arm(host, f"--joints={','.join(map(str, LOOKING))}"):
         fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
@@ -59,9 +57,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
         hand.source._poses._hand._stream.stop()
 
 
-def test_the_truth_of_another_instant_is_not_taken():
-    require_ur_rtde()
-    host = own_address()
+def test_the_truth_of_another_instant_is_not_taken(host):
     with simulated_arm(host):
         truth, clock = TruthClient(host), WallClock()
         assert truth.joints(clock.now_ns()).shape == (6,)
@@ -70,9 +66,8 @@ def test_the_truth_of_another_instant_is_not_taken():
                 truth.joints(clock.now_ns() + offset_ns)
 
 
-def test_without_an_arm_one_line_says_what_to_start():
-    require_ur_rtde()
-    scenario = at(own_address())
+def test_without_an_arm_one_line_says_what_to_start(host):
+    scenario = at(host)
     begin = time.monotonic()
     with pytest.raises(ArmError, match="camera-node simulate-arm"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
