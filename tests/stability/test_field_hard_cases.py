@@ -24,15 +24,6 @@ long = pytest.mark.parametrize(
 
 
 @every_field
-def test_nothing_at_all(name: str) -> None:
-    field = tiny(name)
-    assert field.fit([], Budget(steps=3)).steps == 0
-    points, colors = field.points(10)
-    assert points.shape == (0, 3) and colors.shape == (0, 3)
-    healthy(field, VIEWS)
-
-
-@every_field
 def test_one_view(name: str) -> None:
     field = tiny(name)
     field.fit(VIEWS[:1], Budget(steps=60))
