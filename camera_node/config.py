@@ -6,6 +6,7 @@ needs the data itself (does the folder hold this camera?) is checked when the so
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,18 @@ REPLAYS = ("once", "restart")
 PAIRINGS = ("nearest", "interpolated")
 BACKGROUNDS = ("white", "black", "keep")
 ROBOTS = ("ur3e",)
+
+
+def _check(config: Any, **allowed: tuple[Any, Any] | tuple[str, ...]) -> None:
+    """ValueError unless each of these keys has one of the names, or a number within the two bounds, that are
+    allowed; None is not checked."""
+    for key, values in allowed.items():
+        value = getattr(config, key)
+        if isinstance(values[0], str):
+            if value not in values:
+                raise ValueError(f"{key} is {value!r}, expected one of {', '.join(values)}")
+        elif value is not None and not values[0] <= value <= values[1]:
+            raise ValueError(f"{key} is {value:.10g}, expected {values[0]:.10g} to {values[1]:.10g}")
 
 
 @dataclass(frozen=True)
@@ -38,12 +51,7 @@ class SourceConfig:
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.fps is not None and not 0.01 <= self.fps <= 1000:
-            raise ValueError(f"fps is {self.fps:g}, expected 0.01 to 1000")
-        if self.codec not in CODECS:
-            raise ValueError(f"codec is {self.codec!r}, expected one of {', '.join(CODECS)}")
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"quality is {self.quality}, expected 1 to 100")
+        _check(self, fps=(0.01, 1000), codec=CODECS, quality=(1, 100))
 
 
 @dataclass(frozen=True)
@@ -106,8 +114,9 @@ class ArmConfig:
     teleop: dict[str, Any] | None = None  # read by the command alone: a node that streams needs none of it
 
     def __post_init__(self) -> None:
-        if self.robot not in ROBOTS:
-            raise ValueError(f"robot is {self.robot!r}, expected one of {', '.join(ROBOTS)}")
+        _check(
+            self, robot=ROBOTS, frequency_hz=(10, 500), pairing=PAIRINGS, max_gap_ms=(0, math.inf)
+        )  # fmt: skip
         if not self.cameras:
             raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
         # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
@@ -115,9 +124,6 @@ class ArmConfig:
             raise ValueError(
                 f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2"
             )
-        if not 10.0 <= self.frequency_hz <= 500.0:
-            raise ValueError(f"frequency_hz is {self.frequency_hz:g}, expected 10 to 500")
-        _check_pairing(self.pairing, self.max_gap_ms)
 
 
 @dataclass(frozen=True)
@@ -159,7 +165,7 @@ class TrajectoryConfig:
     hand_eye: str = ""
 
     def __post_init__(self) -> None:
-        _check_pairing(self.pairing, self.max_gap_ms)
+        _check(self, pairing=PAIRINGS, max_gap_ms=(0, math.inf))
 
 
 @dataclass(frozen=True)
@@ -179,13 +185,11 @@ class RecordedConfig(SourceConfig):
             raise ValueError("data: missing: the data set's folder or JSON file")
         if self.scale < 1:
             raise ValueError(f"scale is {self.scale:g}, expected 1 or more (2 halves the images)")
-        if self.loop not in LOOPS:
-            raise ValueError(f"loop is {self.loop!r}, expected one of {', '.join(LOOPS)}")
-        background = getattr(self, "background", BACKGROUNDS[0])
-        if background not in BACKGROUNDS:
-            raise ValueError(f"background is {background!r}, expected {', '.join(BACKGROUNDS)}")
-        if background == "keep" and self.codec != "png":
-            raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
+        _check(self, loop=LOOPS)
+        if hasattr(self, "background"):
+            _check(self, background=BACKGROUNDS)
+            if self.background == "keep" and self.codec != "png":
+                raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
 
 
 @dataclass(frozen=True)
@@ -224,12 +228,8 @@ class LiveConfig(SourceConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (8 <= self.width <= MAX_IMAGE_SIDE_PX and 8 <= self.height <= MAX_IMAGE_SIDE_PX):
-            raise ValueError(f"width and height: expected 8 to {MAX_IMAGE_SIDE_PX}")
-        if self.exposure_us is not None and not 1 <= self.exposure_us <= 1_000_000:
-            raise ValueError("exposure_us: expected 1 to 1000000")
-        if not 0.1 <= self.first_frame_s <= 60.0:
-            raise ValueError("first_frame_s: expected 0.1 to 60")
+        side = (8, MAX_IMAGE_SIDE_PX)
+        _check(self, width=side, height=side, exposure_us=(1, 10**6), first_frame_s=(0.1, 60))
 
 
 @dataclass(frozen=True)
@@ -253,8 +253,7 @@ class OakConfig(LiveConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 100 <= self.iso <= 1600:
-            raise ValueError("iso: expected 100 to 1600")
+        _check(self, iso=(100, 1600))
 
 
 @dataclass(frozen=True)
@@ -279,8 +278,7 @@ class ZjuConfig(RecordedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.01 <= self.recorded_fps <= 1000:
-            raise ValueError(f"recorded_fps is {self.recorded_fps:g}, expected 0.01 to 1000")
+        _check(self, recorded_fps=(0.01, 1000))
 
 
 @dataclass(frozen=True)
@@ -316,8 +314,7 @@ class McapConfig(SourceConfig):
         super().__post_init__()
         if not self.file:
             raise ValueError("file: missing: the recording")
-        if self.loop not in REPLAYS:
-            raise ValueError(f"loop is {self.loop!r}, expected one of {', '.join(REPLAYS)}")
+        _check(self, loop=REPLAYS)
         if self.effects:
             raise ValueError("effects: a recording is replayed as it was; leave them out")
 
@@ -336,13 +333,6 @@ MODELS: dict[str, type[SourceConfig]] = {
     "oak": OakConfig,
     "realsense": RealsenseConfig,
 }
-
-
-def _check_pairing(pairing: str, max_gap_ms: float) -> None:
-    if pairing not in PAIRINGS:
-        raise ValueError(f"pairing is {pairing!r}, expected one of {', '.join(PAIRINGS)}")
-    if max_gap_ms < 0:
-        raise ValueError("max_gap_ms cannot be negative")
 
 
 def source_config(scenario: Scenario) -> SourceConfig:

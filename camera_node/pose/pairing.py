@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import PairedPose, PoseGapError, locate
+from camera_node.pose.providers import PairedPose, PoseGapError, sample_at
 from freshfield.geometry import Pose, cross_matrix, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
@@ -137,15 +137,12 @@ class SampleBuffer(Generic[T]):
         """The sample for an instant. Raises PoseGapError where none is near enough."""
         with self._lock:
             try:
-                place = locate(self._times, t_ns, self._max_gap_ns)
+                found = sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
             except PoseGapError:
                 self.counts.refused += 1
                 raise
             self.counts.paired += 1
-            if self._interpolate is None or place.fraction is None:
-                return PairedSample(self._samples[place.nearest], place.gap_ns)
-            a, b = self._samples[place.before], self._samples[place.before + 1]
-        return PairedSample(self._interpolate(a, b, place.fraction), place.gap_ns)
+            return PairedSample(*found)
 
     def ready(self, t_ns: int) -> bool:
         """Whether a sample as new as the instant has come; until then the newest one would be repeated."""

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import bisect
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
+
+T = TypeVar("T")
 
 _COLUMN_NAMES = ("t", "time", "timestamp")
 
@@ -80,26 +82,22 @@ class Trajectory:
         self._max_gap_ns = max_gap_ns
 
     def at(self, t_ns: int) -> PairedPose:
-        place = locate(self._times, t_ns, self._max_gap_ns)
-        if not self._interpolate or place.fraction is None:
-            return PairedPose(self._poses[place.nearest], place.gap_ns)
-        before, after = self._poses[place.before], self._poses[place.before + 1]
-        return PairedPose(before.interpolate(after, place.fraction), place.gap_ns)
+        interpolate = Pose.interpolate if self._interpolate else None
+        return PairedPose(*sample_at(self._times, self._poses, t_ns, self._max_gap_ns, interpolate))
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where an instant lies among sample times: the nearest one, and the share ``fraction`` of the way from
-    ``before`` to the next; None on a sample, before the first and after the last."""
+def sample_at(
+    times_ns: Sequence[int],
+    samples: Sequence[T],
+    t_ns: int,
+    max_gap_ns: int,
+    interpolate: Callable[[T, T, float], T] | None,
+) -> tuple[T, int]:
+    """The sample for an instant, and the time (ns) from that instant to the nearest sample.
 
-    nearest: int
-    gap_ns: int
-    before: int
-    fraction: float | None
-
-
-def locate(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
-    """Place of an instant among increasing times. Raises PoseGapError where none is within the bound."""
+    times_ns: of the samples, increasing. interpolate: makes a sample between two, at a share of the way from
+    the first to the second; None takes the nearest. Raises PoseGapError where none is within ``max_gap_ns``.
+    """
     if not times_ns:
         raise PoseGapError("there is no pose yet")
     after = bisect.bisect_left(times_ns, t_ns)
@@ -112,9 +110,10 @@ def locate(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
     gap = abs(times_ns[nearest] - t_ns)
     if gap > max_gap_ns:
         raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {max_gap_ns / 1e6:g} ms")
-    if gap == 0 or before < 0 or last:
-        return Place(nearest, gap, before, None)
-    return Place(nearest, gap, before, (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before]))
+    if interpolate is None or gap == 0 or before < 0 or last:
+        return samples[nearest], gap
+    fraction = (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before])
+    return interpolate(samples[before], samples[after], fraction), gap
 
 
 def read_tum(

@@ -15,7 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.sources.datasets.records import DatasetError, camera_to_world, errors_at, read_json
+from camera_node.sources.datasets.records import (
+    DatasetError,
+    camera_to_world,
+    errors_at,
+    read_array,
+    read_json,
+)
 from freshfield.geometry import Pinhole, Pose
 
 
@@ -34,8 +40,8 @@ def load_calibration(file: Path) -> dict[str, CalibratedCamera]:
 
 
 def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
-    k = _array(entry, "K", (3, 3), where)
-    distortion = _array(entry, "dist_k1k2p1p2", (4,), where) if "dist_k1k2p1p2" in entry else np.zeros(4)
+    k = read_array(entry, "K", (3, 3), where)
+    distortion = read_array(entry, "dist_k1k2p1p2", (4,), where) if "dist_k1k2p1p2" in entry else np.zeros(4)
     size = [entry.get(key) for key in ("width", "height")]
     if not all(isinstance(v, int) and v > 0 for v in size):
         raise DatasetError(f"{where}: width and height are {size}, expected positive whole numbers")
@@ -52,19 +58,7 @@ def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
     )
     if "R_world_to_cam" not in entry:
         return CalibratedCamera(intrinsics, None)
-    rotation = _array(entry, "R_world_to_cam", (3, 3), where)
-    translation = _array(entry, "t_world_to_cam", (3,), where)
+    rotation = read_array(entry, "R_world_to_cam", (3, 3), where)
+    translation = read_array(entry, "t_world_to_cam", (3,), where)
     with errors_at(f"{where}.R_world_to_cam"):
         return CalibratedCamera(intrinsics, Pose.from_matrix(camera_to_world(rotation, translation)))
-
-
-def _array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    try:
-        value = np.array(entry[key], dtype=np.float64)
-    except KeyError:
-        raise DatasetError(f"{where}: {key} is missing") from None
-    except (ValueError, TypeError):
-        raise DatasetError(f"{where}.{key}: expected numbers") from None
-    if value.shape != shape or not np.all(np.isfinite(value)):
-        raise DatasetError(f"{where}.{key}: expected finite numbers of shape {shape}, got {value.shape}")
-    return value

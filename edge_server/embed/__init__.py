@@ -1,9 +1,9 @@
-"""What a camera sees, in a few numbers: the frozen backbone of a YOLO detector through ONNX Runtime (6.31).
+"""Embeddings of frames: the frozen backbone of a YOLO detector, run by ONNX Runtime (6.31).
 
 A frame's embedding z = F_e(frame) is the detector's last backbone feature map, averaged over the image and
-projected to ``dim`` numbers. Any detection ONNX exported from YOLOv8 or YOLO11 will do; the default is a
-small detector of our own, trained on our own scenes (``edge-server train-detector``) and shipped. A
-scenario asks for embeddings with ``edge.embedding``; without that key nothing here is imported.
+projected to ``dim`` numbers. Any detection ONNX exported from YOLOv8 or YOLO11 works; the default is a small
+detector trained on our own scenes (``edge-server train-detector``). The scenario key ``edge.embedding``
+enables it; without that key this package is not imported.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 
 DEFAULT = "default"
 MODELS = Path(__file__).parent / "models"
-# Of the two that are shipped the faster one; between their features the mean cosine is .998 (detector.json).
+# The faster of the two shipped models; their features have a mean cosine of 0.998 (detector.json).
 DETECTOR = "detector_int8.onnx"
 PROVIDERS = ("auto", "cpu", "cuda")
 
 
 class EmbeddingError(ValueError):
-    """A model, setting or image that cannot be used: one line saying what, where and what to do."""
+    """A model, setting or image is unusable; the one-line message says what, where and what to do."""
 
 
 class SizeError(EmbeddingError):
-    """A size that the model was not exported for."""
+    """The model was not exported for this image size."""
 
 
 @dataclass(frozen=True)
 class EmbeddingConfig:
     """The section ``edge.embedding`` of a scenario.
 
-    model: a YOLO detection ONNX, relative to the scenario, or ``default``. dim: numbers a frame, at most the
-    channels of the tapped layer. size: side in pixels that frames are fitted into; None takes the model's
-    own. tap: the tensor to embed with, or a module of the exporter's such as ``model.9``; None finds the
-    backbone's end. provider: where it runs; auto takes CUDA where ONNX Runtime has it. threads: of the CPU.
+    model: a YOLO detection ONNX, relative to the scenario, or ``default``. dim: length of an embedding, at
+    most the channels of the tapped layer. size: side of the model's input, pixels; None: the model's own.
+    tap: the tensor to embed, or a module of the exporter's such as ``model.9``; None: the backbone's end.
+    provider: auto uses CUDA if ONNX Runtime has it. threads: of the CPU.
     """
 
     model: str = DEFAULT
@@ -62,7 +62,7 @@ class EmbeddingConfig:
 
 
 def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:
-    """The section ``edge.embedding`` of the file ``scenario``; raises freshfield.scenario.ScenarioError."""
+    """Read the section ``edge.embedding`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
     config = read_section(EmbeddingConfig, values, f"{scenario}: edge.embedding")
     if config.model == DEFAULT:
@@ -71,13 +71,13 @@ def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfi
 
 
 def model_path(name: str) -> Path:
-    """The file of a model's name."""
+    """The file of a model: a path, or ``default``."""
     return MODELS / DETECTOR if name == DEFAULT else Path(name)
 
 
 def make_embedder(section: EmbeddingConfig) -> Embedder:
-    """The embedder that a section describes. Raises EmbeddingError: a library that is not installed, a
-    file that is no YOLO detector, a size or provider that it cannot have."""
+    """Create from a section. EmbeddingError: a library is not installed, the file is not a YOLO detector, or
+    it cannot have this size or provider."""
     try:
         from edge_server.embed.backbone import load_backbone
         from edge_server.embed.embedder import Embedder

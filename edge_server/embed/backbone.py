@@ -1,9 +1,9 @@
-"""Finds the end of a YOLO detector's backbone in its ONNX graph and cuts everything behind it off.
+"""Finds the end of a YOLO detector's backbone in its ONNX graph, and cuts off the rest.
 
-A detector of the YOLO family is a backbone, which ends in a coarse feature map, and a neck, which begins by
-enlarging that map and joining it with a finer one. So the backbone's end is what the first enlargement
-reads. That holds for YOLOv8, where it is module 9, for YOLO11, where it is module 10, for quantised files
-and for those whose nodes an optimiser has renamed. The neck and the head are not run, not even loaded.
+A YOLO detector has a backbone, which ends in a coarse feature map, and a neck, which first enlarges that map
+and joins it with a finer one. So the backbone ends at the input of the first enlargement. This holds for
+YOLOv8 (module 9), YOLO11 (module 10), quantized files and files whose nodes an optimizer has renamed. Neck
+and head are not loaded.
 
 The file may come from anywhere: it is checked before anything in it is run or allocated.
 """
@@ -28,12 +28,12 @@ from onnx.utils import Extractor
 from edge_server.embed import EmbeddingError, SizeError
 
 OUTPUT = "pooled"
-# The largest detectors of the family have 230 MB.
+# Twice the largest detectors of the family, 230 MB.
 MAX_FILE_BYTES = 512 * 2**20
-# Of any one tensor and image: six times the largest of YOLO11x at 640 pixels.
+# Of one tensor per image: six times the largest of YOLO11x at 640 pixels.
 MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
-# The size that these detectors are trained at where a file does not say another.
+# The training size of these detectors, unless the file states another.
 USUAL_SIDE = 640
 # Written by experiments.training.detector.export: mean (C,) and axes (C, K) of the pooled features.
 PROJECTION_KEY = "freshfield.projection"
@@ -41,8 +41,8 @@ PROJECTION_KEY = "freshfield.projection"
 _ENLARGE = ("Resize", "Upsample")
 _PER_IMAGE = "DynamicQuantizeLinear"
 _CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
-# What backbones are made of. Operators whose output size is in their data (Expand, Tile, ConstantOfShape,
-# Range, loops) are not among them: with these, a few bytes can ask for any amount of memory.
+# Operators of backbones. Those whose output size is in their data (Expand, Tile, ConstantOfShape, Range,
+# loops) are missing: a few bytes could request any amount of memory.
 _KNOWN = frozenset(
     {
         "Abs", "Add", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat", "Constant", "Conv",
@@ -58,7 +58,7 @@ _TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorPro
 
 @dataclass(frozen=True)
 class Projection:
-    """A model's own learnt projection: rows are (features - mean) @ axes; mean (C,), axes (C, K)."""
+    """A model's learned projection: embeddings are (features - mean) @ axes. mean: (C,). axes: (C, K)."""
 
     mean: NDArray[np.float32]
     axes: NDArray[np.float32]
@@ -69,7 +69,8 @@ class Backbone:
     """A detector up to its backbone's end: images (n, 3, height, width) in [0, 1] -> ``pooled`` (n,
     channels).
 
-    model: the ONNX bytes. batch: images a run takes; None, any number. digest: of the file it came from.
+    model: the ONNX bytes. tap: the tensor that is pooled. batch: images per run; None: any number. digest: of
+    the source file.
     """
 
     name: str
@@ -86,7 +87,7 @@ class Backbone:
 
 
 def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -> Backbone:
-    """Read the detector at ``path``. ``tap`` and ``size`` as in EmbeddingConfig. Raises EmbeddingError."""
+    """Load the detector at ``path``. tap, size: as in EmbeddingConfig. Raises EmbeddingError."""
     data = _read(path)
     model = _parse(data, path)
     meta = {p.key: p.value for p in model.metadata_props}
@@ -111,8 +112,8 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
 
 
 def cut_layers(path: Path, taps: tuple[str, ...]) -> tuple[bytes, str]:
-    """(ONNX bytes of the detector at ``path`` up to the feature maps ``taps``, name of its input): the maps
-    themselves are its outputs, under their own names. Raises EmbeddingError."""
+    """Cut the detector at ``path`` after the feature maps ``taps``. Returns its ONNX bytes and the name of
+    its input; the outputs are the maps, under their own names. Raises EmbeddingError."""
     model = _parse(_read(path), path)
     image = _image_input(model, path)
     cut = _cut(model, image.name, {_find_tap(model, tap, path): None for tap in taps}, path)
@@ -163,7 +164,7 @@ def _image_input(model: onnx.ModelProto, path: Path) -> onnx.ValueInfoProto:
 
 
 def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
-    """The tensor asked for, or the backbone's end."""
+    """Name of the tensor that ``tap`` means, or of the backbone's end."""
     nodes = model.graph.node
     if tap is not None:
         outputs = [o for node in nodes for o in node.output if o]
@@ -184,7 +185,7 @@ def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
     for node in nodes:
         for name in node.input:
             readers.setdefault(name, []).append(node)
-    seen: set[str] = set()  # tensors behind a convolution: an enlargement before is the user's preprocessing
+    seen: set[str] = set()  # after a convolution; an enlargement before any is preprocessing
     for node in nodes:
         behind = node.op_type in _CONVOLVE or any(i in seen for i in node.input)
         if node.op_type in _ENLARGE and behind and _is_joined(node, readers):
@@ -198,7 +199,7 @@ def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
 
 
 def _is_joined(node: onnx.NodeProto, readers: dict[str, list[onnx.NodeProto]]) -> bool:
-    """Whether an enlarged map meets another one, maybe after having been quantised."""
+    """Whether an enlarged map is joined with another, possibly after quantization."""
     following = [reader for name in node.output for reader in readers.get(name, [])]
     return any(
         reader.op_type == "Concat"
@@ -208,9 +209,9 @@ def _is_joined(node: onnx.NodeProto, readers: dict[str, list[onnx.NodeProto]]) -
 
 
 def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: Path) -> onnx.ModelProto:
-    """The graph from the images to ``taps``: tensor -> name of its mean over the image, or None for the
-    map itself."""
-    # An earlier export's shapes may be wrong for another size; the extractor wants some value all the same.
+    """The graph from the images to ``taps``: tensor -> name of its mean over the image, or None for the map
+    itself."""
+    # Exported shapes may be wrong for another size, but the extractor needs an entry per tap.
     model.graph.name = "backbone"
     del model.graph.value_info[:]
     model.graph.value_info.extend(helper.make_empty_tensor_value_info(name) for name in taps)
@@ -236,7 +237,7 @@ def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: 
         if pooled is None:
             cut.graph.output.append(helper.make_tensor_value_info(tap, TensorProto.FLOAT, None))
             continue
-        # A map that is quantised for good is whole numbers: its offset and scale are the same in every image.
+        # A statically quantized map holds integers, with the same offset and scale in every image.
         cut.graph.node.extend(
             [
                 helper.make_node("Cast", [tap], ["pooled.float"], to=TensorProto.FLOAT),
@@ -251,7 +252,7 @@ def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: 
 def _shape_of(
     cut: onnx.ModelProto, size: int | None, meta: dict[str, str], path: Path
 ) -> tuple[int | None, tuple[int, int]]:
-    """(fixed batch or None, (height, width)) that the model will be fed."""
+    """(fixed batch or None, (height, width)) of the model's input."""
     batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
     if height and width:
         if size is not None and (height, width) != (size, size):
@@ -269,7 +270,7 @@ def _shape_of(
 
 
 def _exported_for(meta: dict[str, str]) -> tuple[int, int]:
-    """(height, width) that the exporter noted, such as ``[640, 640]``."""
+    """(height, width) in the exporter's metadata, such as ``[640, 640]``, else USUAL_SIDE."""
     try:
         height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
         return height, width
@@ -278,7 +279,7 @@ def _exported_for(meta: dict[str, str]) -> tuple[int, int]:
 
 
 def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, path: Path) -> int:
-    """Channels of the tap; refuses what would take more memory than any YOLO backbone."""
+    """Number of channels of the tap. EmbeddingError: a tensor is larger than in any YOLO backbone."""
     fed = onnx.ModelProto()
     fed.CopyFrom(cut)
     for dim, value in zip(fed.graph.input[0].type.tensor_type.shape.dim, (batch, 3, height, width)):
@@ -304,7 +305,7 @@ def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, pat
 
 
 def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection | None:
-    """The projection that a model of ours carries: float32, mean and then the axes."""
+    """The projection that a model of ours carries in its metadata; None without one."""
     if PROJECTION_KEY not in meta:
         return None
     try:
@@ -318,5 +319,5 @@ def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection |
 
 
 def pack_projection(mean: NDArray[np.float32], axes: NDArray[np.float32]) -> str:
-    """The text of the metadata ``PROJECTION_KEY`` for mean (C,) and axes (C, K)."""
+    """Text for the metadata ``PROJECTION_KEY``. mean: (C,). axes: (C, K)."""
     return base64.b64encode(mean.astype("<f4").tobytes() + axes.astype("<f4").tobytes()).decode()

@@ -1,4 +1,4 @@
-"""Embeddings of frames, computed when a decision first uses a frame and then kept."""
+"""Caches embeddings of frames, computed when a decision first uses a frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from freshfield.frame import Frame
 
-# Frames whose embeddings are kept: several rounds of the largest rigs. A kilobyte each at most.
+# Number of embeddings to keep: several rounds of the largest rigs.
 CAPACITY = 1024
 
 _Key = tuple[str, str, int]
@@ -56,8 +56,8 @@ class EmbeddingCache(Generic[Item]):
     def __init__(
         self, embedder: EmbedderLike, decode: Callable[[Item], HasImage | None], capacity: int = CAPACITY
     ) -> None:
-        """decode: gives the view of a frame, None where it is damaged. Share it with the field's decoder, so
-        that a frame that both use is decoded once."""
+        """decode: gives a frame's view, None if it is damaged. Share it with the field, so that a frame that
+        both use is decoded once."""
         self._embedder, self._decode, self._capacity = embedder, decode, capacity
         # None: the frame has no embedding.
         self._rows: OrderedDict[_Key, _Row] = OrderedDict()
@@ -65,10 +65,9 @@ class EmbeddingCache(Generic[Item]):
         self.failed = 0
 
     def of(self, items: Sequence[Item]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Embeddings of frames in their order.
+        """Embed frames. Returns embeddings, float32 (n, dim), and their validity, bool (n,).
 
-        Returns float32 (n, dim), and bool (n,), which of them are valid. The row of a frame that cannot be
-        decoded, or for which the model gives nothing finite, is zero and not valid.
+        A frame that cannot be decoded, or whose embedding is not finite, has a row of zeros and is not valid.
         """
         keys = [(i.frame.camera, i.frame.session, i.frame.sequence) for i in items]
         missing = {key: item for key, item in zip(keys, items) if key not in self._rows}

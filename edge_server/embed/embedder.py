@@ -1,4 +1,4 @@
-"""Runs a backbone and projects what it gives: images -> embeddings (6.31)."""
+"""Runs a backbone and projects its features: images -> embeddings (6.31)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from edge_server.embed.letterbox import GREY, blob, checked
 
 log = logging.getLogger(__name__)
 
-# Images a run where the model takes any number. On a CPU more of them leave its caches: these small networks
-# then take longer a frame, not shorter.
+# Images per run if the model takes any number. On a CPU, larger batches exceed its caches and take longer per
+# image.
 _BATCH = {"cpu": 4, "cuda": 32}
-# Of the random projection: one model, one embedding, whatever the scenario's seed.
+# Fixed, so that a model's embeddings do not depend on the scenario's seed.
 _PROJECTION_SEED = 20240631
 _NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 
@@ -28,13 +28,13 @@ _NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 class Embedder:
     """A frozen map from images to ``dim`` numbers each.
 
-    Two embedders of one ``name`` give the same numbers, so what was learnt with one holds with the other.
-    ``failed`` counts images for which the model gave NaN or infinity.
+    name: what was learned with one embedder holds for any other of the same name. failed: number of images
+    for which the model gave NaN or infinity.
     """
 
     def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:
-        """Raises EmbeddingError: ``dim`` beyond the backbone's channels, a provider that ONNX Runtime does
-        not have here, a model that does not run."""
+        """EmbeddingError: ``dim`` exceeds the backbone's channels, ONNX Runtime has no such provider, or the
+        model does not run."""
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
@@ -43,16 +43,16 @@ class Embedder:
         )
         self._session, self.provider = open_session(backbone.model, provider, threads, backbone.name)
         self.step = backbone.batch or _BATCH[self.provider]
-        """Images a run takes."""
-        # What cannot run fails here, with the file's name, and not at the first decision.
+        """Images per run."""
+        # A model that cannot run fails here, not at the first decision.
         self.pooled([np.full((8, 8, 3), GREY, np.uint8)])
 
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any sizes; RGBA is laid over grey.
+        """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any size; RGBA is composited over
+        gray.
 
-        An image for which the model gives NaN or infinity gets a row of zeros, which no other image gets,
-        and is counted in ``failed``; its neighbours in the batch keep theirs. Raises EmbeddingError for what
-        is no image.
+        An image for which the model gives NaN or infinity has a row of zeros, which no other image has, and
+        is counted in ``failed``. EmbeddingError: an array is not an image.
         """
         features = self.pooled(images)
         # A finite feature beyond float32's square root may still overflow in the product.
@@ -64,7 +64,7 @@ class Embedder:
         return rows
 
     def pooled(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Means over the image (n, channels) of the backbone's last feature map, as the model gives them."""
+        """Features (n, channels): means over each image of the backbone's last feature map."""
         whole = [checked(image, number) for number, image in enumerate(images)]
         b = self.backbone
         out = np.empty((len(whole), b.channels), dtype=np.float32)
@@ -78,7 +78,7 @@ class Embedder:
         return out
 
     def run(self, part: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Features (n, channels) of ready-made input (n, 3, height, width), one run of the model."""
+        """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels)."""
         try:
             found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
         except Exception as error:  # ONNX Runtime's exceptions share no base class
@@ -93,7 +93,8 @@ class Embedder:
 
 
 def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[ort.InferenceSession, str]:
-    """(session, the provider it runs on: cpu or cuda). Raises EmbeddingError."""
+    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. name: for errors. Raises
+    EmbeddingError."""
     available = [short for short, long in _NAMES.items() if long in ort.get_available_providers()]
     chosen = ("cuda" if "cuda" in available else "cpu") if provider == "auto" else provider
     if chosen not in available:
@@ -103,8 +104,8 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
         )
     options = ort.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # an error is raised: printed, too, it would be said twice
-    # Waiting threads would spin on the cores that the field is being fitted on.
+    options.log_severity_level = 4  # errors are raised, not printed too
+    # Spinning threads would take the field's cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names = [_NAMES[chosen]] if chosen == "cpu" else [_NAMES[chosen], _NAMES["cpu"]]
     try:
@@ -114,7 +115,7 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
     except Exception as error:  # as above
         reason = " ".join(str(error).split())[:200]
         raise EmbeddingError(f"{name}: ONNX Runtime cannot load it: {reason}") from None
-    # Where CUDA's libraries do not load, ONNX Runtime falls back without a word.
+    # If CUDA's libraries do not load, ONNX Runtime falls back to the CPU silently.
     if chosen == "cuda" and _NAMES["cuda"] not in session.get_providers():
         if provider == "cuda":
             raise EmbeddingError("provider: CUDA cannot be used here: its driver or libraries do not load")
@@ -124,8 +125,8 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
 
 
 def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean (C,) and axes (C, dim): the model's own where it has one, else fixed, random and orthonormal,
-    which keeps distances as well as any projection that knows nothing of the data."""
+    """Mean (C,) and axes (C, dim): the model's own, else fixed, random and orthonormal, which keeps distances
+    as well as any projection that ignores the data."""
     channels = backbone.channels
     if backbone.projection is not None:
         mean, axes = backbone.projection.mean, backbone.projection.axes
@@ -136,5 +137,5 @@ def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDAr
         raise EmbeddingError(f"dim: {backbone.tap} has {channels} channels, {dim} numbers were asked for")
     draw = np.random.default_rng(_PROJECTION_SEED).standard_normal((channels, dim))
     q, r = np.linalg.qr(draw)
-    # QR is unique only up to signs: fixing them makes libraries agree.
+    # QR is unique only up to signs: fixed, they are the same in all libraries.
     return np.zeros(channels, np.float32), (q * np.sign(np.diag(r))).astype(np.float32)

@@ -1,7 +1,7 @@
-"""What leaves the edge as files that other programs read: one module a format, none needs the others.
+"""Exports fields and runs as files for other programs, one module per format.
 
-Everything written is whole or not there at all (``freshfield.files``). Conventions are those of the format:
-each module says how they differ from ours (camera-to-world, OpenCV axes, metres, w-first quaternions).
+Files are written atomically (``freshfield.files``). Each module states how its format's conventions differ
+from ours (camera-to-world, OpenCV axes, metres, w-first quaternions).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from freshfield.geometry import Pinhole
 
 
 class ExportError(ValueError):
-    """Something that cannot be written as asked; the message says why and what to do."""
+    """The export cannot be written as asked; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A posed picture as formats want it. name: of the file, without folder or extension. image: uint8
-    (H, W, 3 or 4). camera_to_world: (4, 4), OpenCV axes, metres. t_s: when, in seconds."""
+    """An image with its pose. name: file name without folder and extension. image: uint8 (H, W, 3 or 4).
+    camera_to_world: (4, 4), OpenCV axes, metres. t_s: capture time, seconds."""
 
     name: str
     image: NDArray[np.uint8]
@@ -31,7 +31,7 @@ class PosedImage:
 
 
 def file_names(cameras: list[str]) -> list[str]:
-    """A file name for each camera, without extension: its own last part where no two share it."""
+    """A file name per camera, without extension: the last part of its name, numbered if two are equal."""
     plain = [camera.replace("\\", "/").rsplit("/", 1)[-1].rsplit(".", 1)[0] or "camera" for camera in cameras]
     safe = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in plain]
     return safe if len(set(safe)) == len(safe) else [f"{k:05d}_{name}" for k, name in enumerate(safe)]

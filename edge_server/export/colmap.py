@@ -25,7 +25,8 @@ _NAMES = {_PINHOLE: "PINHOLE", _OPENCV: "OPENCV"}
 
 @dataclass(frozen=True)
 class Cloud:
-    """points: float64 (N, 3), metres. color: uint8 (N, 3). seen: bool (N, S), in which shots."""
+    """A point cloud. points: float64 (N, 3), metres. color: uint8 (N, 3). seen: bool (N, S), which shots see
+    each point."""
 
     points: NDArray[np.float64]
     color: NDArray[np.uint8]
@@ -44,14 +45,14 @@ class _Image:
 
 
 def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud, binary: bool = False) -> None:
-    """Write cameras, images and points3D (.txt, or .bin) to ``folder``, which is made. Images are called
-    NAME.png. ExportError: no shots."""
+    """Write cameras, images and points3D (.txt, or .bin if ``binary``) to ``folder``, which is created.
+    Images are named NAME.png. ExportError: no shots."""
     if not shots:
         raise ExportError("no camera has reported: there is nothing to write")
     folder.mkdir(parents=True, exist_ok=True)
     lenses = list(dict.fromkeys(shot.intrinsics for shot in shots))
     images = [_image(k, shot, lenses, cloud) for k, shot in enumerate(shots)]
-    # Of a point: number of the image, place of its pixel among that image's.
+    # For each point: (image number, index of its pixel among that image's).
     tracks: list[list[tuple[int, int]]] = [[] for _ in cloud.points]
     for image in images:
         for place, point in enumerate(image.points):

@@ -1,4 +1,4 @@
-"""``edge-server export``: what a run or a fit has made, as files for other programs."""
+"""``edge-server export``: writes a run or a fit as files for other programs."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from depth as the cameras see it, fused on a grid; what no camera saw stays open
 """
 
 
-# (mesh, scenario, views) -> distances to the true surface, None where it is not known, and a line for people.
+# (mesh, scenario, views) -> (distances to the true surface or None, a sentence to print).
 Comparison = Callable[[Any, str, Any], tuple[dict[str, Any] | None, str]]
 
 
 def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
-    """The command; returns its exit status. compare: what --measure does. It needs the synthetic world, which
-    the edge does not import, so the ``edge-server`` command hands it in."""
+    """Run the command; returns its exit status. compare: implements --measure. It is passed in because it
+    needs the synthetic world, which the edge does not import."""
     parser = _parser()
     args = parser.parse_args(argv)
     wanted = ("mesh", "splats", "points", "colmap", "transforms", "trajectory")
@@ -94,13 +94,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 class Export:
-    """One call of the command. What several outputs need is made once, and only if one needs it."""
+    """One export. What several outputs need is computed once, on first use."""
 
     def __init__(self, args: argparse.Namespace, compare: Comparison | None = None) -> None:
         self.args, self._compare = args, compare
         self._said = ("", 0.0)
         self._began = time.perf_counter()
-        self._stages: dict[str, tuple[float, float]] = {}  # when each began and when it was last heard of
+        self._stages: dict[str, tuple[float, float]] = {}  # name -> start, last progress
 
     @cached_property
     def source(self):
@@ -113,7 +113,7 @@ class Export:
 
     @cached_property
     def maps(self):
-        """What the cameras see of the field."""
+        """Depth maps, rendered at the cameras."""
         from edge_server.surface.reconstruct import make_depth_maps
 
         return make_depth_maps(
@@ -122,13 +122,13 @@ class Export:
 
     @cached_property
     def cloud(self):
-        """Surface points and who sees them."""
+        """Surface points, and the cameras that see them."""
         from edge_server.export.point_cloud import sparse_points
 
         return sparse_points(self.maps, self.args.count)
 
     def run(self) -> None:
-        """Check everything that can be checked at once, then write. ExportError, SurfaceError."""
+        """Check all options, then write every output. Raises ExportError, SurfaceError."""
         args = self.args
         self._check()
         for name in ("trajectory", "splats", "transforms", "colmap", "points", "mesh"):
@@ -257,10 +257,10 @@ class Export:
             print(f"{file}: {write_tum(file, found[camera])} poses", flush=True)
 
     def _progress(self, what: str, share: float) -> None:
-        """A line a second, and one when a stage is done."""
+        """Print progress once a second, and when a stage ends."""
         name, at = self._said
         now = time.perf_counter()
-        # A stage has begun when the one before it was last heard of.
+        # A stage starts at the last progress of the one before it.
         begin = max((end for _, end in self._stages.values()), default=self._began)
         self._stages[what] = (self._stages.get(what, (begin, now))[0], now)
         if share >= 1.0 or what != name or now - at >= 1.0:

@@ -1,4 +1,4 @@
-"""GLB (glTF 2.0, binary) of a mesh with colours, by trimesh."""
+"""GLB (glTF 2.0, binary) of a mesh with colors, written by trimesh."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 def write_mesh(
     path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
 ) -> None:
-    """vertices (V, 3) in metres with colour (V, 3), faces (F, 3). The file's scene is turned so that our z is
-    its y, up. ExportError: trimesh is missing."""
+    """Write vertices (V, 3) in metres, uint8 color (V, 3) and faces (F, 3). The scene is turned so that our z
+    is glTF's y, up. ExportError: trimesh is missing."""
     try:
         import trimesh
     except ImportError:

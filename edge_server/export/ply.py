@@ -1,4 +1,4 @@
-"""PLY (Turk 1994), binary and little-endian: meshes and points with colours, any table of properties."""
+"""PLY (Turk 1994), binary and little-endian: meshes and points with colors, tables of properties."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 def write_mesh(
     path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
 ) -> None:
-    """vertices (V, 3) in metres with colour (V, 3), faces (F, 3)."""
+    """Write vertices (V, 3) in metres, color (V, 3) and faces (F, 3)."""
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
     rows["count"], rows["corner"] = 3, faces
     table = _colored(vertices, color)
@@ -24,12 +24,12 @@ def write_mesh(
 
 
 def write_points(path: Path, points: NDArray[np.float32], color: NDArray[np.uint8]) -> None:
-    """points (N, 3) in metres with colour (N, 3)."""
+    """Write points (N, 3) in metres with color (N, 3)."""
     write_table(path, _colored(points, color))
 
 
 def write_table(path: Path, table: NDArray[np.void]) -> None:
-    """A structured array (N,) as the element ``vertex``: its fields become properties, in their order."""
+    """Write a structured array (N,) as the element ``vertex``; its fields become the properties, in order."""
     write_bytes(path, _header(table) + table.tobytes())
 
 

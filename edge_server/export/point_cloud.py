@@ -1,4 +1,4 @@
-"""Points with colours and the cameras that see them, from depth maps: what COLMAP calls a sparse model."""
+"""Points with colors and visibility from depth maps: COLMAP's sparse model."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ SAME = 0.01  # depth tolerance of the same point, share of the distance
 
 
 def sparse_points(maps: Sequence[DepthMap], count: int) -> Cloud:
-    """Up to ``count`` points, evenly many of the pixels of each map that see a surface, with the maps that
-    show a surface there."""
+    """Up to ``count`` surface points, sampled evenly from all maps, and the maps that see each."""
     points, colors, source = [], [], []
     share = count // max(len(maps), 1)
     for k, found in enumerate(maps):

@@ -22,8 +22,8 @@ POSES = "poses.jsonl"
 
 @dataclass(frozen=True)
 class Source:
-    """file: the checkpoint. field: as it was saved. views: the last one of every camera. name: of the
-    representation."""
+    """A saved field. file: its checkpoint. name: of the representation. views: the last one of each
+    camera."""
 
     file: Path
     name: str
@@ -32,7 +32,7 @@ class Source:
 
     @property
     def shots(self) -> list[PosedImage]:
-        """The views as pictures to be written."""
+        """The views as images to write."""
         names = file_names([v.camera for v in self.views])
         return [
             PosedImage(
@@ -43,8 +43,8 @@ class Source:
 
 
 def open_source(path: Path) -> Source:
-    """The field saved in ``path``: a checkpoint, or the folder of a run or fit. ExportError: there is none,
-    or it cannot be read."""
+    """Load the field saved in ``path``: a checkpoint, or the folder of a run or fit. ExportError: there is
+    none, or it cannot be read."""
     file = find_checkpoint(path)
     try:
         state, about = checkpoint.load(file)
@@ -63,8 +63,8 @@ def open_source(path: Path) -> Source:
 
 
 def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
-    """The options a field was made with: those of the state where it tells, since a deadline may have chosen
-    them, but on this machine's threads and device."""
+    """The options a field was made with, without threads and device. The state's own come first, because a
+    deadline may have chosen them."""
     try:
         settings = json.loads(str(state["meta"]))["settings"]
     except (KeyError, ValueError, TypeError):
@@ -74,7 +74,7 @@ def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) ->
 
 
 def find_checkpoint(path: Path) -> Path:
-    """The checkpoint that ``path`` is or holds: of several, a run's last one, else its newest snapshot."""
+    """The checkpoint at ``path`` or in it: a run's last one, else its newest snapshot. ExportError: none."""
     if path.is_file():
         return path
     if not path.is_dir():
@@ -90,7 +90,7 @@ def find_checkpoint(path: Path) -> Path:
 
 
 def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
-    """(ns, pose) of every camera: all that its run wrote down, else its last one."""
+    """Camera -> [(ns, pose)]: all that the run recorded, else the last one. ExportError: a damaged record."""
     found: dict[str, list[tuple[int, Pose]]] = {}
     path = source.file.parent / POSES
     if path.is_file():
@@ -116,7 +116,7 @@ def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
 
 
 def write_images(folder: Path, shots: list[PosedImage]) -> None:
-    """NAME.png of every shot, transparency kept."""
+    """Write NAME.png for every shot, with transparency. ExportError: a file cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     for shot in shots:
         code = cv2.COLOR_RGBA2BGRA if shot.image.shape[2] == 4 else cv2.COLOR_RGB2BGR

@@ -1,7 +1,7 @@
 """Gaussians as PLY in the layout of Kerbl et al.'s code, which the common splat viewers open.
 
-There, colour is .5 + Y0 f_dc + sum of Y_k f_rest, with spherical harmonics whose odd ones run the other way
-round than ours; scales are logarithms, opacities before their sigmoid, quaternions w-first: as here.
+There, color is 0.5 + Y0 f_dc + sum of Y_k f_rest, with spherical harmonics whose odd orders have the opposite
+sign. Scales are logarithms, opacities are before the sigmoid, quaternions are w-first: as here.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1], np.float32)
 
 
 def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
-    """Write all Gaussians; returns how many. ExportError: there are none."""
+    """Write all Gaussians; returns their number. ExportError: there are none."""
     table = splat_table(gaussians, box)
     if not len(table):
         raise ExportError("the field has no Gaussians yet: fit it first")

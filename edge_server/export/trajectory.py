@@ -14,7 +14,7 @@ from freshfield.geometry import Pose
 
 
 def write_tum(path: Path, poses: Iterable[tuple[int, Pose]]) -> int:
-    """(ns, pose) pairs in any order, written by time; returns how many. ExportError: none."""
+    """Write (ns, pose) pairs, sorted by time; returns their number. ExportError: none."""
     rows = sorted(poses, key=lambda row: row[0])
     if not rows:
         raise ExportError("no pose is known: there is nothing to write")

@@ -12,7 +12,7 @@ from freshfield.geometry import OPENGL_TO_OPENCV
 
 def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | None = None) -> Path:
     """Write ``folder``/transforms.json for images in ``folder``/images; returns its path. points: name of a
-    PLY beside it, which nerfstudio starts splats from. ExportError: no shots."""
+    PLY file in ``folder`` from which nerfstudio initializes splats. ExportError: no shots."""
     if not shots:
         raise ExportError("no camera has reported: there is nothing to write")
     folder.mkdir(parents=True, exist_ok=True)

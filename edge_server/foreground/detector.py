@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 NMS_IOU = 0.6
 _TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-# Boxes that reach the suppression: what is below is no object of interest.
+# Boxes that enter non-maximum suppression, by score.
 _MOST = 300
 
 
@@ -35,7 +35,8 @@ class Detection:
 
 
 class Detector:
-    """A YOLO model at ``path`` (``default``: the one shipped). Raises ForegroundError."""
+    """A YOLO detection model. path: its ONNX file, or ``default`` for the shipped one. ForegroundError: the
+    file is missing or unusable."""
 
     def __init__(self, path: str, provider: str = "auto", threads: int = 1) -> None:
         file = model_path(path)
@@ -48,11 +49,12 @@ class Detector:
         meta = self._session.get_modelmeta().custom_metadata_map
         self.height, self.width = _size(image.shape, meta, file)
         self.kinds = _kinds(meta)
-        self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # what cannot run fails here, with the file's name
+        self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # a model that cannot run fails here
 
     def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
-        """Detections in ``image`` (H, W, 3 or 4) from ``confidence`` up, the surest first, overlapping ones
-        of a kind left out. Raises ForegroundError where the model gives what no YOLO head does."""
+        """Detect objects in uint8 ``image`` (H, W, 3 or 4): best score first, after non-maximum suppression
+        per class. confidence: minimum score. ForegroundError: the model fails, or its output is not that of a
+        YOLO head."""
         whole = checked(image, 0)
         try:
             out = self._session.run(None, {self._input: blob([whole], self.height, self.width, self._dtype)})[
@@ -63,7 +65,7 @@ class Detector:
             raise ForegroundError(f"{self.name}: ONNX Runtime cannot run it: {reason}") from None
         rows = decode(np.asarray(out), confidence, self.name)
         h, w = whole.shape[:2]
-        # The letterbox, undone.
+        # From the letterboxed input back to the image.
         scale = min(self.height / h, self.width / w)
         left, top = (
             (side - max(1, round(n * scale))) // 2 for side, n in ((self.width, w), (self.height, h))
@@ -76,15 +78,16 @@ class Detector:
 
 
 def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[tuple[float, ...]]:
-    """Rows (left, top, right, bottom, score, kind), the surest first, of a head's output (1, 4 + kinds,
-    cells) or (1, cells, 4 + kinds): centre, size and a score a kind, in pixels of the model. What is
-    not finite, and boxes without area, are left out."""
+    """Decode a YOLO head's ``output`` (1, 4 + kinds, cells) or (1, cells, 4 + kinds): center, size and a
+    score per class, in pixels of the model's input. Returns rows (left, top, right, bottom, score, kind),
+    best score first, without those that are not finite or have no area. name: of the model, for errors.
+    Raises ForegroundError."""
     if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5:
         raise ForegroundError(
             f"{name}: gives {output.shape}, not the boxes and scores (1, 4 + kinds, cells) of a YOLO v8 or "
             "v11 head; export it with format=onnx and nms=False"
         )
-    # There are more cells than numbers a cell, unless the model is tiny: our smallest gives 8 x 64.
+    # The longer axis holds the cells: our smallest model has 64 of them, with 8 numbers each.
     table = output[0].T if output.shape[1] < output.shape[2] else output[0]
     table = table.astype(np.float64)
     scores, kinds = table[:, 4:].max(axis=1), table[:, 4:].argmax(axis=1)
@@ -104,7 +107,7 @@ def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[t
 
 
 def open_model(file: Path, provider: str, threads: int) -> Any:
-    """A session of the ONNX model in ``file``. Raises ForegroundError."""
+    """Open the ONNX model in ``file``. Raises ForegroundError."""
     try:
         if file.stat().st_size > MAX_FILE_BYTES:
             raise ForegroundError(f"{file}: larger than {MAX_FILE_BYTES >> 20} MB")
@@ -118,7 +121,8 @@ def open_model(file: Path, provider: str, threads: int) -> Any:
 
 
 def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:
-    """(height, width) to feed: the input's own, else what the exporter noted, else the usual."""
+    """(height, width) of the input: fixed by the model, else from the exporter's metadata, else
+    USUAL_SIDE."""
     sides = [side if isinstance(side, int) else 0 for side in shape[2:]]
     if not all(sides):
         try:
@@ -131,7 +135,7 @@ def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]
 
 
 def _kinds(meta: dict[str, str]) -> dict[int, str]:
-    """Names of what the model knows, as the exporter noted them; without a note there are only numbers."""
+    """Class names from the exporter's metadata; empty without them."""
     try:
         return {int(k): str(v) for k, v in ast.literal_eval(meta["names"]).items()}
     except (KeyError, ValueError, TypeError, AttributeError, SyntaxError, MemoryError, RecursionError):

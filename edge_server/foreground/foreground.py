@@ -89,8 +89,8 @@ class Foreground:
 
     def status(self) -> dict[str, Any]:
         """Counts, and milliseconds per image."""
-        pictures = sum(vars(self.counts).values())
-        return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / pictures if pictures else None}
+        images = sum(vars(self.counts).values())
+        return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / images if images else None}
 
 
 class Boxes:

@@ -31,7 +31,7 @@ class Segmenter(Protocol):
 
 
 def make_segmenter(config: ForegroundConfig) -> Segmenter:
-    """Raises ForegroundError."""
+    """Create the segmenter that ``config.segment`` names. ForegroundError: its model is unusable."""
     if config.segment == BOX:
         return WholeBox()
     if config.segment == GRABCUT:
@@ -76,9 +76,10 @@ class GrabCut:
         # GrabCut initializes its mixtures by k-means, which uses OpenCV's global random generator.
         cv2.setRNGSeed(_SEED)
         inside, outside = np.zeros((1, 65)), np.zeros((1, 65))
-        picture, nowhere = np.ascontiguousarray(small), (0, 0, 1, 1)  # the labels replace the rectangle
+        unused = (0, 0, 1, 1)  # the labels replace the rectangle
         mode = cv2.GC_INIT_WITH_MASK
-        cv2.grabCut(picture, labels, nowhere, outside, inside, self._iterations, mode)
+        pixels = np.ascontiguousarray(small)
+        cv2.grabCut(pixels, labels, unused, outside, inside, self._iterations, mode)
         found = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
         if scale < 1.0:
             soft = cv2.resize(found.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)

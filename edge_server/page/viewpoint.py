@@ -143,5 +143,5 @@ def visitor_camera(
 
 
 def row_band(camera: Pinhole, first_row: int, rows: int) -> Pinhole:
-    """The camera of the image rows first_row .. first_row + rows - 1 of ``camera``."""
+    """The camera of ``rows`` image rows of ``camera``, from ``first_row`` on."""
     return Pinhole(camera.width, rows, camera.fx, camera.fy, camera.cx, camera.cy - first_row)

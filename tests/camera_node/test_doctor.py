@@ -13,7 +13,7 @@ from camera_node import doctor
 from camera_node.cli import main
 from freshfield.clock import WallClock
 from freshfield.scenario import load
-from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.robot.arm.simulated import simulated_arm
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
 
@@ -42,9 +42,7 @@ def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     assert parts["network"][0] is None and parts["scenario"][0] is None
 
 
-def test_an_arm_that_is_well(capsys, tmp_path):
-    require_ur_rtde()
-    host = own_address()
+def test_an_arm_that_is_well(capsys, tmp_path, host):
     with simulated_arm(host):
         _, parts = examined(capsys, cell_at(tmp_path, host, frequency_hz=10))
     assert parts["arm"] == (True, parts["arm"][1]) and "running" in parts["arm"][1]
@@ -52,10 +50,9 @@ def test_an_arm_that_is_well(capsys, tmp_path):
     assert parts["arm's path"][0] and "of 51 viewpoints" in parts["arm's path"][1]
 
 
-def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path):
-    require_ur_rtde()
+def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path, host):
     path = {**load("cell").source["arm"]["path"], "radius_m": 0.55}
-    code, parts = examined(capsys, cell_at(tmp_path, own_address(), path=path))
+    code, parts = examined(capsys, cell_at(tmp_path, host, path=path))
     ok, said = parts["arm's path"]
     assert code == 1 and ok is False
     reached = int(re.search(r"reaches (\d+) of 51", said)[1])
@@ -63,9 +60,8 @@ def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path):
     assert 3 <= reached < 0.6 * 51 and sum(map(int, rings.groups())) == reached
 
 
-def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path):
-    require_ur_rtde()
-    _, parts = examined(capsys, cell_at(tmp_path, own_address(), simulated=False))
+def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path, host):
+    _, parts = examined(capsys, cell_at(tmp_path, host, simulated=False))
     assert parts["hand-eye"][0] is False and "still the example's" in parts["hand-eye"][1]
 
 
@@ -77,11 +73,9 @@ def test_a_part_that_fails_in_its_own_way_does_not_end_the_examination():
     assert (finding.ok, finding.said) == (False, "RuntimeError: xioctl failed last error 5")
 
 
-def test_every_fault_is_named_in_one_call(capsys, tmp_path):
-    require_ur_rtde()
-    code, parts = examined(
-        capsys, cell_at(tmp_path, own_address(), cameras={"hand": "none.yaml"}), "--to", "127.0.0.1:9"
-    )
+def test_every_fault_is_named_in_one_call(capsys, tmp_path, host):
+    scenario = cell_at(tmp_path, host, cameras={"hand": "none.yaml"})
+    code, parts = examined(capsys, scenario, "--to", "127.0.0.1:9")
     assert code == 1
     assert parts["network"][0] is False and "does a firewall stand between" in parts["network"][1]
     assert parts["hand-eye"][0] is False and "none.yaml" in parts["hand-eye"][1]

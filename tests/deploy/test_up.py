@@ -143,7 +143,7 @@ def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame
 def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     run = up("--for", "0", "--process-per-camera")
     run.wait_for_updates()
-    assert {run.pid(f"node-cam0{i}") for i in range(4)} >= {run.pid("node-cam03")}
+    assert len({run.pid(f"node-cam0{i}") for i in range(4)}) == 4
     run.process.send_signal(signal.SIGINT)
     assert run.end() == 0, run.output
     assert "stopping (Ctrl-C)" in run.output and "Traceback" not in run.output

@@ -62,15 +62,22 @@ async def run_while(node: Node, work) -> None:
         await asyncio.wait_for(running, 10)
 
 
-def test_frames_arrive_as_captured(tmp_path):
-    async def scene():
-        peer = await Peer().start()
-        node = make_node(tmp_path, peer.address, seconds=2.0)
-        await node.run()
-        await peer.stop()
-        return peer, node
+def run_against(peer: Peer, tmp_path: Path, frames: int | None = None, **options) -> Node:
+    """A node that has run until ``peer`` had so many frames, or for the ``seconds`` of its options."""
 
-    peer, node = asyncio.run(scene())
+    async def scene() -> Node:
+        await peer.start()
+        node = make_node(tmp_path, peer.address, **options)
+        await (node.run() if frames is None else run_while(node, peer.until(frames)))
+        await peer.stop()
+        return node
+
+    return asyncio.run(scene())
+
+
+def test_frames_arrive_as_captured(tmp_path):
+    peer = Peer()
+    node = run_against(peer, tmp_path, seconds=2.0)
     by_camera = {c: [f for f in peer.frames if f.camera == c] for c in ("cam00", "cam01", "cam02")}
     counts = check_books(tmp_path / "out", waiting_at_most=0)
     images = {picture(i).tobytes() for i in range(24)}
@@ -96,13 +103,8 @@ def test_frames_arrive_as_captured(tmp_path):
 
 
 def test_a_slow_peer_gets_the_newest_frame_and_never_two(tmp_path):
-    async def scene():
-        peer = await Peer(respond=answer(after_s=0.4)).start()
-        await make_node(tmp_path, peer.address, seconds=4.0).run()
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+    peer = Peer(respond=answer(after_s=0.4))
+    run_against(peer, tmp_path, seconds=4.0)
     counts = check_books(tmp_path / "out")
     assert peer.most_unanswered == 1
     for camera, c in counts.items():
@@ -126,15 +128,8 @@ def test_a_slow_peer_gets_the_newest_frame_and_never_two(tmp_path):
     ],
 )
 def test_refusals_are_counted_and_said_once(tmp_path, caplog, outcome, reason, expected):
-    async def scene():
-        peer = await Peer(respond=answer(outcome, reason)).start()
-        node = make_node(tmp_path, peer.address, cameras=2)
-        await run_while(node, peer.until(20))
-        await peer.stop()
-        return node
-
     with caplog.at_level(logging.INFO, "camera-node"):
-        node = asyncio.run(scene())
+        node = run_against(Peer(respond=answer(outcome, reason)), tmp_path, frames=20, cameras=2)
     check_books(tmp_path / "out")
     (file,) = ledger.read_all(tmp_path / "out")
     details = {e.detail for e in file.events if e.event == "answered"}
@@ -171,16 +166,9 @@ def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
 
 def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
     ahead_ns = 7_000_000_000
-
-    async def scene():
-        peer = await Peer(clock=WallClock(offset_ns=ahead_ns)).start()
-        drift = {"effects": {"clock_drift": {"offset_ms": -1500.0, "offset_spread_ms": 100.0}}}
-        node = make_node(tmp_path, peer.address, source=drift)
-        await run_while(node, peer.until(60))
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+    peer = Peer(clock=WallClock(offset_ns=ahead_ns))
+    drift = {"effects": {"clock_drift": {"offset_ms": -1500.0, "offset_spread_ms": 100.0}}}
+    run_against(peer, tmp_path, frames=60, source=drift)
     newest = {f.camera: f for f in peer.frames}
     offsets_ms = {c: f.clock_offset_ns / 1e6 for c, f in newest.items()}
     assert offsets_ms["cam00"] == pytest.approx(7000, abs=50)  # the held-out camera's clock is right
@@ -194,25 +182,14 @@ def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
 
 
 def test_without_a_clock_service_the_offset_is_said_to_be_unknown(tmp_path):
-    async def scene():
-        peer = await Peer(with_clock_service=False).start()
-        await run_while(make_node(tmp_path, peer.address), peer.until(10))
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+    peer = Peer(with_clock_service=False)
+    run_against(peer, tmp_path, frames=10)
     assert {f.clock_uncertainty_ns for f in peer.frames} == {MAX_CAPTURE_AGE_NS}
 
 
 def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
-    async def scene():
-        peer = await Peer(clock=WallClock(offset_ns=7_000_000_000), clock_delay_s=0.4).start()
-        node = make_node(tmp_path, peer.address)
-        await run_while(node, peer.until(20))
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+    peer = Peer(clock=WallClock(offset_ns=7_000_000_000), clock_delay_s=0.4)
+    run_against(peer, tmp_path, frames=20)
     assert max(f.clock_uncertainty_ns for f in peer.frames) < 1_000_000_000
     assert min(f.clock_offset_ns for f in peer.frames) > 6_000_000_000
     first = {f.camera: f for f in reversed(peer.frames)}

@@ -247,8 +247,3 @@ def test_what_to_install_is_said(tmp_path):
         ended = run([sys.executable, "-c", code], capture_output=True, text=True)
         assert ended.returncode == 2
         assert ended.stderr.splitlines()[-1].endswith("recordings need MCAP: pip install 'freshfield[mcap]'")
-
-
-def test_nothing_is_loaded_where_nothing_is_recorded():
-    code = "import sys, edge_server.live.server, camera_node.build; print('mcap' in sys.modules)"
-    assert run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

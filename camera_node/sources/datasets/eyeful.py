@@ -30,6 +30,7 @@ from camera_node.sources.datasets.records import (
     PosedImage,
     errors_at,
     find_files,
+    read_array,
     read_json,
 )
 from freshfield.geometry import se3_inverse
@@ -128,8 +129,7 @@ def _entry(entry: dict[str, Any], where: str) -> _Entry:
     if not isinstance(name, str) or len(Path(name).parts) != 2 or ".." in Path(name).parts:
         raise DatasetError(f"{where}: cameraId is {name!r}, expected CAMERA/IMAGE")
     where = f"{where} ({name})"
-    k = _matrix(entry, "K", 3, where)
-    transform = _matrix(entry, "T", 4, where)
+    k, transform = read_array(entry, "K", (3, 3), where).T, read_array(entry, "T", (4, 4), where).T
     try:
         d = [float(v) for v in entry.get("distortion", [])]
         width, height = int(entry["width"]), int(entry["height"])
@@ -150,16 +150,6 @@ def _entry(entry: dict[str, Any], where: str) -> _Entry:
             width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
         )
     return _Entry(name, lens, se3_inverse(transform))
-
-
-def _matrix(entry: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:
-    try:
-        values = np.asarray(entry[key], dtype=np.float64).reshape(size, size)
-    except KeyError:
-        raise DatasetError(f"{where}: {key} is missing") from None
-    except (TypeError, ValueError):
-        raise DatasetError(f"{where}: {key} is no matrix of {size} x {size} numbers") from None
-    return values.T  # column by column
 
 
 def _from_xml(file: Path) -> list[_Entry]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,19 @@ def read_json(file: Path) -> Any:
         raise DatasetError(f"{file}: no such file") from None
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
+
+
+def read_array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    """The finite numbers at ``key`` of a JSON object. where: starts messages. Raises DatasetError."""
+    try:
+        value = np.array(entry[key], dtype=np.float64)
+    except KeyError:
+        raise DatasetError(f"{where}: {key} is missing") from None
+    except (ValueError, TypeError):
+        raise DatasetError(f"{where}.{key}: expected numbers") from None
+    if value.size != math.prod(shape) or not np.all(np.isfinite(value)):
+        raise DatasetError(f"{where}.{key}: expected finite numbers of shape {shape}, got {value.shape}")
+    return value.reshape(shape)
 
 
 def camera_to_world(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:

@@ -9,24 +9,17 @@ recording by several cameras of something that moves.
 from __future__ import annotations
 
 import math
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera_node.config import BACKGROUNDS, TransformsConfig
-from camera_node.sources.datasets.imaging import composite, read_image, resize, shrink
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    Image,
-    PosedImage,
-    find_files,
-    read_json,
-)
-from freshfield.geometry import OPENGL_TO_OPENCV, GeometryError, Pinhole, Pose
+from camera_node.sources.datasets.imaging import read_image
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
+from freshfield.geometry import OPENGL_TO_OPENCV
 
 # First what nerfstudio and NeRF-synthetic start a training from.
 FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
@@ -56,14 +49,14 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
         raise DatasetError(f"{path}: no such file or folder")
     tried = []
     for file in [path] if path.is_file() else find_files(path, FILES):
-        dataset = _load(file, options.scale, options.background)
+        dataset = _load(file, options)
         if dataset.images:
             return dataset
         tried.append(f"{file.name} (all {dataset.missing} images missing)")
     raise DatasetError(f"{path}: no usable transforms JSON: {'; '.join(tried) or 'none found'}")
 
 
-def _load(file: Path, scale: float, background: str) -> Dataset:
+def _load(file: Path, options: ImageOptions) -> Dataset:
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
@@ -77,18 +70,9 @@ def _load(file: Path, scale: float, background: str) -> Dataset:
             missing += 1
             continue
         camera = str(frame.get("camera", frame.get("camera_label", "")))
-        full = _intrinsics({**data, **frame}, image, sizes, camera, where)
-        images.append(
-            PosedImage(
-                name=str(frame["file_path"]),
-                camera=camera,
-                time_s=_number(frame, "time", where) if "time" in frame else None,
-                camera_to_world=_pose(frame, where),
-                intrinsics=shrink(full, scale),
-                read=partial(_read, image, full, shrink(full, scale), background),
-                path=image if scale == 1 else None,
-            )
-        )
+        photo = Photo(image, _lens({**data, **frame}, image, sizes, camera, where), options)
+        time_s = _number(frame, "time", where) if "time" in frame else None
+        images.append(posed_photo(photo, frame["file_path"], _pose(frame, where), where, camera, time_s))
     fps = _number(data, "fps", str(file)) if "fps" in data else None
     return Dataset(tuple(images), missing, fps)
 
@@ -111,16 +95,14 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
             matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
         if matrix.shape != (4, 4):
             raise ValueError(f"its shape is {matrix.shape}")
-        return Pose.from_matrix(matrix @ OPENGL_TO_OPENCV).matrix()
+        return matrix @ OPENGL_TO_OPENCV
     except KeyError:
         raise DatasetError(f"{where}: 'transform_matrix' is missing") from None
-    except (GeometryError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise DatasetError(f"{where}: transform_matrix is no camera-to-world matrix: {error}") from None
 
 
-def _intrinsics(
-    d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], camera: str, where: str
-) -> Pinhole:
+def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], camera: str, where: str) -> Lens:
     if d.get("camera_model") in _FISHEYE:
         raise DatasetError(f"{where}: camera_model {d['camera_model']} is no pinhole; undistort the images")
     for name in ("k3", "k4", "k5", "k6"):
@@ -147,7 +129,7 @@ def _intrinsics(
     k1, k2, p1, p2 = (_number(d, name, where) if name in d else 0.0 for name in ("k1", "k2", "p1", "p2"))
     cx = _number(d, "cx", where) if "cx" in d else width / 2.0
     cy = _number(d, "cy", where) if "cy" in d else height / 2.0
-    return Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
+    return Lens(width, height, fx, fy, cx, cy, (k1, k2), (p1, p2))
 
 
 def _number(d: dict[str, Any], key: str, where: str) -> float:
@@ -155,13 +137,3 @@ def _number(d: dict[str, Any], key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise DatasetError(f"{where}: {key} is {value!r}, expected a number")
     return float(value)
-
-
-def _read(path: Path, full: Pinhole, small: Pinhole, background: str) -> Image:
-    image = read_image(path)
-    if image.shape[:2] != (full.height, full.width):
-        raise DatasetError(
-            f"{path}: image is {image.shape[1]} x {image.shape[0]}, its transforms JSON says "
-            f"{full.width} x {full.height}"
-        )
-    return resize(composite(image, background), small.width, small.height)

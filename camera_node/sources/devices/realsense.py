@@ -102,7 +102,7 @@ class RealsenseFeed(Feed):
         self._stamps = FrameClock(clock)
 
     def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
-        """FrameClock of the host's time and the exposure asked for; intrinsics as the library has them."""
+        """Ask for the host's time and for the exposure; returns the library's intrinsics."""
         rs = library()
         for sensor in profile.get_device().query_sensors():
             if sensor.supports(rs.option.global_time_enabled):

@@ -20,7 +20,7 @@ from edge_server.scheduler.wait import generated_in, wait_window
 
 
 class BanditPolicy(Policy):
-    """``actor`` as a policy. ``last_decision`` is there to learn from or to explain."""
+    """``actor`` as a policy. last_decision: the newest one, to learn from or to explain."""
 
     last_decision: Decision | None = None
 
@@ -33,7 +33,7 @@ class BanditPolicy(Policy):
 
     @staticmethod
     def from_file(path: Path | str, rng: np.random.Generator) -> BanditPolicy:
-        """ValueError, in one line, where ``path`` is no checkpoint of a learner."""
+        """Load a learner's checkpoint. ValueError: ``path`` is not one."""
         return BanditPolicy(Actor.load(path), f"bandit:{path}", rng)
 
     def plan(self, epoch: Epoch) -> SelectionWindow:

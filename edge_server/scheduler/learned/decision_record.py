@@ -1,7 +1,7 @@
-"""Decisions on disk, so that they can be explained after a run: OUT/decisions/000123.npz.
+"""Decisions on disk, to be explained after a run: OUT/decisions/000123.npz.
 
-One file a decision: the state, the action, and the embedded frames as they were delivered. The policy is
-written once, policy-HASH.npz. Only the newest decisions are kept, as many as fit.
+A file holds one decision: state, action, and the embedded frames as delivered. The policy is written once, as
+policy-HASH.npz. Only the newest decisions that fit are kept.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ class RecordedDecision:
 
 
 def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
-    """Decision ``number`` of the run in folder ``run``; None: the newest. ValueError in one line where there
-    is no such decision, or its file is damaged."""
+    """Read decision ``number`` of the run in folder ``run``; None: the newest. ValueError: there is no such
+    decision, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(

@@ -59,9 +59,8 @@ class Explanation:
 
 
 def explain(actor: Actor, state: State, action: Any, pairs: int | None = None) -> Explanation:
-    """Why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs: of
-    permutations;
-    None: as many as take some ten milliseconds."""
+    """Explain why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs: of
+    permutations; None: as many as take some ten milliseconds."""
     if pairs is None:
         pairs = min(PAIRS, max(2, round(PAIRS * (_CAMERAS / max(len(state), 1)) ** 2)))
     features = actor.spec.layout.features(state)

@@ -1,9 +1,9 @@
-"""A bandit problem as a gymnasium environment: bring your own learner.
+"""A bandit problem as a gymnasium environment, for other learners.
 
     environment = BanditEnvironment(problem, Spec("wait", layout, omegas_ms=(0, 60, 120)), cameras=18)
     stable_baselines3.PPO("MlpPolicy", environment).learn(20_000)
 
-An episode is one decision. Observations are the features of ``StateLayout``, one row a camera; actions are
+An episode is one decision. Observations are the features of ``StateLayout``, one row per camera; actions are
 MultiBinary(N) for ``select``, otherwise Discrete(K). Needs the extra ``gym`` (pip install 'freshfield[gym]').
 """
 

@@ -86,6 +86,7 @@ class Spec:
             raise ValueError("entropy and value must be finite and not negative")
 
     def as_json(self) -> dict[str, Any]:
+        """The specification as JSON values, for ``from_json``."""
         return dataclasses.asdict(self)
 
     @staticmethod

@@ -12,8 +12,8 @@ if TYPE_CHECKING:  # only learning needs torch
 
 
 class Round(Protocol):
-    """One instant at which to decide. ``reward`` may be called any number of times: every action starts from
-    the same field, so that actions can be compared."""
+    """One instant at which to decide. ``reward`` may be called repeatedly: every action starts from the same
+    field, so that actions can be compared."""
 
     @property
     def state(self) -> State: ...
@@ -25,6 +25,8 @@ class Round(Protocol):
 
 
 class Problem(Protocol):
+    """A source of rounds."""
+
     def draw(self, seed: int) -> Round:
         """The round of ``seed``: the same seed, the same instant."""
         ...

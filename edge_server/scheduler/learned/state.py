@@ -182,7 +182,6 @@ class StateLayout:
 
 
 def require_int(name: str, value: object, least: int, most: int) -> None:
-    """ValueError unless ``value``, as a file may hold it, is an int from ``least`` to ``most``; 64.0 is
-    not."""
+    """ValueError unless ``value`` is an int from ``least`` to ``most``; 64.0 is not one."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {value!r}")

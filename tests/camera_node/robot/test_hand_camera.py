@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -20,7 +18,7 @@ from camera_node.robot.hand_camera import TruthClient
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, ScenarioError, load
-from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.robot.arm.simulated import own_address, simulated_arm
 
 CELL = load("cell")
 LOOKING = (-95.90, 9.29, -109.38, 0.72, 262.47, 38.48)  # degrees, from a viewpoint of the cell's tour
@@ -43,9 +41,7 @@ def take(camera):
     return camera.capture(int(time.time() * camera.fps))
 
 
-def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
-    require_ur_rtde()
-    host = own_address()
+def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
     scenario = at(host)
     with simulated_arm(host, f"--joints={','.join(map(str, LOOKING))}"):
         fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
@@ -61,9 +57,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
         hand.source._poses._hand._stream.stop()
 
 
-def test_the_truth_of_another_instant_is_not_taken():
-    require_ur_rtde()
-    host = own_address()
+def test_the_truth_of_another_instant_is_not_taken(host):
     with simulated_arm(host):
         truth, clock = TruthClient(host), WallClock()
         assert truth.joints(clock.now_ns()).shape == (6,)
@@ -72,9 +66,8 @@ def test_the_truth_of_another_instant_is_not_taken():
                 truth.joints(clock.now_ns() + offset_ns)
 
 
-def test_without_an_arm_one_line_says_what_to_start():
-    require_ur_rtde()
-    scenario = at(own_address())
+def test_without_an_arm_one_line_says_what_to_start(host):
+    scenario = at(host)
     begin = time.monotonic()
     with pytest.raises(ArmError, match="camera-node simulate-arm"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
@@ -91,17 +84,3 @@ def test_effects_that_take_the_camera_to_stand_still_are_refused():
     scenario = at(own_address(), effects={"motion_blur": None})
     with pytest.raises(ScenarioError, match=r"motion_blur: not for a camera that an arm carries \(hand\)"):
         build_cameras(scenario, source_config(scenario), ["hand"])
-
-
-def test_a_world_without_an_arm_loads_nothing_of_one():
-    code = """
-import sys
-from camera_node.build import build_cameras
-from camera_node.config import source_config
-from freshfield.scenario import load
-build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
-unasked = ("camera_node.pose", "camera_node.robot.hand_camera", "camera_node.sources.devices.live", "rtde",
-           "depthai")
-print([name for name in sys.modules if name.startswith(unasked)])
-"""
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -136,15 +136,16 @@ def test_recorded_states_are_used_only_when_asked(tmp_path: Path) -> None:
     path = write_trace(tmp_path / "t.jsonl", GILBERT, 6, seconds=80)
     blind = tmp_path / "blind.jsonl"
     blind.write_text(path.read_text().replace('"state":1', '"state":0'))
-    assert fit(path).parameters == fit(blind).parameters
+    guessed = fit(path).parameters
+    assert guessed == fit(blind).parameters
     told = fit(path, use_states=True)
     check(told, GILBERT_TRUE)
     assert told.chosen_by == "recorded states" and 2 not in told.bic
     # Knowing the states narrows every interval.
     for name, value in told.parameters.items():
-        guessed = fit(path).parameters[name].interval
-        assert value.interval and guessed
-        assert value.interval[1] / value.interval[0] < guessed[1] / guessed[0]
+        wider = guessed[name].interval
+        assert value.interval and wider
+        assert value.interval[1] / value.interval[0] < wider[1] / wider[0]
 
 
 @pytest.mark.parametrize("section", [

@@ -12,7 +12,7 @@ import pytest
 
 def run_with_bounds_checks(code: str, folder: Path, request: pytest.FixtureRequest) -> None:
     """Fails unless ``code`` ends well and prints "kept". folder: for kernels where pytest keeps no cache."""
-    cache = request.config.cache
+    cache = getattr(request.config, "cache", None)
     kernels = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(folder)
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": kernels}
     out = subprocess.run(

@@ -1,13 +1,14 @@
 """Every representation made small, and the views that tests fit it to.
 
-``NAME/small.py`` beside this file has the class (FIELD), settings for pictures of 48 pixels (SMALL), of 24
-(TINY, for hard cases) and of 64 (POISONED), ``check_bounds`` of the parameters, the arrays
-of a state that are always finite (FINITE), and REACHED_DB: the PSNR that
-a healthy field reaches in these tests. Another CPU rounds differently, which costs tenths of a decibel.
+``NAME/small.py`` beside this file has the class (FIELD), settings for images of 48 pixels (SMALL), of 24
+(TINY, for hard cases) and of 64 (POISONED), and REACHED_DB: the PSNR that a healthy field reaches in these
+tests. Another CPU rounds differently, which costs tenths of a decibel. Where the parameters are not a table
+and a network, it also has FINITE, the arrays of a state that are always finite, and ``check_bounds``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Any
@@ -15,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_server.fields import Rendering, View
+from edge_server.fields import View
+from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.registry import field_names
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
@@ -49,16 +51,21 @@ def tiny(name: str, **changed: Any) -> Any:
     return CLASSES[name](replace(TINY[name], **changed))
 
 
-def check_bounds(field: Any, out: Rendering) -> None:
-    """What must hold of the parameters of a field, and of what it renders, after anything."""
+def healthy(field: Any, views: Sequence[View]) -> None:
+    """Whatever has happened: nothing is out of bounds, neither a parameter nor a rendered image."""
     name = next(name for name, kind in CLASSES.items() if type(field) is kind)
-    state = field.state()
-    for array in _MODULES[name].FINITE:
+    state, module = field.state(), _MODULES[name]
+    for array in getattr(module, "FINITE", ("table", "net", "density", "behind")):
         assert np.isfinite(state[array]).all(), f"{array} is not finite"
-    assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
-    assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
-    assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
-    _MODULES[name].check_bounds(field, out)
+    for view in (views[0], views[-1]):
+        out = field.render(view.camera_to_world, view.intrinsics)
+        assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
+        assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
+        assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
+        if hasattr(module, "check_bounds"):
+            module.check_bounds(field, out)
+        else:
+            assert np.abs(state["table"]).max() <= PARAMETER_LIMIT
 
 
 def score(field: Any, view: View = HELD) -> float:

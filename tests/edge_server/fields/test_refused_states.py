@@ -40,12 +40,14 @@ def _said(change: Callable[[dict[str, Any]], Any]) -> Callable[[State], None]:
     return spoil
 
 
-def _last_array_cut(state: State) -> None:
+def _last_array(state: State) -> str:
     """Of what is learned: what comes before it is right."""
-    name = [n for n in state if n not in ("meta", "behind") and not n.startswith(("image", "pose", "moved"))][
-        -1
-    ]
-    state[name] = state[name][:-1]
+    others = ("meta", "behind", "image", "pose", "moved")
+    return [name for name in state if not name.startswith(others)][-1]
+
+
+def _last_array_cut(state: State) -> None:
+    state[_last_array(state)] = state[_last_array(state)][:-1]
 
 
 def _image_cut(state: State) -> None:
@@ -63,6 +65,7 @@ DAMAGE: dict[str, Callable[[State], Any]] = {
     "a picture that is too small": _image_cut,
     "a pose that is none": _pose_lost,
     "an array that is too short": _last_array_cut,
+    "an array that is missing": lambda state: state.pop(_last_array(state)),
     "no step count": _said(lambda meta: meta.pop("step")),
     "a step count that is none": _said(lambda meta: meta.update(step=None)),
     "no cameras": _said(lambda meta: meta.pop("cameras")),
@@ -99,3 +102,22 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
     assert all(np.array_equal(one[key], two[key]) for key in one)
     field.load_state(good)
     assert all(np.array_equal(field.state()[key], good[key]) for key in good)
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "text"),
+    [
+        ("ngp", {"hidden": 32}, "hidden = 16"),
+        ("nerfacto", {"appearance": 2}, "appearance = 0"),
+        ("tensorf", {"density_rank": 16}, "density_rank = 8"),
+        ("splat", {"harmonics": 4}, "harmonics = 1"),
+        ("splat", {"gaussians": 100, "start": 100}, "holds 100 at most"),
+        ("voxel", {"sizes": (16, 32, 64)}, r"sizes = \[16, 32, 48\]"),
+    ],
+)
+def test_a_state_of_another_shape_is_refused(name: str, other: dict[str, Any], text: str) -> None:
+    field = small(name)
+    if name == "splat":  # which has no Gaussians before
+        field.fit(VIEWS, Budget(steps=1))
+    with pytest.raises(ValueError, match=text):
+        small(name, **other).load_state(field.state())

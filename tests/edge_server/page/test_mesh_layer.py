@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,13 +57,3 @@ def test_a_field_that_has_seen_nothing_has_no_mesh(server):
     press(layer, client)
     assert client.notifications == [("No mesh", "the field has not been trained yet")]
     assert layer.button.label == "show mesh" and layer._node is None
-
-
-def test_nothing_for_it_is_loaded_before_the_first_press():
-    code = (
-        "import sys, edge_server.page, edge_server.live.server\n"
-        "loaded = [m for m in sys.modules if m.startswith(('edge_server.surface', 'skimage'))"
-        " or m == 'edge_server.fields.splat.planar']\n"
-        "assert not loaded, loaded"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -1,6 +1,10 @@
-"""The small detector whose backbone makes the default embeddings, trained by us on our own scenes.
+"""Trains the small detector whose backbone gives the default embeddings, on our own scenes.
 
-``scenes`` varies the shipped worlds and knows exact boxes, ``dataset`` renders and keeps them, ``network``
-and ``loss`` are of the YOLOv8 family, ``training`` runs, ``export`` writes ONNX in float32 and 8 bits,
-``average_precision`` measures quality. ``perceptual`` fits a perceptual distance on the same backbone.
+scenes.py             variations of the shipped worlds, with exact boxes
+dataset.py            renders them and keeps the images
+network.py, loss.py   of the YOLOv8 family
+training.py           training, resumable
+export.py             ONNX in float32 and 8 bits
+average_precision.py  the detector's quality
+perceptual.py         fits a perceptual distance on the same backbone
 """

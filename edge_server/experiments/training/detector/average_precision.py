@@ -44,8 +44,8 @@ def measure(run: Run, dataset: LabeledImages) -> dict[str, Any]:
 
 
 def detections(output: NDArray[np.float32]) -> Array:
-    """One image's output0 (4 + kinds, cells) -> (n, 6): left, top, right, bottom, score, kind, best first,
-    without overlapping ones of one kind."""
+    """Decode one image's output0 (4 + kinds, cells). Returns (n, 6): left, top, right, bottom, score, kind;
+    best score first, after non-maximum suppression per kind."""
     centre, size, scores = output[:2].T, output[2:4].T, output[4:].T
     cells, kinds = np.nonzero(scores > MIN_SCORE)
     if not len(cells):
@@ -63,7 +63,7 @@ def average_precision(found: Sequence[Array], true: Sequence[Array], ious: Array
     """Average precision (len(ious),) of one kind, interpolated at 101 recalls; NaN without a true box.
 
     found: (n, 5) of each image, boxes with scores. true: (m, 4) of each image, boxes. Of two detections of
-    one thing the better counts and the other is false.
+    one object, the one with the lower score is false.
     """
     total = sum(map(len, true))
     if not total:
@@ -86,7 +86,8 @@ def average_precision(found: Sequence[Array], true: Sequence[Array], ious: Array
 
 
 def _matches(found: Array, true: Array, ious: Array) -> NDArray[np.bool_]:
-    """(n, len(ious)): whether each detection, best first, is the first to meet a true box so well."""
+    """(n, len(ious)) true positives: detections that are the best-scored with at least this IoU with a true
+    box."""
     hits = np.zeros((len(found), len(ious)), dtype=np.bool_)
     if not len(found) or not len(true):
         return hits

@@ -1,4 +1,4 @@
-"""``edge-server train-detector``: renders, trains, exports, measures; every step goes on where it stopped."""
+"""``edge-server train-detector``: renders, trains, exports and measures; every step is resumable."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HELD_OUT_WORLDS = 40
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit status."""
+    """Run the command; returns its exit status."""
     args = _parser().parse_args(argv)
     try:
         import onnx  # noqa: F401
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """All steps; returns what detector.json holds."""
+    """Run all steps; returns the contents of detector.json."""
     from edge_server.experiments.training.detector import export
     from edge_server.experiments.training.detector.average_precision import measure
     from edge_server.experiments.training.detector.dataset import of_own_rigs, render
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
-    """How near embeddings of both files are: cosine of pooled features about the float mean."""
+    """Cosines between both files' pooled features, after subtracting the float mean."""
     import numpy as np
 
     from edge_server.experiments.training.detector.export import pooled_features

@@ -1,4 +1,4 @@
-"""Renders the images of the detector once, in files that are kept, so that an interrupted run continues."""
+"""Renders the detector's images once and keeps them in files, so that an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edge_server.experiments.training.detector.scenes import Boxes, own_rig, sce
 
 SHARD_SHOTS = 20
 INSTANTS = 8
-# Of the shipped scenes, whose cameras are never trained on: every third camera at four instants.
+# Test cameras and instants of the shipped scenes, which are never trained on.
 RIG_CAMERAS = tuple(f"cam{k:02d}" for k in range(0, 19, 3))
 RIG_INSTANTS_S = (0.0, 0.7, 1.6, 2.5)
 
@@ -43,8 +43,8 @@ def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np
 
 
 def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers: int) -> LabeledImages:
-    """``INSTANTS`` images of each of ``shots`` variations, read from ``folder`` where they are rendered
-    already."""
+    """``INSTANTS`` images of each of ``shots`` variations; those already in ``folder`` are read from
+    there."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
     for first in range(0, shots, SHARD_SHOTS):
@@ -92,7 +92,7 @@ def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("wb") as file:
         np.savez(file, images=whole.images, counts=counts, boxes=np.concatenate(whole.boxes))
-    part.replace(path)  # whole or not there: Ctrl-C leaves no half shard
+    part.replace(path)  # atomic: Ctrl-C leaves no partial shard
 
 
 def _seed(seed: int, number: int) -> int:

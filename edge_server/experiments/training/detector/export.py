@@ -45,7 +45,7 @@ def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any]) -
     """Write the detector with any number of images of any size whose sides are multiples of 16."""
     model = model.eval()
     with warnings.catch_warnings():
-        # The successor of this exporter needs a package more and gives the same dozen operators.
+        # The newer exporter needs another package and gives the same operators.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             model,
@@ -64,13 +64,13 @@ def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any]) -
 
 
 def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
-    """Quantise statically, weights per channel, with ranges calibrated on ``images`` (n, H, W, 3).
+    """Quantize to static 8 bits, weights per channel, with ranges calibrated on ``images`` (n, H, W, 3).
 
-    Up to the boxes' arithmetic: pixel coordinates have no room in 8 bits.
+    The arithmetic of the boxes stays in float: pixel coordinates do not fit in 8 bits.
     """
     model = onnx.load(str(fp32))
     heads = ("/model.10/", "/model.11/")
-    # The last convolutions of the heads and all that follows: logits and distances need their full range.
+    # From the last convolutions of the heads on: logits and distances need their full range.
     inner = [n.name for n in model.graph.node if not n.name.startswith("/model.")]
     last = [n.name for n in model.graph.node if n.name.startswith(heads) and ".1/" in n.name]
     with _quiet(), tempfile.TemporaryDirectory(prefix="freshfield-int8-") as folder:
@@ -99,7 +99,7 @@ def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the quantiser, which logs every node to the root logger."""
+    """Silence the quantizer, which logs every node to the root logger."""
     root = logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)
@@ -110,8 +110,8 @@ def _quiet() -> Iterator[None]:
 
 
 def add_projection(path: Path, features: NDArray[np.float32]) -> dict[str, float]:
-    """Store the learnt projection of pooled ``features`` (n, C) in the model's metadata: principal axes, each
-    scaled to unit variance. Returns the share of variance that the first 8, 16, 32 and 64 axes hold."""
+    """Store a projection in the model's metadata: the principal axes of pooled ``features`` (n, C), each
+    scaled to unit variance. Returns the share of variance that the first 8, 16, 32 and 64 axes explain."""
     mean = features.mean(axis=0)
     _, spread, axes = np.linalg.svd((features - mean).astype(np.float64), full_matrices=False)
     # The sign of an axis is arbitrary: its largest entry is positive.
@@ -133,8 +133,7 @@ def runner(path: Path) -> Run:
 
 
 def pooled_features(path: Path, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Features (n, C) of ``images`` that embeddings are projected from, computed as embeddings compute
-    them."""
+    """Features (n, C) of ``images`` (n, H, W, 3), from which embeddings are projected."""
     side = images.shape[1]
     backbone = load_backbone(path, size=side)
     session = _session(backbone.model)
@@ -152,7 +151,7 @@ def _session(model: str | bytes) -> ort.InferenceSession:
 
 
 def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any]) -> None:
-    """The metadata that the family's exporter writes, so that any of its tools can read the file."""
+    """Set the metadata that the family's exporter writes, so that its tools can read the file."""
     names = "{" + ", ".join(f"{k}: '{kind}'" for k, kind in enumerate(KINDS)) + "}"
     values = {"task": "detect", "stride": "16", "imgsz": f"[{side}, {side}]", "names": names, **about}
     _set_metadata(model, {key: str(value) for key, value in values.items()})

@@ -1,7 +1,7 @@
 """Loss of the detector: task-aligned assignment (TOOD, Feng et al. 2021) as YOLOv8 uses it.
 
-Each true box is assigned the cells inside it whose prediction has the highest score^a * overlap^b. They learn
-the box (generalised IoU) and, as score, their alignment.
+Each true box is assigned the cells inside it whose prediction has the highest score^a * overlap^b. These
+cells learn the box (generalized IoU) and, as their score, the alignment.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _REPORT_EVERY = 20  # batches
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit status."""
+    """Run the command; returns its exit status."""
     args = _parser().parse_args(argv)
 
     def work() -> None:
@@ -68,7 +68,7 @@ class FitFailed(ValueError):
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Render, distort, fit, measure, write; returns what perceptual.json holds."""
+    """Render, distort, fit, measure and write; returns the contents of perceptual.json."""
     from edge_server.experiments.common.progress import Progress
     from edge_server.experiments.training.detector.dataset import (
         LabeledImages,
@@ -188,8 +188,8 @@ class Compared:
 
 
 def left_out(known: Sequence[Compared]) -> dict[str, Any]:
-    """``correlation`` on all pairs of each scene, with weights and power fitted to the other scenes of the
-    first set: what to expect of a new scene. (The backbone was trained on variations of all of them.)"""
+    """``correlation`` for each scene, with weights and power fitted to the others: what to expect of a new
+    scene. (The backbone was trained on variations of all of them.)"""
     found = {}
     for scene in sorted(set(known[0].scenes)):
         x, y = known[0].of(scene, others=True)

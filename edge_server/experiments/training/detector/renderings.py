@@ -18,8 +18,8 @@ INSTANT_S = 0.4
 
 
 def field_renderings(side: int, seed: int) -> tuple[NDArray[np.uint8], list[str]]:
-    """(pairs (n, 2, side, side, 3) of rendering and truth, scene and steps of each): every third camera of
-    the shipped scenes is left out of the fit and rendered after each of ``STEPS``."""
+    """Pairs of rendering and truth, uint8 (n, 2, side, side, 3), and the scene and steps of each. Every third
+    camera of the shipped scenes is left out of the fit and rendered after each of ``STEPS``."""
     pairs, names = [], []
     progress = Progress(len(SCENES) * sum(STEPS))
     for scene in SCENES:

@@ -1,9 +1,8 @@
 """Training scenes of the detector: variations of the shipped worlds, with exact bounding boxes.
 
-A seed makes one variation: a shipped scene without some of its furniture, with people, carts, balls and drums
-on random paths, seen by one camera. The kind of a thing follows from its shape, whether it moves or not: a
-figure is a person, a sphere a ball, a cylinder of drum-like proportions a drum. Its box encloses the pixels
-whose ray meets it first: the visible part.
+A seed gives one variation: a shipped scene without some of its furniture, with people, carts, balls and drums
+on random paths, seen by one camera. The kind of an object follows from its shape: a figure is a person, a
+sphere a ball, a cylinder of drum-like proportions a drum. A box encloses the visible pixels.
 """
 
 from __future__ import annotations
@@ -171,7 +170,7 @@ def _small_things(rng: np.random.Generator) -> list[tuple[str, MovingBody]]:
 def _thing(
     rng: np.random.Generator, place_m: tuple[float, float, float], size_m: float, path_m: float
 ) -> tuple[str, MovingBody]:
-    """A ball or a drum in random colours that circles ``place_m`` and turns."""
+    """A ball or a drum in random colors that circles ``place_m`` and turns."""
     kind = str(rng.choice(["ball", "drum"]))
     tall = rng.uniform(0.7, 1.8)
     shape: Shape = Sphere(size_m) if kind == "ball" else Cylinder(size_m * 0.8, size_m * 0.8 * tall)
@@ -191,15 +190,15 @@ def _thing(
 
 
 def _texture(rng: np.random.Generator) -> tx.Texture:
-    def colour() -> tx.Color:
+    def color() -> tx.Color:
         r, g, b = rng.uniform(0.08, 0.98, 3)
         return float(r), float(g), float(b)
 
     period = float(rng.choice([1 / 3, 1 / 4, 1 / 6]))
     made: list[tx.Texture] = [
-        tx.Plain(colour()),
-        tx.Stripes(colour(), colour(), period, soft=0.04),
-        tx.Checker(colour(), colour(), 1 / 8, 0.5, 0.05),
+        tx.Plain(color()),
+        tx.Stripes(color(), color(), period, soft=0.04),
+        tx.Checker(color(), color(), 1 / 8, 0.5, 0.05),
     ]
     return made[int(rng.integers(len(made)))]
 

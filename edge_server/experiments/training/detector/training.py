@@ -1,4 +1,4 @@
-"""Trains the detector. Every epoch writes a checkpoint, from which a stopped run continues."""
+"""Trains the detector. Every epoch writes a checkpoint, from which a stopped run resumes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from edge_server.experiments.training.detector.scenes import KINDS, MIN_SIDE_PX,
 
 BATCH = 32
 WARMUP_STEPS = 100
-# Weights averaged over about this many steps are what is exported.
+# The exported weights are an average over about this many steps.
 AVERAGED_STEPS = 300
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that does not belong to this run; the message says which setting differs."""
+    """The checkpoint does not belong to this run; the message says which setting differs."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class Settings:
 def train(
     dataset: LabeledImages, settings: Settings, checkpoint: Path
 ) -> tuple[Detector, list[dict[str, Any]]]:
-    """Train and return (the averaged detector in eval mode, a row an epoch). Continues from
-    ``checkpoint``."""
+    """Train, or resume from ``checkpoint``. Returns the averaged detector in eval mode, and a row of losses
+    per epoch. CheckpointError: made with other settings. FloatingPointError: the loss diverged."""
     torch.set_num_threads(settings.threads)
     torch.use_deterministic_algorithms(True)
     torch.manual_seed(settings.seed)
-    # Channels last: a quarter less processor time a step.
+    # Channels last: a quarter less time per step.
     model = Detector(len(KINDS))
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
     averaged = Detector(len(KINDS)).eval()

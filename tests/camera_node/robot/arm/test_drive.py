@@ -22,8 +22,6 @@ from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import (
-    own_address,
-    require_ur_rtde,
     simulated_arm,
     start_cli,
     wait_until_moving,
@@ -35,10 +33,8 @@ PATH = {"azimuths_deg": [-150, -120], "elevations_deg": [60], "rolls_deg": [0], 
 
 
 @pytest.fixture
-def cell(tmp_path):
+def cell(tmp_path, host):
     """A cell with a short and fast path: its file, its address."""
-    require_ur_rtde()
-    host = own_address()
     return write_cell(tmp_path, host, PATH), host
 
 
@@ -153,10 +149,8 @@ def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
         assert at_rest(truth)
 
 
-def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
-    require_ur_rtde()
+def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch, host):
     monkeypatch.setattr(driving, "_STALLED_S", 0.3)
-    host = own_address()
     with simulated_arm(host):
         stream = ArmStream(host, WallClock(), 50.0, max_gap_ms=5000.0, stale_s=5.0)
         stream.start()

@@ -13,8 +13,6 @@ from camera_node.robot.arm import pose_error as measuring
 from camera_node.robot.arm.pose_error import PoseError, by_gap_and_speed, by_rate, format_gaps, measure
 from camera_node.robot.hand_camera import TruthClient
 from tests.camera_node.robot.arm.simulated import (
-    own_address,
-    require_ur_rtde,
     simulated_arm,
     start_cli,
     wait_until_moving,
@@ -56,9 +54,7 @@ def test_a_cell_of_a_few_instants_is_not_shown():
 
 
 @pytest.mark.slow
-def test_a_standing_arm_has_no_error_whatever_the_pairing(tmp_path, capsys):
-    require_ur_rtde()
-    host = own_address()
+def test_a_standing_arm_has_no_error_whatever_the_pairing(tmp_path, capsys, host):
     with simulated_arm(host):
         assert measuring.main([str(write_cell(tmp_path, host)), "--seconds", "0.6", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -69,9 +65,7 @@ def test_a_standing_arm_has_no_error_whatever_the_pairing(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_moving_arms_nearest_pose_is_off_by_gap_times_speed(tmp_path):
-    require_ur_rtde()
-    host = own_address()
+def test_a_moving_arms_nearest_pose_is_off_by_gap_times_speed(tmp_path, host):
     file = write_cell(tmp_path, host, {"speed_rad_s": 1.5, "acceleration_rad_s2": 4.0})
     with simulated_arm(host):
         driver = start_cli("drive-arm", file)

@@ -230,7 +230,7 @@ def test_eyeful_damage_is_named(tmp_path):
     whole = file.read_text()
     for change, message in (
         (lambda e: e.pop("T"), r"KRT\[1\] \(10/10_DSC0001\): T is missing"),
-        (lambda e: e.update(K=[1, 2]), "K is no matrix of 3 x 3"),
+        (lambda e: e.update(K=[1, 2]), r"K: expected finite numbers of shape \(3, 3\)"),
         (lambda e: e.update(distortion=[0.1]), "RadialAndTangential' with 1 coefficients"),
         (lambda e: e.update(cameraId="../../x"), r"cameraId is '\.\./\.\./x'"),
         (lambda e: e.update(width=100), "another shape"),

@@ -1,9 +1,5 @@
 """The proposal-sampled field in the sizes of the tests that ask all representations the same."""
 
-import numpy as np
-
-from edge_server.fields import Rendering
-from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 
@@ -21,13 +17,7 @@ POISONED = NerfactoSettings(
     levels=6, levels_every=10, log2_table=12, finest_resolution=64, bins=48, proposal_cells=32, hidden=16,
     rays=512, batch_samples=4096, samples=16, samples_start=16, samples_ramp=100, cells=32, threads=2,
 )  # fmt: skip
-FINITE = ("table", "net", "density", "behind")
 REACHED_DB = {
     "held out": 23.0, "moved": 21.15, "one view": 26.81, "after noise": 20.17, "moving cameras": 27.14,
     "after no weights": 22.32,
 }  # fmt: skip
-
-
-def check_bounds(field: NerfactoField, out: Rendering) -> None:
-    """Of parameters, after anything that may have happened to them."""
-    assert np.abs(field.state()["table"]).max() <= PARAMETER_LIMIT

@@ -5,24 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.nerfacto.settings import EFFORTS, NerfactoSettings, help_text, make_settings
-from edge_server.fields.registry import make_field
 from tests.edge_server.fields.common.test_camera_refinement import _displaced
 from tests.edge_server.fields.nerfacto.small import SMALL
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN, score
-
-
-@pytest.fixture(scope="module")
-def trained() -> NerfactoField:
-    field = NerfactoField(SMALL)
-    field.fit(SEEN, Budget(steps=250))
-    return field
 
 
 def test_the_proposal_learns_where_surfaces_are() -> None:
@@ -43,35 +33,6 @@ def test_the_proposal_learns_where_surfaces_are() -> None:
 def _pixels(view: View) -> np.ndarray:
     v, u = np.mgrid[0 : view.intrinsics.height, 0 : view.intrinsics.width]
     return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
-
-
-def test_a_state_of_another_shape_is_refused() -> None:
-    state = NerfactoField(SMALL).state()
-    with pytest.raises(ValueError, match="appearance = 0"):
-        NerfactoField(replace(SMALL, appearance=2)).load_state(state)
-    with pytest.raises(ValueError, match="not a state"):
-        NerfactoField(SMALL).load_state({"table": state["table"]})
-
-
-def test_it_is_registered_and_its_options_are_checked() -> None:
-    field = make_field("nerfacto", {"bins": 40, "appearance": 4}, seed=5)
-    assert isinstance(field, NerfactoField) and field.settings.bins == 40 and field.settings.seed == 5
-    with pytest.raises(ValueError, match=r"no option density_rank; it has: effort, .*bins.*nice"):
-        make_field("nerfacto", {"density_rank": 8})
-    for wrong, text in (
-        ({"bins": 4}, "bins must be in 8..1024, not 4"),
-        ({"proposal_cells": 30}, "proposal_cells must be a multiple of 4"),
-        ({"even": 1.5}, "even must be in 0.0..1.0"),
-        ({"appearance": 99}, "appearance must be in 0..16"),
-        ({"appearance": 4, "exposure": True}, "choose one"),
-        ({"device": "cuda"}, "CPUs only"),
-        ({"effort": "heroic"}, "low, medium, high"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            make_field("nerfacto", wrong)
-    assert all(len(text) > 10 for text in help_text().values())
-    low, medium, high = (make_settings({"effort": e}) for e in EFFORTS)
-    assert low.samples < medium.samples < high.samples and medium == NerfactoSettings()
 
 
 def test_appearances_take_up_what_differs_between_cameras() -> None:

@@ -1,9 +1,5 @@
 """The hash-grid field in the sizes of the tests that ask all representations the same (``fields.small``)."""
 
-import numpy as np
-
-from edge_server.fields import Rendering
-from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
 
@@ -20,13 +16,7 @@ POISONED = NgpSettings(
     levels=6, levels_every=10, log2_table=12, finest_resolution=64, hidden=16, rays=512, batch_samples=4096,
     samples=64, samples_ramp=100, cells=32, threads=2,
 )  # fmt: skip
-FINITE = ("table", "net", "density", "behind")
 REACHED_DB = {
     "held out": 23.25, "moved": 21.77, "one view": 32.25, "after noise": 18.21, "moving cameras": 26.95,
     "after no weights": 20.97,
 }  # fmt: skip
-
-
-def check_bounds(field: NgpField, out: Rendering) -> None:
-    """Of parameters, after anything that may have happened to them."""
-    assert np.abs(field.state()["table"]).max() <= PARAMETER_LIMIT

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.ngp.field import NgpField
@@ -27,17 +26,6 @@ def test_a_smoothed_field_repeats_itself_and_is_smoother() -> None:
 
     assert rough(fields[0]) < 0.7 * rough(fields[2])
     assert score(fields[0]) > 16.0
-
-
-def test_a_state_of_another_shape_is_refused() -> None:
-    state = NgpField(SMALL).state()
-    with pytest.raises(ValueError, match="hidden = 16"):
-        NgpField(replace(SMALL, hidden=32)).load_state(state)
-    with pytest.raises(ValueError, match="not a state"):
-        NgpField(SMALL).load_state({"table": state["table"]})
-    del state["net_v"]
-    with pytest.raises(ValueError, match="net_v"):
-        NgpField(SMALL).load_state(state)
 
 
 def test_fewer_samples_render_a_rougher_picture() -> None:

@@ -97,21 +97,6 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
     assert (where_marked == expected).mean() > 0.99
 
 
-def test_a_state_of_another_shape_is_refused() -> None:
-    field = SplatField(SMALL)
-    field.fit(SEEN, Budget(steps=1))
-    state = field.state()
-    with pytest.raises(ValueError, match="harmonics = 1"):
-        SplatField(replace(SMALL, harmonics=4)).load_state(state)
-    with pytest.raises(ValueError, match="not a state"):
-        SplatField(SMALL).load_state({"params": state["params"]})
-    with pytest.raises(ValueError, match="holds 100 at most"):
-        SplatField(replace(SMALL, gaussians=100, start=100)).load_state(state)
-    del state["v"]
-    with pytest.raises(ValueError, match="'v'"):
-        SplatField(SMALL).load_state(state)
-
-
 @pytest.mark.alone
 def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
     """New views at every update: they are ingested, tested, tracked and seeded within the budget."""

@@ -1,9 +1,5 @@
 """The vector-matrix field in the sizes of the tests that ask all representations the same."""
 
-import numpy as np
-
-from edge_server.fields import Rendering
-from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.tensorf.field import TensorfField
 from edge_server.fields.tensorf.settings import TensorfSettings
 
@@ -20,13 +16,7 @@ POISONED = TensorfSettings(
     color_rank=8, resolution_start=16, resolution=48, upsample=(40, 100), hidden=16, rays=512,
     batch_samples=4096, samples=64, samples_ramp=100, cells=32, threads=2,
 )  # fmt: skip
-FINITE = ("table", "net", "density", "behind")
 REACHED_DB = {
     "held out": 24.76, "moved": 24.16, "one view": 20.18, "after noise": 19.19, "moving cameras": 27.27,
     "after no weights": 18.68,
 }  # fmt: skip
-
-
-def check_bounds(field: TensorfField, out: Rendering) -> None:
-    """Of parameters, after anything that may have happened to them."""
-    assert np.abs(field.state()["table"]).max() <= PARAMETER_LIMIT

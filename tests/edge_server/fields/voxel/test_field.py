@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.registry import make_field
 from edge_server.fields.voxel.field import VoxelField
-from edge_server.fields.voxel.settings import EFFORTS, help_text, make_settings
 from tests.edge_server.fields.scenes import mean_psnr, psnr
 from tests.edge_server.fields.small import HELD, SEEN, same_state
 from tests.edge_server.fields.voxel.small import SMALL
@@ -62,14 +60,6 @@ def test_upsampling_hardly_changes_the_picture() -> None:
     assert psnr(before, after) > 26.0
 
 
-def test_a_state_of_another_shape_is_refused() -> None:
-    state = VoxelField(SMALL).state()
-    with pytest.raises(ValueError, match=r"sizes = \[16, 32, 48\]"):
-        VoxelField(replace(SMALL, sizes=(16, 32, 64))).load_state(state)
-    with pytest.raises(ValueError, match="not a state"):
-        VoxelField(SMALL).load_state({"table": state["table"]})
-
-
 def test_the_grid_is_as_fine_as_pixels_where_no_size_is_set() -> None:
     field = VoxelField(replace(SMALL, sizes=None, refine_at=(3, 6)))
     field.fit(SEEN, Budget(steps=8))
@@ -94,24 +84,3 @@ def test_a_plain_background_is_known_to_be_empty_in_spite_of_noise() -> None:
     without = VoxelField(replace(SMALL, outline=0.0))
     without.fit(noisy, Budget(steps=2))
     assert without._outline_views is not None and without._outline_views[1].pixels.shape[1] == 3
-
-
-def test_it_is_registered_and_its_options_are_checked() -> None:
-    field = make_field("voxel", {"sizes": [16, 24], "refine_at": [10]}, seed=5)
-    assert isinstance(field, VoxelField) and field.settings.sizes == (16, 24) and field.settings.seed == 5
-    for wrong, text in (
-        ({"levels": 3}, r"no option levels; it has: effort, sizes, .*nice"),
-        ({"hidden": 16}, "no option hidden; it has"),
-        ({"sizes": [32, 16]}, "sizes must be rising"),
-        ({"sizes": [32, 48], "refine_at": [9, 12]}, "refine_at must be 1 rising"),
-        ({"refine_at": [9, 9]}, "refine_at must be rising"),
-        ({"parts": 0}, "parts must be in 1..64, not 0"),
-        ({"device": "cuda"}, "CPUs only"),
-        ({"effort": "heroic"}, "low, medium, high"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            make_field("voxel", wrong)
-    assert all(len(text) > 10 for text in help_text().values())
-    assert make_settings({"effort": "low"}).sizes == EFFORTS["low"]["sizes"]
-    for effort in EFFORTS:
-        make_settings({"effort": effort})

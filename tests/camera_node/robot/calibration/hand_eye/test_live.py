@@ -40,7 +40,7 @@ from camera_node.sources.base import Shot
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import load
-from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.robot.arm.simulated import simulated_arm
 from tests.camera_node.robot.calibration.pictures import BOARD, LENS, camera_in_target, render, taken
 
 X = simulate.CAMERA_IN_HAND
@@ -222,10 +222,8 @@ def looking():
 
 
 @pytest.mark.slow
-def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys):
+def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys, host):
     """The real client library moves a simulated arm, from one look at the board to the answer."""
-    require_ur_rtde()
-    host = own_address()
     path = {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0, "floor_m": 0.02}
     file = bench(tmp_path, host, path=path)
     monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
@@ -241,9 +239,7 @@ def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys
     assert np.linalg.norm(np.ptp(hands[:, :3, 3], axis=0)) > 0.1  # nobody else has moved it
 
 
-def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends_the_session(tmp_path):
-    require_ur_rtde()
-    host = own_address()
+def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends_the_session(tmp_path, host):
     plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 3.0, "floor_m": 0.02})))
     begin, joints = looking()
     with simulated_arm(host, joints) as process:
@@ -263,9 +259,7 @@ def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends
             mover.close()
 
 
-def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
-    require_ur_rtde()
-    host = own_address()
+def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path, host):
     plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 0.2, "floor_m": 0.02})))
     begin, joints = looking()
     goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
@@ -294,9 +288,7 @@ def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
             mover.close()
 
 
-def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, capsys):
-    require_ur_rtde()
-    host = own_address()
+def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, capsys, host):
     file = bench(tmp_path, host, simulated=False)
     monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
     begin, joints = looking()
@@ -315,10 +307,8 @@ def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, c
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkeypatch, capsys):
+def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkeypatch, capsys, host):
     """A simulated controller with the real client library, and a camera whose stamps are 60 ms late."""
-    require_ur_rtde()
-    host = own_address()
     file = bench(tmp_path, host)
     monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 60_000_000)})
     begin, joints = looking()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
+from edge_server.experiments.training.scheduler.episode import Choice
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     baseline_policies,
@@ -59,16 +61,27 @@ def quiet(line: str) -> None:
     del line
 
 
-def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
-    with WorkerPool(NOTHING) as one, WorkerPool(NOTHING, jobs=2) as two:
-        alone = train(setting(), CONFIG, one, tmp_path / "one", quiet)
+@pytest.fixture
+def pool() -> Iterator[WorkerPool]:
+    with WorkerPool(NOTHING) as pool:
+        yield pool
+
+
+def asked_of(pool: WorkerPool, numbers: Iterable[int] = (7,)) -> list[tuple[int, int, Choice]]:
+    """Every decision of these episodes with the choice of policy ``all``, to be evaluated."""
+    moments = [m for episode in pool.draw(setting(), list(numbers)) for m in episode]
+    return [(m.seed, m.number, c) for m in moments for c in choices(named("all"), [m])]
+
+
+def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path, pool: WorkerPool):
+    alone = train(setting(), CONFIG, pool, tmp_path / "one", quiet)
+    with WorkerPool(NOTHING, jobs=2) as two:
         both = train(setting(), CONFIG, two, tmp_path / "two", quiet)
     assert same(alone, both) and not same(alone, Learner(CONFIG.spec, CONFIG.seed))
     timeless = [[{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
                 for name in ("one", "two")]  # fmt: skip
     assert timeless[0] == timeless[1]
-    with WorkerPool(NOTHING) as pool:
-        other = train(setting(), dataclasses.replace(CONFIG, seed=1), pool, tmp_path / "other", quiet)
+    other = train(setting(), dataclasses.replace(CONFIG, seed=1), pool, tmp_path / "other", quiet)
     assert not same(alone, other)
 
 
@@ -107,14 +120,13 @@ def test_a_training_with_damaged_files_is_refused_in_one_line(damage: str, what:
         train(setting(), CONFIG, pool, tmp_path, quiet)
 
 
-def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
+def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path, pool: WorkerPool):
     omegas = (30.0, 100.0, 400.0)
     spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)
     config = TrainingConfig(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
-    with WorkerPool(NOTHING) as pool:
-        learner = train(setting(steps=1), config, pool, tmp_path, quiet)
-        candidates = {**baseline_policies(omegas, ["threshold"]), "learnt": learner.actor}
-        evaluation = evaluate_policies(setting(steps=1), pool, seeds(0, "test", 6), candidates, config.reward)
+    learner = train(setting(steps=1), config, pool, tmp_path, quiet)
+    candidates = {**baseline_policies(omegas, ["threshold"]), "learnt": learner.actor}
+    evaluation = evaluate_policies(setting(steps=1), pool, seeds(0, "test", 6), candidates, config.reward)
     assert evaluation.term("learnt", "aaoi_ms").mean < evaluation.term("threshold:100", "aaoi_ms").mean
     assert paired(evaluation.rewards("learnt"), evaluation.rewards("random")).low > 0.0
     found = read_log(tmp_path)
@@ -124,8 +136,7 @@ def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
 def test_evaluations_are_kept_in_a_file_and_a_torn_line_costs_only_itself(tmp_path: Path):
     known = tmp_path / "known.jsonl"
     with WorkerPool(NOTHING, known=known) as pool:
-        moments = pool.draw(setting(), [7])[0]
-        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        asked = asked_of(pool)
         first = pool.evaluate(setting(), asked * 2)
         assert pool.evaluated == len(asked) and first[: len(asked)] == first[len(asked) :]
         assert pool.evaluate(setting(steps=5), asked) != first[: len(asked)]
@@ -200,18 +211,17 @@ def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Pa
     assert said in text and text.count("\n") == 1
 
 
-def test_other_learners_see_the_same_decisions_as_a_problem():
-    with WorkerPool(NOTHING) as pool:
-        problem = FitProblem(setting(), CONFIG.spec, REWARD, pool)
-        moments = pool.draw(setting(), [4])[0]
-        decision = problem.draw(4 * setting().decisions + 1)
-        assert decision.moment == moments[1] and decision.state is moments[1].state
-        action = np.array([True, False, True, True])
-        reward, terms = decision.reward(action)
-        assert decision.reward(action) == (reward, terms) and set(terms) == {"psnr", "ssim"}
-        assert reward == pytest.approx(sum(terms.values()))
-        batch = collect(Learner(CONFIG.spec, 0), problem, range(6))
-        assert len(batch) == 6 and np.isfinite(batch.rewards).all()
+def test_other_learners_see_the_same_decisions_as_a_problem(pool: WorkerPool):
+    problem = FitProblem(setting(), CONFIG.spec, REWARD, pool)
+    moments = pool.draw(setting(), [4])[0]
+    decision = problem.draw(4 * setting().decisions + 1)
+    assert decision.moment == moments[1] and decision.state is moments[1].state
+    action = np.array([True, False, True, True])
+    reward, terms = decision.reward(action)
+    assert decision.reward(action) == (reward, terms) and set(terms) == {"psnr", "ssim"}
+    assert reward == pytest.approx(sum(terms.values()))
+    batch = collect(Learner(CONFIG.spec, 0), problem, range(6))
+    assert len(batch) == 6 and np.isfinite(batch.rewards).all()
 
 
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
@@ -249,18 +259,17 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
 
 
-def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path):
+def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path, pool: WorkerPool):
     Learner(CONFIG.spec, 77).save(tmp_path / "policy.npz")
 
     def stop(line: str) -> None:
         raise KeyboardInterrupt
 
-    with WorkerPool(NOTHING) as pool:
-        with pytest.raises(KeyboardInterrupt):
-            train(setting(), CONFIG, pool, tmp_path, stop)
-        assert not (tmp_path / "policy.npz").exists()
-        Learner(CONFIG.spec, 77).save(tmp_path / "policy.npz")
-        learner = train(setting(), CONFIG, pool, tmp_path, quiet)
+    with pytest.raises(KeyboardInterrupt):
+        train(setting(), CONFIG, pool, tmp_path, stop)
+    assert not (tmp_path / "policy.npz").exists()
+    Learner(CONFIG.spec, 77).save(tmp_path / "policy.npz")
+    learner = train(setting(), CONFIG, pool, tmp_path, quiet)
     assert same(Learner.load(tmp_path / "policy.npz"), learner)
 
 
@@ -271,9 +280,9 @@ def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Pa
         (make_reward("set", distance_is="perceptual"), "edge.metrics"),
     ],
 )
-def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path: Path):
+def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path, pool):
     config = dataclasses.replace(CONFIG, reward=reward)
-    with WorkerPool(NOTHING) as pool, pytest.raises(TrainingError, match=missing):
+    with pytest.raises(TrainingError, match=missing):
         train(setting(), config, pool, tmp_path, quiet)
     assert not (tmp_path / "training.json").exists()
 
@@ -317,8 +326,7 @@ def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: P
         raise KeyboardInterrupt
 
     with WorkerPool(NOTHING, known=known) as pool:
-        moments = [m for e in pool.draw(setting(), range(12)) for m in e]
-        asked = [(m.seed, m.number, c) for m in moments for c in choices(named("all"), [m])]
+        asked = asked_of(pool, range(12))
         with pytest.raises(KeyboardInterrupt):
             pool.evaluate(setting(), asked, stop)
     ((done, count),) = seen
@@ -329,20 +337,18 @@ def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: P
         assert pool.evaluated == count - done
 
 
-def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch):
+def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch, pool: WorkerPool):
     monkeypatch.setattr("edge_server.experiments.training.scheduler.trainer._PROGRESS_EVERY_S", 0.0)
     text: list[str] = []
     config = dataclasses.replace(CONFIG, episodes=6, batch=6)
-    with WorkerPool(NOTHING) as pool:
-        train(setting(), config, pool, tmp_path, text.append)
+    train(setting(), config, pool, tmp_path, text.append)
     assert len(text) >= 3 and text[0].endswith("fits of batch 1") and text[-1].startswith("6/6 episodes")
 
 
 def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path: Path):
     known = tmp_path / "known.jsonl"
     with WorkerPool(NOTHING, known=known) as pool:
-        moments = pool.draw(setting(), [7])[0]
-        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        asked = asked_of(pool)
         pool.evaluate(setting(), asked)
         spent = pool.cost_s(setting(), asked)
     assert spent > 0.0
@@ -357,12 +363,10 @@ def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path:
         assert pool.evaluated == len(asked)
 
 
-def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path):
+def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path, pool: WorkerPool):
     config = dataclasses.replace(CONFIG, stages=(1, 3))
-    with WorkerPool(NOTHING) as pool:
-        learner = train(setting(), config, pool, tmp_path / "a", quiet)
-        shorter = dataclasses.replace(CONFIG, episodes=2)
-        first = train(setting(), shorter, pool, tmp_path / "b", quiet)
+    learner = train(setting(), config, pool, tmp_path / "a", quiet)
+    first = train(setting(), dataclasses.replace(CONFIG, episodes=2), pool, tmp_path / "b", quiet)
     assert same(Learner.load(stage_file(tmp_path / "a", 1)), first)
     assert same(Learner.load(stage_file(tmp_path / "a", 3)), learner) and not same(first, learner)
     with pytest.raises(TrainingError, match="stages"):

@@ -1,0 +1,56 @@
+"""Only what the scenario calls for is imported: each program in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+EDGE = """
+import edge_server.page, edge_server.live.server, edge_server.report.report
+import edge_server.experiments.virtual.from_scenario
+from edge_server.config import read_config
+from freshfield.scenario import load
+read_config(load("room"))
+"""
+NODE = """
+import camera_node.node, camera_node.build, camera_node.cli
+import camera_node.robot.arm.hand_eye_mount, camera_node.pose.pairing
+"""
+NODE_WITHOUT_ARM = """
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from freshfield.scenario import load
+build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
+"""
+TILE = """
+import camera_node.synthetic.frame_cache
+from camera_node.synthetic import make_scene
+make_scene("tile", {"width": 16, "height": 16}).render("cam00", 0.0)
+"""
+EMULATOR = """
+import channel_emu.cli, channel_emu.live.frame_stream, channel_emu.live.benchmark
+import channel_emu.virtual.simulate
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "unasked"),
+    [
+        (EDGE, ("edge_server.embed", "edge_server.foreground", "edge_server.live.keyframes",
+                "edge_server.surface", "edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib",
+                "mcap", "torch")),
+        (NODE, ("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy",
+                "mcap")),
+        (NODE_WITHOUT_ARM, ("camera_node.pose", "camera_node.robot.hand_camera",
+                            "camera_node.sources.devices.live", "rtde", "depthai")),
+        (TILE, ("camera_node.synthetic.scenes.room", "camera_node.synthetic.person", "torch", "numba",
+                "edge_server", "channel_emu", "scipy", "matplotlib")),
+        (EMULATOR, ("torch", "numba", "camera_node", "edge_server")),
+    ],
+    ids=("edge", "node", "node without an arm", "tile", "emulator"),
+)  # fmt: skip
+def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
+    code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
