@@ -32,11 +32,19 @@ def summarize(out: Path) -> str:
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}",
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
         f"{fmt(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
-        f"{'all accounted for' if frames.get('closes') else 'the counts DO NOT ADD UP'}",
+        f"{_accounted(frames)}",
         *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
     return "\n".join(lines)
+
+
+def _accounted(frames: dict[str, Any]) -> str:
+    """Whether every frame is accounted for, and why not."""
+    if not frames.get("closes"):
+        return "NOT ALL ACCOUNTED FOR: " + "; ".join(frames.get("doubts") or ["no account"])
+    cut_off = frames.get("cut_off")
+    return "all accounted for" + (f", {cut_off} of them cut off by the end of a process" if cut_off else "")
 
 
 def _parts(age_ms: dict[str, Any]) -> str:

@@ -195,7 +195,8 @@ def _frames_table(report: Report) -> str:
         ("lost", "lost by the channel"),
         ("broken", "its stream ended on the way"),
         ("delivered", "in the edge's buffer, or the held-out truth"),
-        ("in_flight", "sent; no process recorded its end"),
+        ("in_flight", "inside the link when the emulator ended"),
+        ("cut_off", "sent; held by a process that was killed or still runs"),
     ]
     rows = [["frames", "", ""]]
     rows += [
@@ -210,7 +211,7 @@ def _frames_table(report: Report) -> str:
     result = (
         "<p class=ok>Every frame is accounted for."
         if f["closes"]
-        else "<p class=bad>The counts of frames do not add up."
+        else f"<p class=bad>Not every frame is accounted for: {escape('; '.join(f['doubts']))}."
     )
     if count := f["contradiction_count"]:
         result += f" <span class=bad>The ledgers contradict each other on {count} frames:</span></p><ul>"
@@ -225,7 +226,7 @@ def _frames_table(report: Report) -> str:
 
 def _frames_by_camera(report: Report) -> str:
     names = ("captured", "replaced", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
-             "delivered", "in_flight")  # fmt: skip
+             "delivered", "in_flight", "cut_off")  # fmt: skip
     rows = [["camera", *(n.replace("_", " ") for n in names), "rejected"]]
     by_camera = report["frames"]["by_camera"] if report["frames"] is not None else {}
     for camera, f in by_camera.items():
