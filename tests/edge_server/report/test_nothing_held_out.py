@@ -1,4 +1,4 @@
-"""Every place that shows a fidelity: with nothing held out each says so, and none calls it "at the present"."""
+"""Every place that shows a fidelity: with nothing held out each says so, and none speaks of the present."""
 
 from __future__ import annotations
 
