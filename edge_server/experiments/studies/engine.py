@@ -134,7 +134,7 @@ class Engine:
                 ray.init(address=address, log_to_driver=False, include_dashboard=False)
             except (ConnectionError, ValueError, RuntimeError) as error:
                 raise StudyError(f"--ray {self.ray}: no cluster can be reached: {error}") from None
-        remote = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
+        remote: Any = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
         running = {
             remote.remote(mappings, self.folders, processor()): task for task, mappings in zip(tasks, sent)
         }

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf, nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -159,7 +160,7 @@ class ChaosDeployment(VirtualDeployment):
         self._stalled.discard(role)
         if role == "emulator":
             self._advance_links(self.clock.now_ns())
-            self._send_waiting()
+        self._send_waiting()
         while role == "edge" and self._upstream:
             self._arrive(self._upstream.popleft())
 
@@ -229,7 +230,7 @@ class ChaosDeployment(VirtualDeployment):
         )
         request = to_request(frame)
         header, data = request.header, shot.payload
-        wrong: list[tuple[object, str, list[object]]] = [
+        wrong: list[tuple[Any, str, list[Any]]] = [
             (header, "camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
             (header, "session_id", ["a\nb", "", "x" * 1000]),
             (header, "generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
@@ -277,12 +278,12 @@ class ChaosDeployment(VirtualDeployment):
         self._waiting[frame.camera] = frame
 
     def _send_waiting(self) -> None:
-        waiting, self._waiting = self._waiting, {}
-        for frame in waiting.values():
-            if "node" in self._stalled:
-                self._waiting[frame.camera] = frame
-            else:
-                self._offer(frame, self.clock.now_ns())
+        """What waits at the node leaves, once both the node and the emulator run."""
+        if {"node", "emulator"} & (self._down | self._stalled):
+            return
+        for frame in self._waiting.values():
+            self._offer(frame, self.clock.now_ns())
+        self._waiting.clear()
 
     def _offer(self, frame: Frame, now_ns: int) -> None:
         self._count("sent", "node", frame)

@@ -12,7 +12,7 @@ import dataclasses
 import heapq
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -352,7 +352,7 @@ class VirtualDeployment:
 
     # --- the edge -------------------------------------------------------------------------------------
 
-    def _run_edge(self) -> Iterator[WakeCondition]:
+    def _run_edge(self) -> Generator[WakeCondition, None, None]:
         """The edge's loop; it yields when it wants to go on."""
         updates, settings = self.updates, self.settings
         steps = settings.first_steps or settings.steps
