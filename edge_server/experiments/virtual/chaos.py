@@ -126,6 +126,8 @@ def _state(deployment: ChaosDeployment) -> Iterator[str]:
     """Bounds of queues and memory, and numbers that are none."""
     if deployment.most_inside > _MOST_INSIDE:
         yield f"{deployment.most_inside} frames inside a link, at most {_MOST_INSIDE} expected"
+    if deployment.damaged_admitted:
+        yield f"{deployment.damaged_admitted} frames with a wrong checksum were taken in"
     sessions = max(len(s) for s in deployment._admission._sessions.values())
     if sessions > MAX_SESSIONS_PER_CAMERA:
         yield f"{sessions} sessions remembered of a camera, at most {MAX_SESSIONS_PER_CAMERA} expected"

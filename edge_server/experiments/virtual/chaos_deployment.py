@@ -48,6 +48,7 @@ class ChaosDeployment(VirtualDeployment):
 
     really: frames and copies by what became of them, with the names of ``FrameCounts``; refusals as
     ``rejected:reason``, those of unknown origin as ``strangers``. arrivals: instants of deliveries by camera.
+    damaged_admitted: frames taken in although their checksum was wrong.
     most_inside: most frames that a link held. lines_lost: to full disks. restarts: of processes, by role.
     """
 
@@ -62,7 +63,7 @@ class ChaosDeployment(VirtualDeployment):
         self.scenario = scenario
         self.really: Counter[str] = Counter()
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
-        self.most_inside = self.lines_lost = 0
+        self.most_inside = self.lines_lost = self.damaged_admitted = 0
         self.restarts: Counter[str] = Counter()
         self._out = out
         self._down: set[str] = set()
@@ -206,6 +207,7 @@ class ChaosDeployment(VirtualDeployment):
             header = request.header
             try:
                 reason = self._deliver(from_request(request), ())
+                self.damaged_admitted += not reason and checksum(header, request.payload) != request.crc32c
             except FrameRejected as error:
                 reason = error.reason
                 self.rejected[reason] += 1
@@ -316,6 +318,7 @@ class ChaosDeployment(VirtualDeployment):
         frame = event.transit.item
         reason = self._deliver(frame, event.transit.flips)
         self._count(f"rejected:{reason}" if reason else "delivered", "edge", frame)
+        self.damaged_admitted += bool(event.transit.flips and not reason)
         if not reason:
             self.arrivals[frame.camera].append(self.clock.now_ns())
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_server.experiments.virtual import chaos
+from edge_server.experiments.virtual import chaos, chaos_deployment
 from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
 from edge_server.experiments.virtual.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
 from edge_server.report import frame_accounting
+from freshfield.frame import checksum, from_request
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 
@@ -118,6 +119,19 @@ def learn_what_is_no_number(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(ChaosDeployment, "end", end)
 
 
+def check_no_checksum(patch: pytest.MonkeyPatch) -> None:
+    """Whatever arrives is given the checksum that it should have."""
+
+    def repaired(request):
+        kept, request.crc32c = request.crc32c, checksum(request.header, request.payload)
+        try:
+            return from_request(request)
+        finally:
+            request.crc32c = kept
+
+    patch.setattr(chaos_deployment, "from_request", repaired)
+
+
 def draw_without_seed(patch: pytest.MonkeyPatch) -> None:
     whole = ChaosDeployment._stamp
     draw = np.random.default_rng()
@@ -143,6 +157,7 @@ def break_a_part(patch: pytest.MonkeyPatch) -> None:
         (forget_kills, 20, "in no ledger", "crash emulator"),
         (never_restart_the_edge, 2, "never up to date again", "crash edge"),
         (learn_what_is_no_number, 2, "the field's params is not finite", None),
+        (check_no_checksum, 6, "with a wrong checksum were taken in", "hostile"),
         (draw_without_seed, 2, "a second run has another digest", None),
         (break_a_part, 7, "KeyError in test_chaos.py, policy: 'omega'", "policy"),
     ],
