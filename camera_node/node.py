@@ -102,6 +102,8 @@ class Node:
             self._pool.shutdown(wait=False, cancel_futures=True)
             await channel.close()
             self._enter("stopped")
+            for outbox in self.outboxes.values():
+                outbox.close()
             if ledger is not None:
                 ledger.close(self._clock.now_ns())
 

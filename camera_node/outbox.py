@@ -60,8 +60,16 @@ class Outbox:
         self.record(frame.sequence, "sent")
         return frame
 
+    def close(self) -> None:
+        """The node ends: enter a frame that still waits in the ledger as ``waiting``."""
+        if self._frame is not None:
+            self._write(self._frame.sequence, "waiting")
+
     def record(self, sequence: int, event: str, detail: str = "") -> None:
         """Count an event and write it to the ledger."""
         self.counts[detail if event == "answered" else event] += 1
+        self._write(sequence, event, detail)
+
+    def _write(self, sequence: int, event: str, detail: str = "") -> None:
         if self._ledger is not None:
             self._ledger.write(self._clock.now_ns(), self.camera, self.session, sequence, event, detail)

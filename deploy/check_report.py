@@ -20,7 +20,10 @@ def problems(out: Path) -> list[str]:
     frames, fidelity = report["frames"], report["fidelity"]
     updates, baseline = report["updates"], fidelity["baseline"]
     checks = {
-        "every frame is accounted for": frames["closes"],
+        f"every frame is accounted for ({'; '.join(frames['doubts'])})": frames["closes"],
+        "no two ledgers contradict each other": not frames["contradiction_count"],
+        "no line of a ledger was lost": not frames["lines_lost"],
+        "no frame was cut off by a kill": not frames["cut_off"],
         "frames were delivered": frames["delivered"] > 0,
         "no frame was rejected": not frames["rejected"],
         "the field was updated at least three times": updates["count"] >= 3,

@@ -29,6 +29,7 @@ The edge of freshfield: takes posed frames, keeps a radiance field up to date, s
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
   edge-server simulate room --seconds 10
+  edge-server chaos --seeds 0..99 --jobs 2
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
   edge-server explain runs/room --decision 12
@@ -78,6 +79,10 @@ _COMMANDS = {
     "simulate": (
         "experiments.virtual.simulate",
         "a scenario's whole deployment in virtual time, repeatable bit for bit",
+    ),
+    "chaos": (
+        "experiments.virtual.chaos",
+        "small deployments in virtual time with faults from seeds, and what must hold after each",
     ),
     "study": ("experiments.studies.command", "the thesis's figures as commands, each with a verdict"),
     "bench": (

@@ -59,6 +59,11 @@ class CameraFlow:
         if kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
             self.upstream.send(message)
 
+    def close(self) -> None:
+        """The emulator ends: enter what is inside the link in the ledger as ``in_flight``."""
+        for transit in self.link.model.pending():
+            self._write(transit.item, "in_flight", self._clock.now_ns())
+
     def describe(self, message: Message) -> str:
         return f"frame {message.sequence} of {self.camera}"
 

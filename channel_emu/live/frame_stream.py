@@ -112,6 +112,8 @@ class FrameStream:
     def close(self) -> None:
         """Close ledger and status, each even if the other fails."""
         try:
+            for flow in self.flows.values():
+                flow.close()
             self._ledger.close(self._proxy.clock.now_ns())
         finally:
             self._write_status(self._snapshot(final=True))

@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.resources import ResourceUse
 from freshfield_up.status import RunStatus, Status, fmt, number
 
@@ -142,10 +143,11 @@ def _edge_line(edge: Status) -> str:
     updates = number(edge, "updates", "count")
     if not updates:
         return str(edge.get("doing") or "no update yet")
+    views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
     parts = [
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
-        f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB",
+        f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
         f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
         f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
         f"policy {edge.get('policy', '-')}",

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.status import fmt
 
 
@@ -16,13 +17,14 @@ def summarize(out: Path) -> str:
     updates, fidelity = report.get("updates", {}), report.get("fidelity", {})
     final, baseline = fidelity.get("final") or {}, fidelity.get("baseline") or {}
     shown = fidelity.get("shown") or {}
+    views = f" on {NOTHING_HELD_OUT}" if "selected" in fidelity.get("scored_on", ()) else ""
     rejected = sum(frames.get("rejected", {}).values())
     lines = [
         "",
         f"shown      PSNR {fmt(shown.get('psnr_db'), '.2f')} dB over the last fifth of the run "
         f"(moving pixels {fmt(shown.get('psnr_moving_db'), '.2f')} dB, still "
         f"{fmt(shown.get('psnr_still_db'), '.2f')}), {_parts(shown.get('age_ms') or {})}",
-        f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run "
+        f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run{views} "
         f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
         f"LPIPS {fmt(final.get('lpips'), '.3f')})",
         f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
@@ -32,11 +34,19 @@ def summarize(out: Path) -> str:
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}",
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
         f"{fmt(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
-        f"{'all accounted for' if frames.get('closes') else 'the counts DO NOT ADD UP'}",
+        f"{_accounted(frames)}",
         *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
     return "\n".join(lines)
+
+
+def _accounted(frames: dict[str, Any]) -> str:
+    """Whether every frame is accounted for, and why not."""
+    if not frames.get("closes"):
+        return "NOT ALL ACCOUNTED FOR: " + "; ".join(frames.get("doubts") or ["no account"])
+    cut_off = frames.get("cut_off")
+    return "all accounted for" + (f", {cut_off} of them cut off by the end of a process" if cut_off else "")
 
 
 def _parts(age_ms: dict[str, Any]) -> str:

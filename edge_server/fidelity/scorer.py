@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -25,6 +25,7 @@ from edge_server.fidelity.images import BLACK, Color, Image, ImageError, same_si
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
+from freshfield.scenario import NOTHING_HELD_OUT
 
 log = logging.getLogger(__name__)
 
@@ -38,11 +39,18 @@ GAP_PERIODS = 0.55
 
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")
 """The scores that are reported of what was shown."""
+SELECTED = "selected"
+"""In place of a held-out camera's name where nothing is held out: a score on the views trained on."""
 
 Load = Callable[[], NDArray]
 # A rendering, or a function that makes it once the truth's generation time is known: by then a moving
 # held-out camera has another pose.
 Render = NDArray | Callable[[int], NDArray]
+
+
+def fidelity_title(scored_on: Iterable[str | None]) -> str:
+    """What a score of these (``Publication.scored_on``) is: training views are no truth at the present."""
+    return f"Fidelity on {NOTHING_HELD_OUT}" if SELECTED in scored_on else "Fidelity at the present"
 
 
 class PerceptualMetric(Protocol):

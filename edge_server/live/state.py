@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.scorer import Score
+from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
 from freshfield.frame import Frame
 
@@ -35,7 +35,7 @@ class Publication:
     refused: selected cameras whose view the field left out, because it contradicts all others.
     psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
     is nothing to score. truth_gap_ms: time from the present to that truth.
-    scored_on: held-out camera, or "selected" where nothing is held out (6.21-6.22).
+    scored_on: held-out camera, or SELECTED where nothing is held out (6.21-6.22).
     perceptual: the stand-in for LPIPS, where the scenario lists it (edge.metrics).
     """
 
@@ -74,7 +74,7 @@ class Publication:
             lpips=score.lpips,
             perceptual=score.perceptual,
             truth_gap_ms=score.truth_gap_ms,
-            scored_on=score.camera if score.on == "held-out" else "selected",
+            scored_on=score.camera if score.on == "held-out" else SELECTED,
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView
 from edge_server.page.colors import (
     AGAINST,
@@ -19,6 +20,7 @@ from edge_server.page.colors import (
     css,
     scale_color,
 )
+from freshfield.scenario import NOTHING_HELD_OUT
 
 if TYPE_CHECKING:  # loaded only with a learned policy
     from edge_server.scheduler.learned.explain import Explanation
@@ -65,7 +67,8 @@ def status(s: Summary) -> str:
         f'<div style="{_DIM};font-size:.92em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;'
         f'min-height:1.4em">{escape(s.doing)}</div></div>'
     )
-    on = f"dB on {s.scored_on}" if s.scored_on else "dB held out"
+    names = {None: "held-out views", SELECTED: NOTHING_HELD_OUT}
+    on = f"dB on {names.get(s.scored_on, s.scored_on)}"
     tiles = (
         ("PSNR", number(s.psnr_db, 1), escape(on)),
         ("updates", str(s.updates), "of the field"),
@@ -136,14 +139,15 @@ def _row(camera: CameraView, used: bool) -> str:
     )
 
 
-def comparison_caption(camera: str, psnr_db: float | None, update: int) -> str:
-    """The caption above the pair of images."""
+def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:
+    """The caption above the pair of images. held_out: the camera is."""
+    truth = "truth at the present" if held_out else NOTHING_HELD_OUT
     score = "" if psnr_db is None else f"{number(psnr_db, 1)} dB &middot; "
     return (
         f'<div style="padding:.4em .9em .25em;font-size:.78em"><b>{escape(camera)}</b>, '
         f'<span style="{_DIM}">{score}update {update}</span>'
         f'<div style="display:grid;grid-template-columns:1fr 1fr;{_DIM};font-size:.95em">'
-        "<span>truth at the present</span><span>what the field renders</span></div></div>"
+        f"<span>{truth}</span><span>what the field renders</span></div></div>"
     )
 
 

@@ -77,13 +77,16 @@ class Panel:
         self._explanation.refresh()
         comparison = self._state.comparison
         if comparison is not None and comparison.number != self._compared_update:
-            self._show_comparison(comparison, publications)
+            held_out = any(c.held_out for c in cameras if c.camera == comparison.camera)
+            self._show_comparison(comparison, publications, held_out)
 
-    def _show_comparison(self, comparison: Comparison, publications: list[Publication]) -> None:
+    def _show_comparison(
+        self, comparison: Comparison, publications: list[Publication], held_out: bool
+    ) -> None:
         self._compared_update = comparison.number
         scored = next((p for p in reversed(publications) if p.number == comparison.number), None)
         self._caption.content = markup.comparison_caption(
-            comparison.camera, scored.psnr_db if scored else None, comparison.number
+            comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
         )
         pair = side_by_side(comparison.truth, comparison.rendered)
         if self._pair is None:

@@ -10,6 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
@@ -74,7 +75,7 @@ class Timelines:
     def __init__(self, gui: viser.GuiApi) -> None:
         self._age = _Chart(gui, "Age of the newest frames, ms",
                            (("mean", FRESH), ("worst", STALE), ("omega", UNKNOWN)), zero=True)  # fmt: skip
-        self._psnr = _Chart(gui, "Fidelity at the present, dB", (("PSNR", HELD_OUT), ("moving", MIDDLE)))
+        self._psnr = _Chart(gui, "", (("PSNR", HELD_OUT), ("moving", MIDDLE)))
         self._channel = _Chart(gui, "Channel", (("state", MIDDLE),), zero=True, stepped=True)
 
     def refresh(self, history: History, publications: Sequence[Publication]) -> None:
@@ -85,6 +86,8 @@ class Timelines:
         omega = _latest_value(t, [(p.t_s, p.omega_ms) for p in recent])
         self._age.draw(t, mean, worst, omega)
         scored = [p for p in recent if p.psnr_db is not None]
+        where = fidelity_title(p.scored_on for p in scored)
+        self._psnr.title = f"{where}, dB"
         self._psnr.draw(_column(p.t_s for p in scored), _column(p.psnr_db for p in scored),
                         _column(p.psnr_moving_db for p in scored))  # fmt: skip
         names = ", ".join(f"{i} {name}" for i, name in enumerate(history.state_names))
@@ -102,7 +105,7 @@ class _Chart:
         self, gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, RGB]],
         zero: bool = False, stepped: bool = False,
     ) -> None:  # fmt: skip
-        self._gui, self._title, self._lines = gui, title, lines
+        self._gui, self.title, self._lines = gui, title, lines
         self._zero, self._stepped = zero, stepped
         self._caption = gui.add_html("", visible=False)
         self._place = gui.add_folder(None)
@@ -127,7 +130,7 @@ class _Chart:
                 self._chart = self._make([self._lines[i] for i in shown], data)
         else:
             self._chart.data = data
-        self._caption.content = chart_caption(self._title, [self._lines[i] for i in shown], remark)
+        self._caption.content = chart_caption(self.title, [self._lines[i] for i in shown], remark)
         self._caption.visible = True
 
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:

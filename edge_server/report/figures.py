@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.report.run_files import Row, RunFiles
 from edge_server.report.style import (
     BLUE,
@@ -22,6 +23,7 @@ from edge_server.report.style import (
     figure,
     label_lines,
 )
+from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
 # Factor by which errors are brightened to be visible.
@@ -58,7 +60,9 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
             if found["baseline"].get(key) is not None:
                 top.axhline(found["baseline"][key], color=GREY, linestyle=dash, linewidth=1.2, label=label)
         fit = report["kind"] == "fit"
-        title = "Fidelity on held-out views" if fit else "Fidelity against the truth at the present"
+        title = fidelity_title(found["scored_on"])
+        if fit and SELECTED not in found["scored_on"]:
+            title = "Fidelity on held-out views"
         label_lines(top, "PSNR (dB)", title=title)
         bottom.plot(*ssim, color=GREEN, label="SSIM (higher is better)")
         if len(lpips[0]):
@@ -156,7 +160,7 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
 
 
 def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
-    """The last held-out image beside the field's rendering of it, and the absolute error."""
+    """The last scored image beside the field's rendering of it, and the absolute error."""
     truth, rendered = _image(files, "truth"), _image(files, "rendered")
     if truth is None or rendered is None or truth.shape != rendered.shape:
         return False
@@ -164,6 +168,8 @@ def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
     height = 2.75 * truth.shape[0] / truth.shape[1] + 0.35
     with figure(path, 1, 3, height_inch=height) as (_, axes):
         truth_is = "held-out truth" if report["kind"] == "fit" else "truth at the present"
+        if SELECTED in report["fidelity"]["scored_on"]:
+            truth_is = NOTHING_HELD_OUT
         titles = (truth_is, "the field's rendering", f"error, {_ERROR_GAIN:g} times")
         for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
             ax.imshow(image, interpolation="nearest")

@@ -1,29 +1,32 @@
-"""Joins the ledgers of all processes into an accounting of every frame, in which no term is a remainder.
+"""Joins the ledgers of all processes into an accounting of every frame; every term is counted by itself.
 
-A frame is (camera, session, sequence). What became of it is what processes wrote. Where they differ, the
-process further down the path is believed, because it held the frame later:
-
-1. **edge**: each ``delivered`` or ``rejected`` ends one copy.
-2. **emulator**: ``skipped``, ``dropped_busy``, ``superseded``, ``lost`` and ``rejected`` each end a copy that
-   the edge has not ended. Then ``broken`` (upstream was gone) ends copies that nothing else has ended.
-3. **node**: an ``answered`` that refuses (dropped_busy, superseded, rejected) ends a copy that no later
-   process has ended. Then ``broken`` does the same.
-4. Otherwise the copy is ``in_flight``: it was sent and no process wrote its end, because the run ended or
-   a process was killed meanwhile.
-
-A frame has one copy for each time it was handed to a stream, plus one for each ``duplicated``. The first
-copy counts as ``sent``, every other one as ``duplicated``, and each ends in exactly one state. A frame that
-was never sent is ``replaced`` if the node wrote so, else ``waiting``. So both sums hold by what was written:
+A frame is (camera, session, sequence). What became of it is what processes wrote. Both sums must come out by
+what was written; nothing is computed as what is left over:
 
     captured = replaced + waiting + sent
-    sent + duplicated = skipped + dropped_busy + superseded + lost + broken + delivered + rejected + in_flight
+    sent + duplicated = skipped + dropped_busy + superseded + lost + broken + delivered + rejected
+                        + in_flight + cut_off
+
+A frame has one copy for each time it was handed to a stream, plus one for each ``duplicated``. The first
+copy counts as ``sent``, every other one as ``duplicated``. Ends of copies:
+
+1. **edge**: each ``delivered`` or ``rejected`` ends one copy.
+2. **emulator**: ``skipped``, ``dropped_busy``, ``superseded``, ``lost``, ``rejected`` and ``in_flight``
+   (inside the link when the emulator ended) each end one copy.
+3. Second-hand statements count only for copies that the above have not ended, because a process further down
+   the path held the frame later: an ``answered`` of the node that refuses, then ``broken``.
+4. ``cut_off``: nobody wrote the end, and a line about the frame is within ``CUT_OFF_NS`` of the end of a
+   ledger that ends without ``closed``, of a process that may have held the copy: it was killed, or still
+   runs. A frame that such a node captured last and did not send counts as ``waiting``.
+
+A copy with no end at all is in no term, so the second sum then fails. ``doubts`` says in words why an account
+does not close: a sum that does not come out, statements that cannot all be true (``contradictions``, such as
+a frame both dropped and delivered), ledger lines that were lost, ledgers that cannot be read.
 
 A frame that only the emulator or the edge wrote about (its node's ledger is on another machine) counts as
 captured and sent, with a note. Where nodes' ledgers are present, a frame that was only ever refused, of a
-camera that no process accepted or with a garbled id, is of unknown origin and counted apart (``strangers`` in
-the report). Statements that cannot all be true, such as a frame both dropped and delivered, are listed in
-``contradictions``; the frame counts once, by the order above. A line missing after a kill or from a full disk
-is no contradiction: later lines about the frame stand for it.
+camera that no process accepted, of a session whose node did not write about it or with a garbled id, is of
+unknown origin and counted apart (``strangers`` in the report).
 
 Runs are long. Ledgers are therefore read line by line, and each frame keeps only the number of its history:
 frames share a few dozen different histories, each of which is evaluated once.
@@ -32,6 +35,7 @@ frames share a few dozen different histories, each of which is evaluated once.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,10 +43,13 @@ from typing import Any
 from freshfield.ledger import LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
-LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost")
-ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "in_flight")
+LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
+ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "cut_off")
+# A process that is killed takes with it what it wrote about in its last moments. The thesis's links hold a
+# frame for a second or two; a frame without a line so near to the end was lost by something else.
+CUT_OFF_NS = 10 * 10**9
 _EVENTS = {
-    "node": {"captured", "replaced", "sent", "broken", "answered"},
+    "node": {"captured", "replaced", "waiting", "sent", "broken", "answered"},
     "emulator": {"received", *LINK_ENDS, "rejected", "forwarded", "duplicated", "broken"},
     "edge": {"delivered", "rejected"},
 }
@@ -70,6 +77,7 @@ class FrameCounts:
     delivered: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     in_flight: int = 0
+    cut_off: int = 0
 
     def count_end(self, state: str, copies: int = 1) -> None:
         """Count copies that ended in ``state``; a rejection is written ``rejected:reason``."""
@@ -91,12 +99,19 @@ class FrameCounts:
                 setattr(self, name, getattr(self, name) + value * times)
 
     @property
-    def balanced(self) -> bool:
-        """Whether both sums of the module's docstring hold."""
+    def without_end(self) -> tuple[int, int]:
+        """Frames captured and copies sent that have no end by the sums of the module's docstring: both 0
+        where the sums hold, negative where more ended than there were."""
         ended = sum(getattr(self, name) for name in ENDS if name != "rejected") + self.rejected.total()
         return (
-            self.captured == self.replaced + self.waiting + self.sent and self.sent + self.duplicated == ended
+            self.captured - self.replaced - self.waiting - self.sent,
+            self.sent + self.duplicated - ended,
         )
+
+    @property
+    def balanced(self) -> bool:
+        """Whether both sums hold."""
+        return self.without_end == (0, 0)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, in the order in which a frame passes the states."""
@@ -108,7 +123,9 @@ class FrameAccounting:
     """What became of every frame of a run.
 
     unknown_origin: refused frames that no camera of the run can have sent, by reason; in no other count.
-    notes: one line for people on whatever was missing, torn or assumed. ledgers: how many were read.
+    lines_lost: ledger lines that were not written or cannot be read. unreadable: names of ledgers that cannot
+    be read to their end. notes: one line for people on whatever was missing, torn or assumed. ledgers: how
+    many were read.
     """
 
     total: FrameCounts = field(default_factory=FrameCounts)
@@ -116,15 +133,33 @@ class FrameAccounting:
     contradictions: list[str] = field(default_factory=list)
     contradiction_count: int = 0
     unknown_origin: Counter[str] = field(default_factory=Counter)
+    lines_lost: int = 0
+    unreadable: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     ledgers: int = 0
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why not every frame is accounted for, one line each; empty where the account closes."""
+        per_camera = [counts.without_end for counts in self.by_camera.values()]
+        unsent, copies = (sum(abs(found[i]) for found in per_camera) for i in (0, 1))
+        found = {
+            "captured = replaced + waiting + sent is off by {:,} frames": unsent,
+            "sent + duplicated = the sum of all ends is off by {:,} copies": copies,
+            "the ledgers contradict each other on {:,} frames": self.contradiction_count,
+            "{:,} lines of the ledgers were lost": self.lines_lost,
+            f"ledgers that cannot be read ({', '.join(self.unreadable)}): {{}}": len(self.unreadable),
+        }
+        return [text.format(count) for text, count in found.items() if count]
 
     def as_dict(self) -> dict[str, Any]:
         """The ``frames`` part of a report."""
         reasons = dict(sorted(self.unknown_origin.items()))
         return {
             **self.total.as_dict(),
-            "closes": self.total.balanced,
+            "closes": not self.doubts,
+            "doubts": self.doubts,
+            "lines_lost": self.lines_lost,
             "contradictions": self.contradictions,
             "contradiction_count": self.contradiction_count,
             "strangers": {"count": self.unknown_origin.total(), "reasons": reasons},
@@ -195,6 +230,7 @@ class _LedgerContents:
     frames: number of each frame's history, by (camera, session) and sequence. accepted: cameras about which
     some process wrote more than refusals. garbled: by camera, the reasons for which frames with a garbled id
     were refused; each is one frame. unknown_events: how often each event that no role writes was read.
+    near_end: frames written about near the end of a ledger without ``closed``; bit r: of one of role r.
     """
 
     histories: _Histories = field(default_factory=_Histories)
@@ -202,47 +238,73 @@ class _LedgerContents:
     accepted: set[str] = field(default_factory=set)
     garbled: dict[str, Counter[str]] = field(default_factory=dict)
     unknown_events: Counter[str] = field(default_factory=Counter)
+    near_end: dict[tuple[str, str, int], int] = field(default_factory=dict)
 
 
 def account_frames(out: Path) -> FrameAccounting:
     """Join every ledger in the folder ``out``. Ledgers that cannot be read are left out and noted."""
-    ledgers, notes = [], []
+    accounting = FrameAccounting()
+    ledgers, notes = [], accounting.notes
     for path in sorted(out.glob("ledger-*.tsv")):
         try:
             ledgers.append(LedgerReader(path))
         except (ValueError, OSError) as error:
-            # Killed before its first line was complete: it had not written about any frame either.
             notes.append(f"{path.name} left out: {error}")
-    accounting = FrameAccounting(ledgers=len(ledgers), notes=notes)
+            if not _without_a_line(path):
+                accounting.unreadable.append(path.name)
+    accounting.ledgers = len(ledgers)
     contents = _LedgerContents()
+    ends = _cut_off_ends(ledgers)
     for number, ledger in enumerate(ledgers):
-        notes += _read_ledger(contents, number, ledger)
+        _read_ledger(contents, number, ledger, ends, accounting)
     unknown = sorted(contents.unknown_events.items())
     notes += [f"{count} lines with an unknown {event} left out" for event, count in unknown]
 
     has_node_ledger = any(ledger.role == "node" for ledger in ledgers)
     evaluated = [_evaluate(history) for history in contents.histories.all]
-    in_flight_at: Counter[int] = Counter()
+    open_at: dict[str, Counter[int]] = {"in_flight": Counter(), "cut_off": Counter()}
     without_node = 0
     for (camera, session), frames in sorted(contents.frames.items()):
-        contradicting: set[int] = set()
+        contradicting: dict[int, list[str]] = {}
+        node_wrote = any(contents.histories.all[number].node for number in set(frames.values()))
         for number, count in Counter(frames.values()).items():
             history, (counts, contradictions) = contents.histories.all[number], evaluated[number]
-            if has_node_ledger and camera not in contents.accepted and not history.node:
-                for reason, copies in _refusals(history).items():
+            refusals = _refusals(history)
+            only_refused = node_wrote and refusals.total() == history.emulator.total() + history.edge.total()
+            if not history.node and (only_refused or (has_node_ledger and camera not in contents.accepted)):
+                for reason, copies in refusals.items():
                     accounting.unknown_origin[reason] += copies * count
                 continue
             accounting.add(camera, counts, count)
-            without_node += count * (not history.node)
-            in_flight_at[history.last_file] += counts.in_flight * count
-            accounting.contradiction_count += len(contradictions) * count
+            if not history.node:
+                without_node += count
+                if node_wrote:
+                    contradictions = [*contradictions, "arrived, but its node wrote nothing about it"]
+            open_at["in_flight"][history.last_file] += counts.in_flight * count
             if contradictions:
-                contradicting.add(number)
-        listed = accounting.contradictions
-        if contradicting and len(listed) < _MAX_LISTED:
-            for sequence in sorted(s for s, number in frames.items() if number in contradicting):
-                lines = [f"{camera} {session} {sequence}: {c}" for c in evaluated[frames[sequence]][1]]
-                listed += lines[: _MAX_LISTED - len(listed)]
+                contradicting |= dict.fromkeys(
+                    (s for s, other in frames.items() if other == number), contradictions
+                )
+            unsent, copies = counts.without_end
+            if unsent <= 0 and copies <= 0:
+                continue
+            newest = max(frames)
+            for sequence in [s for s, other in frames.items() if other == number]:
+                near = contents.near_end.get((camera, session, sequence), 0)
+                if unsent > 0 and sequence == newest and near & 1 and not history.last_role:
+                    accounting.add(camera, FrameCounts(waiting=unsent))
+                elif copies > 0 and near >> history.last_role:
+                    accounting.add(camera, FrameCounts(cut_off=copies))
+                    open_at["cut_off"][history.last_file] += copies
+                else:
+                    what = f"the end of {copies} sent copies" if copies > 0 else "what became of the capture"
+                    contradicting[sequence] = [*contradictions, f"{what} is in no ledger"]
+        accounting.contradiction_count += sum(map(len, contradicting.values()))
+        for sequence, found in sorted(contradicting.items()):
+            room = _MAX_LISTED - len(accounting.contradictions)
+            accounting.contradictions += [f"{camera} {session} {sequence}: {c}" for c in found[:room]]
+            if room <= 0:
+                break
     for camera, refusals in contents.garbled.items():
         if has_node_ledger:
             accounting.unknown_origin.update(refusals)
@@ -250,22 +312,55 @@ def account_frames(out: Path) -> FrameAccounting:
             count = refusals.total()
             accounting.add(camera, FrameCounts(captured=count, sent=count, rejected=refusals))
             without_node += count
+    if ledgers and not any(ledger.role == "edge" for ledger in ledgers):
+        notes.append("no edge's ledger here: what the edge took has no end")
     if without_node:
         notes.append(f"{without_node} frames have no node's ledger here: counted as captured and sent")
     if accounting.unknown_origin:
         count = accounting.unknown_origin.total()
         notes.append(f"{count} frames of unknown origin were refused: counted apart")
-    for number, copies in sorted(in_flight_at.items()):
-        if copies:
-            notes.append(f"{copies} in flight, last written by {ledgers[number].path.name}")
+    for what, at in open_at.items():
+        for number, copies in sorted(at.items()):
+            if copies:
+                state = what.replace("_", " ")
+                notes.append(f"{copies} {state}, last written by {ledgers[number].path.name}")
     return accounting
 
 
-def _read_ledger(contents: _LedgerContents, number: int, ledger: LedgerReader) -> list[str]:
-    """Read ledger ``number`` into ``contents``; returns notes."""
-    role, name, notes = ledger.role, ledger.path.name, []
+def _without_a_line(path: Path) -> bool:
+    """Whether a process was killed before its first line was complete: it wrote about no frame either."""
+    try:
+        with path.open("rb") as file:
+            return not file.readline(1 << 16).endswith(b"\n")
+    except OSError:
+        return False
+
+
+def _cut_off_ends(ledgers: Sequence[LedgerReader]) -> list[tuple[int, int, int]]:
+    """(number of the role, first and last instant of its last moments) of each ledger without ``closed``."""
+    ends = []
+    for ledger in ledgers:
+        try:
+            last = ledger.last()
+        except OSError:
+            continue
+        if last is not None and last.event != "closed" and ledger.role in _ROLES:
+            ends.append((_ROLES.index(ledger.role), last.t_ns - CUT_OFF_NS, last.t_ns + CUT_OFF_NS))
+    return ends
+
+
+def _read_ledger(
+    contents: _LedgerContents,
+    number: int,
+    ledger: LedgerReader,
+    ends: Sequence[tuple[int, int, int]],
+    accounting: FrameAccounting,
+) -> None:
+    """Read ledger ``number`` into ``contents``, what is missing into ``accounting``. ends: of
+    ``_cut_off_ends``."""
+    role, name, notes = ledger.role, ledger.path.name, accounting.notes
     known = _EVENTS.get(role, set())
-    after, lost = contents.histories.after, 0
+    after, lost, lost_at_end = contents.histories.after, 0, 0
     try:
         complete, closed = ledger.complete, ledger.closed
         for e in ledger:
@@ -283,19 +378,29 @@ def _read_ledger(contents: _LedgerContents, number: int, ledger: LedgerReader) -
                     contents.accepted.add(e.camera)
                 frames = contents.frames.setdefault((e.camera, e.session), {})
                 frames[e.sequence] = after(frames.get(e.sequence, 0), role, event, number, complete)
+                for ended, first_ns, last_ns in ends:
+                    if first_ns <= e.t_ns <= last_ns:
+                        frame = (e.camera, e.session, e.sequence)
+                        contents.near_end[frame] = contents.near_end.get(frame, 0) | 1 << ended
             elif event == "lost_lines":
                 lost += int(e.detail) if e.detail.isdecimal() else 1
-            elif event != "closed":
+            elif event == "closed":
+                lost_at_end = int(e.detail) if e.detail.isdecimal() else 0
+            else:
                 contents.unknown_events[f"{role} event {event!r}"] += 1
     except OSError as error:
-        return [f"{name}: read in part: {error}"]
+        notes.append(f"{name}: read in part: {error}")
+        accounting.unreadable.append(name)
+        return
     if ledger.torn:
         notes.append(f"{name}: unreadable line left out (killed while writing, or a full disk)")
+    # A line written in part is lost to its writer and torn to its reader. What a kill cut off is not lost.
+    lost = max(lost, lost_at_end, ledger.torn - (ledger.unfinished and not closed))
+    accounting.lines_lost += lost
     if lost:
         notes.append(f"{name}: {lost} lines were lost while it could not be written (a full disk?)")
     if not closed:
         notes.append(f"{name}: not closed (killed, or still running)")
-    return notes
 
 
 def _refusals(history: _History) -> Counter[str]:
@@ -309,57 +414,40 @@ def _refusals(history: _History) -> Counter[str]:
 
 
 def _evaluate(history: _History) -> tuple[FrameCounts, list[str]]:
-    """The counts of one frame, and what cannot be true about it."""
+    """The counts of one frame by what was written, and what cannot be true about it."""
     counts = FrameCounts()
     node, emulator, edge = history.node, history.emulator, history.edge
     contradictions = _node_contradictions(history)
     answers = {e.partition(":")[2]: n for e, n in node.items() if e.startswith("answered:")}
-    if not (node["sent"] or node["broken"] or answers or emulator or edge):
-        counts.captured += 1
-        counts.count_end("replaced" if node["replaced"] else "waiting")
-        return counts, contradictions
-
     arrived, forwarded = edge.total(), emulator["forwarded"]
     if node:
-        frames, handed = 1, max(1, node["sent"])
+        handed = node["sent"]
+        counts = FrameCounts(node["captured"], node["replaced"], node["waiting"], min(1, handed))
     else:
         # No ledger here says how often it was sent: each arrival at the first known hop counts as one.
-        frames = handed = emulator["received"] or (1 if emulator else arrived)
+        handed = counts.captured = counts.sent = emulator["received"] or (1 if emulator else arrived)
+    counts.duplicated = handed - counts.sent + emulator["duplicated"]
     copies = handed + emulator["duplicated"]
     if arrived > copies:
         contradictions.append(f"reached the edge {arrived} times but only {copies} copies were made")
-        copies = arrived
     if emulator and arrived > forwarded and "emulator" not in history.incomplete:
         contradictions.append(f"reached the edge {arrived} times but was forwarded {forwarded} times")
     if emulator["received"] > handed:
         contradictions.append(f"received {emulator['received']} times but sent {handed} times")
-
-    counts.captured += frames
-    counts.sent += frames
-    counts.duplicated += copies - frames
-    left = copies
-    for end, count in edge.items():
-        counts.count_end(end, count)
-        left -= count
     ends = {e: n for e, n in emulator.items() if _is_end(e)}
-    for end, count in ends.items():
-        counted = min(count, left)
-        counts.count_end(end, counted)
-        left -= counted
-        if counted < count:
-            contradictions.append(f"{end} {count} times at the emulator, with {counted} copies left to end")
     if forwarded + sum(ends.values()) > copies:
         contradictions.append(
             f"{copies} copies, but {forwarded} forwarded and {sum(ends.values())} ended before"
         )
+    for end, count in [*edge.items(), *ends.items()]:
+        counts.count_end(end, count)
     for answer, count in answers.items():
         if _is_end(answer):
-            counted = min(count, left)
-            counts.count_end(answer, counted)
-            left -= counted
-    broken = min(left, emulator["broken"] or node["broken"])
-    counts.count_end("broken", broken)
-    counts.count_end("in_flight", left - broken)
+            counts.count_end(answer, min(count, max(0, counts.without_end[1])))
+    broken = emulator["broken"] or node["broken"]
+    counts.count_end("broken", min(broken, max(0, counts.without_end[1])))
+    if (excess := -counts.without_end[1]) > 0 and not contradictions:
+        contradictions.append(f"{excess} ends more than copies")
     return counts, contradictions
 
 

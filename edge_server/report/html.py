@@ -7,6 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from edge_server.fidelity.scorer import SELECTED
+from freshfield.scenario import NOTHING_HELD_OUT
+
 Report = dict[str, Any]
 
 _STYLE = """
@@ -40,7 +43,7 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
     sections = [
         _head(report),
         _tiles(report),
-        _section("Rendering of a held-out view", _figure(figures, "comparison"), _fidelity_table(report)),
+        _section(f"Rendering of {_views(report)}", _figure(figures, "comparison"), _fidelity_table(report)),
         _section("Fidelity over time", _figure(figures, "fidelity")),
         _section("Mesh", _mesh_table(report)),
         _section("Age", _figure(figures, "ages"), _details("By camera", _age_table(report))),
@@ -57,6 +60,11 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
         f"<title>{title}: report</title><style>{_STYLE}</style></head>"
         f"<body><main>{''.join(sections)}</main></body></html>\n"
     )
+
+
+def _views(report: Report) -> str:
+    """The views that every fidelity of the report is on."""
+    return NOTHING_HELD_OUT if SELECTED in report["fidelity"]["scored_on"] else "a held-out view"
 
 
 def _head(report: Report) -> str:
@@ -86,12 +94,13 @@ def _tiles(report: Report) -> str:
     if final["perceptual"] is not None:
         similarity.append((_n(final["perceptual"], 3), "perceptual (not LPIPS)"))
     if report["kind"] == "fit":
-        return _tile_row([(_n(final["psnr_db"], 1, " dB"), "PSNR at the end"), *similarity])
+        what = f"PSNR at the end, of {_views(report)}"
+        return _tile_row([(_n(final["psnr_db"], 1, " dB"), what), *similarity])
     shown = report["fidelity"]["shown"]
     tiles = [(shown, "PSNR of what was shown")] if shown["psnr_db"] is not None else []
     return _tile_row([
         *((_n(found[key], 1, " dB"), f"{what}{where}, last fifth of the run")
-          for found, what in [*tiles, (final, "PSNR at publication")]
+          for found, what in [*tiles, (final, f"PSNR at publication, of {_views(report)}")]
           for key, where in (("psnr_db", ""), ("psnr_moving_db", " where the scene moves"))),
         *similarity,
         (_n(age["mean"], 0, " ms"), f"mean age (95 %: {_n(age['p95'], 0)} ms)"),
@@ -124,7 +133,7 @@ def _fidelity_table(report: Report) -> str:
     for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean color")):
         rows.append([label, _n(found["baseline"][name], 2), *[""] * (len(metrics) - 1)])
     remarks = []
-    if found["scored_on"] == ["selected"]:
+    if SELECTED in found["scored_on"]:
         remarks.append("No camera is held out: scored on the selected views themselves (6.21-6.22).")
     elif found["scored_on"]:
         remarks.append(f"Held out: {', '.join(found['scored_on'])}.")
@@ -195,7 +204,8 @@ def _frames_table(report: Report) -> str:
         ("lost", "lost by the channel"),
         ("broken", "its stream ended on the way"),
         ("delivered", "in the edge's buffer, or the held-out truth"),
-        ("in_flight", "sent; no process recorded its end"),
+        ("in_flight", "inside the link when the emulator ended"),
+        ("cut_off", "sent; held by a process that was killed or still runs"),
     ]
     rows = [["frames", "", ""]]
     rows += [
@@ -210,7 +220,7 @@ def _frames_table(report: Report) -> str:
     result = (
         "<p class=ok>Every frame is accounted for."
         if f["closes"]
-        else "<p class=bad>The counts of frames do not add up."
+        else f"<p class=bad>Not every frame is accounted for: {escape('; '.join(f['doubts']))}."
     )
     if count := f["contradiction_count"]:
         result += f" <span class=bad>The ledgers contradict each other on {count} frames:</span></p><ul>"
@@ -225,7 +235,7 @@ def _frames_table(report: Report) -> str:
 
 def _frames_by_camera(report: Report) -> str:
     names = ("captured", "replaced", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
-             "delivered", "in_flight")  # fmt: skip
+             "delivered", "in_flight", "cut_off")  # fmt: skip
     rows = [["camera", *(n.replace("_", " ") for n in names), "rejected"]]
     by_camera = report["frames"]["by_camera"] if report["frames"] is not None else {}
     for camera, f in by_camera.items():

@@ -19,6 +19,7 @@ from freshfield.v1 import frames_pb2 as pb
 _ID = re.compile(rf"[A-Za-z0-9._-]{{1,{limits.MAX_ID_CHARS}}}")
 _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
 CODEC_NAMES = {number: name for name, number in _CODECS.items()}
+_UINT32 = 0xFFFFFFFF  # an enum on the wire may be negative
 _PACKED = struct.Struct("<QqqqqIIII7d8d")
 
 
@@ -70,7 +71,7 @@ def checksum(header: pb.FrameHeader, data: bytes) -> int:
     p, k = header.pose, header.intrinsics
     packed = _PACKED.pack(
         header.sequence, header.generated_ns, header.clock_offset_ns, header.clock_uncertainty_ns,
-        header.pose_gap_ns, header.codec, header.width, header.height, header.role,
+        header.pose_gap_ns, header.codec & _UINT32, header.width, header.height, header.role & _UINT32,
         p.qw, p.qx, p.qy, p.qz, p.tx_m, p.ty_m, p.tz_m,
         k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2,
     )  # fmt: skip

@@ -11,12 +11,13 @@ writes the event ``closed`` with empty camera, and as detail how many lines were
 ``lost_lines``, with a count as detail and empty camera, stands where lines are missing.
 
 Events. Node: ``captured``; then ``replaced`` (a newer frame took its place before it was sent) or ``sent``
-(handed to the stream; a frame neither replaced nor sent was ``waiting`` when the node ended);
+(handed to the stream), or ``waiting`` (for its turn when the node ended in order);
 ``broken`` (its stream ended before the frame was acknowledged: it may or may not have arrived, what later
 processes wrote decides); ``answered`` with the outcome as detail. Emulator: ``received``; then one of
 ``skipped``, ``dropped_busy``, ``superseded``, ``lost``, ``rejected`` (detail: reason), ``forwarded`` (handed
 to the upstream stream; a second ``forwarded`` is a duplicate's copy, announced by ``duplicated``),
-``broken`` (upstream was gone). Edge: ``delivered`` or ``rejected`` (detail: reason), once per arriving copy.
+``broken`` (upstream was gone), ``in_flight`` (inside the link when the emulator ended in order).
+Edge: ``delivered`` or ``rejected`` (detail: reason), once per arriving copy.
 """
 
 from __future__ import annotations
@@ -93,13 +94,15 @@ class Ledger:
 class LedgerReader:
     """One ledger. Iterating, once or again, reads a line at a time, so that its length takes no memory.
 
-    torn: whether an iteration left out a line, the last one or any other, that could not be read.
+    torn: how many lines the last iteration left out because they could not be read. unfinished: whether one
+        of them was the last, without its newline: what a process that was killed had begun to write.
     Raises ValueError if the file is not a ledger of this version, OSError if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.torn = False
+        self.torn = 0
+        self.unfinished = False
         with path.open("rb") as file:
             head = file.readline(_HEAD_BYTES)
             self._body = file.tell()
@@ -113,12 +116,14 @@ class LedgerReader:
         self.role, self.name, self.pid = fields[2], fields[3], int(fields[4])
 
     def __iter__(self) -> Iterator[Event]:
+        self.torn, self.unfinished = 0, False
         with self.path.open("rb") as file:
             file.seek(self._body)
             for line in file:
                 event = _parse(line)
                 if event is None:
-                    self.torn = True
+                    self.torn += 1
+                    self.unfinished = not line.endswith(b"\n")
                 else:
                     yield event
 

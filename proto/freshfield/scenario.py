@@ -32,6 +32,8 @@ from freshfield.frame import valid_id
 from freshfield.limits import MAX_CAMERAS
 
 PHASES = ("locked", "spread")
+# What every fidelity of a run without held-out cameras is called: on page, report, console and in metrics.
+NOTHING_HELD_OUT = "training views, nothing is held out"
 T = TypeVar("T")
 _HERE = Path(__file__).resolve()
 _CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"

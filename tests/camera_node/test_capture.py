@@ -61,6 +61,23 @@ def frame(sequence: int) -> Frame:
     return Frame("cam", "s", sequence, 0, POSE, LENS, "jpeg", b"")
 
 
+def test_an_outbox_that_closes_says_what_still_waits(tmp_path):
+    async def scene():
+        book = ledger.Ledger(tmp_path, "node", "cam", 1)
+        for camera, taken in (("a", False), ("b", True)):
+            box = Outbox(camera, "s", book, VirtualClock(5))
+            box.put(frame(7))
+            if taken:
+                box.take()
+            box.close()
+
+    asyncio.run(scene())
+    (file,) = ledger.read_all(tmp_path)
+    assert [(e.camera, e.sequence, e.event) for e in file.events] == [
+        ("a", 7, "captured"), ("a", 7, "waiting"), ("b", 7, "captured"), ("b", 7, "sent"),
+    ]  # fmt: skip
+
+
 def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
     async def scene():
         book = ledger.Ledger(tmp_path, "node", "cam", 1)

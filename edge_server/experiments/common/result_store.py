@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +67,8 @@ class ResultStore:
             self._lines.close()
 
     def find(self, *path: str, settings: Mapping[str, Any] | None = None) -> Result | None:
-        """The result at ``path`` if it is there, whole, and was computed with the same settings."""
+        """The result at ``path`` if it is there, whole, and was computed with the same settings on the same
+        kind of processor."""
         found: Any = self.results
         for name in path:
             found = found.get(name) if isinstance(found, dict) else None
@@ -103,8 +106,17 @@ class ResultStore:
 
 
 def content_key(parts: Any, length: int = 16) -> str:
-    """A key of everything that decides a result: JSON values, in any order of their names."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:length]
+    """A key of everything that decides a result: JSON values, in any order of their names, and the processor
+    this runs on. Compiled kernels use what it has, and another kind rounds other last bits."""
+    return hashlib.sha256(json.dumps([processor(), parts], sort_keys=True).encode()).hexdigest()[:length]
+
+
+@cache
+def processor() -> str:
+    """The kind of processor that kernels are compiled for."""
+    import llvmlite.binding as llvm  # what numba compiles with
+
+    return f"{platform.machine()} {llvm.get_host_cpu_name()}"
 
 
 def settings_digest(name: str, options: Mapping[str, Any] | None = None) -> str:
@@ -114,8 +126,8 @@ def settings_digest(name: str, options: Mapping[str, Any] | None = None) -> str:
 
 
 def _as_json(settings: Mapping[str, Any] | None) -> Any:
-    """As they come back from a file: lists for tuples."""
-    return json.loads(json.dumps(settings))
+    """As they come back from a file, lists for tuples, with the processor."""
+    return None if settings is None else json.loads(json.dumps({**settings, "processor": processor()}))
 
 
 def _append(lines: Lines, path: tuple[str, ...], result: Result) -> None:

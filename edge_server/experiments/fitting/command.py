@@ -25,12 +25,13 @@ from edge_server.experiments.scenes.recorded import Recorded, load_recorded
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import write_json
 from freshfield.machine_load import LoadMeter, outside_cores
+from freshfield.scenario import NOTHING_HELD_OUT
 
 DESCRIPTION = """\
 Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
@@ -253,10 +254,10 @@ class _Run:
                 "truth_gap_ms": None,
                 "steps": at.steps,
                 "loss": at.loss,
-                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else "selected",
+                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
             }
         )
-        print(progress_line(at, outside), flush=True)
+        print(progress_line(at, outside, bool(self.data.held_out)), flush=True)
 
     def finish(self) -> dict[str, Any]:
         """Write checkpoint, images and report; returns report.json."""
@@ -313,11 +314,11 @@ class _Run:
         return f"fit {_data_name(self.request.data)}"
 
 
-def progress_line(at: Scored, outside: float | None) -> str:
+def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> str:
     """One line for people: time, steps, scores and how many cores others kept busy."""
     score = at.score
     words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
-    words.append(f"PSNR {score.psnr_db:5.2f} dB")
+    words.append(f"PSNR {score.psnr_db:5.2f} dB" + (f" on {NOTHING_HELD_OUT}" if not held_out else ""))
     words += [f"SSIM {score.ssim:.3f}"] if score.ssim is not None else []
     words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
     words += [f"(others used {outside:.1f} cores)"] if outside is not None else []

@@ -1,7 +1,8 @@
 """Runs trials without stored results: serially, in local processes, or on a Ray cluster.
 
 A trial's result depends only on the trial, not on the backend or order; a test compares the three backends.
-FOLDER/results.jsonl stores results by content: the trial, the program's own source and the data set.
+FOLDER/results.jsonl stores results by content: the trial, the program's own source, the data set and the kind
+of processor.
 After Ctrl-C the same command resumes.
 """
 
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.result_store import ResultStore
+from edge_server.experiments.common.result_store import ResultStore, processor
 from edge_server.experiments.common.result_store import content_key as key_of
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.worker import end_at_once, init_worker
@@ -40,8 +41,13 @@ Task = list[dict[str, Any]]
 """Trials with the same images, as mappings; sent to a process or machine."""
 
 
-def run_task(task: Task, folders: Folders) -> list[Row]:
-    """Return the results of a task's trials, in order. Every backend runs this function."""
+def run_task(task: Task, folders: Folders, kind: str | None = None) -> list[Row]:
+    """Return the results of a task's trials, in order. Every backend runs this function. kind: of processor
+    that they are stored for; StudyError on another."""
+    if kind is not None and kind != processor():
+        raise StudyError(
+            f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor"
+        )
     if folders.lpips is not None:
         import torch
 
@@ -124,8 +130,10 @@ class Engine:
         assert self.ray is not None
         if not ray.is_initialized():
             _start_ray(ray, self.ray)
-        remote = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
-        running = {remote.remote(mappings, self.folders): task for task, mappings in zip(tasks, sent)}
+        remote: Any = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
+        running = {
+            remote.remote(mappings, self.folders, processor()): task for task, mappings in zip(tasks, sent)
+        }
         try:
             while running:
                 finished, _ = ray.wait(list(running), num_returns=1)

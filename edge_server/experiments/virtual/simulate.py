@@ -17,6 +17,7 @@ import numpy as np
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
+from edge_server.experiments.common.result_store import processor
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
@@ -39,7 +40,8 @@ Cameras, emulated network, buffer, policy and field of a scenario in virtual tim
 The parts are the live ones, faults included; only the clock differs. An update spends a number of optimiser
 steps, and virtual time is charged for them: zero, as the thesis does, or ms a step and ms an update
 (edge.compute of the scenario, or --compute; edge-server frontier measures what a machine takes). One seed,
-one result: the digest that is printed is of every publication and of the field's parameters.
+one result on one kind of processor: the digest that is printed is of every publication and of the field's
+parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
 _SHOWN_EVERY_MS = 100.0  # where every publication is scored
@@ -125,6 +127,7 @@ def summary(
         "update_ms": mean_or_none([p.update_ms for p in publications]),
         "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
         "digest": digest(deployment),
+        "processor": processor(),
         "versions": versions(),
     }
 
@@ -166,7 +169,7 @@ def show(found: dict[str, Any]) -> str:
         ),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
-        f"  digest      {found['digest'][:32]}",
+        f"  digest      {found['digest'][:32]} on {found['processor']}",
     ]
     return "\n".join(lines)
 

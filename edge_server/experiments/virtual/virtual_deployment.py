@@ -9,9 +9,10 @@ no result, because nothing reads a frame before.
 from __future__ import annotations
 
 import dataclasses
+import heapq
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -29,6 +30,7 @@ from edge_server.live.buffer import BufferedFrame
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
+from edge_server.scheduler.policy import Policy
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
@@ -151,8 +153,13 @@ class VirtualDeployment:
         self.rejected: Counter[str] = Counter()
         self.failed: Counter[str] = Counter()
         """Captures that a source could not give, by camera; noticed when a decision wanted them."""
+        self.next_policy: Policy | None = None
+        """Takes the policy's place at the next decision, as live."""
+        self.session = SESSION
+        """Of the frames captured from now on."""
         self._on_published = on_published
-        self._origin_ns = updates.start_ns  # of the channel and of the cameras' ticks
+        self._origin_ns = updates.start_ns  # of the cameras' ticks
+        self._channel_origin_ns = updates.start_ns
         self._cameras = {camera.name: camera for camera in cameras}
         if tuple(self._cameras) != updates.buffer.cameras:
             raise ValueError("the cameras and the buffer's are not the same, or in another order")
@@ -172,29 +179,37 @@ class VirtualDeployment:
         self._show_ns = next(self._instants)
         self.decided_ns = updates.start_ns
         """Instant of the decision that is being carried out, or was last."""
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
         self._edge = self._run_edge()
         self._wake = next(self._edge)
+
+    def at(self, at_ns: int, action: Callable[[], None]) -> None:
+        """Call ``action`` at an instant of the clock, before all else that happens then."""
+        heapq.heappush(self._agenda, (at_ns, next(self._order), action))
 
     def run(self, seconds: float) -> list[Publication]:
         """Go on for ``seconds`` of virtual time; returns the publications of that time."""
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         known = len(self.publications)
         while True:
-            due_ns = self._origin_ns + min(link.next_event_ns for link in self._links.values())
+            due_ns, wake_ns = self._link_event_ns(), self._wake_ns()
             capture_ns = min(self._due_ns(name) for name in self._cameras)
-            now_ns = min(due_ns, capture_ns, self._wake.at_ns, self._show_ns)
+            action_ns = self._agenda[0][0] if self._agenda else NEVER_NS
+            now_ns = min(action_ns, due_ns, capture_ns, wake_ns, self._show_ns)
             if now_ns > end_ns:
                 break
             self.clock.advance_to(now_ns)
             # At one instant links complete first, which makes room for captures; a decision sees both.
-            if due_ns == now_ns:
-                for link in self._links.values():
-                    self._take(link.advance(now_ns - self._origin_ns))
+            if action_ns == now_ns:
+                heapq.heappop(self._agenda)[2]()
+            elif due_ns == now_ns:
+                self._advance_links(now_ns)
             elif capture_ns == now_ns:
                 for name in self._cameras:
                     if self._due_ns(name) == now_ns:
                         self._capture(name, now_ns)
-            elif self._wake.at_ns == now_ns:
+            elif wake_ns == now_ns:
                 self._wake = next(self._edge)
             else:
                 self._score_shown(now_ns)
@@ -243,6 +258,16 @@ class VirtualDeployment:
 
     # --- cameras and channel --------------------------------------------------------------------------
 
+    def _link_event_ns(self) -> int:
+        """Instant of the next event of a link."""
+        return self._channel_origin_ns + min(
+            (k.next_event_ns for k in self._links.values()), default=NEVER_NS
+        )
+
+    def _wake_ns(self) -> int:
+        """Instant at which the edge's loop goes on, if nothing arrives before."""
+        return self._wake.at_ns
+
     def _due_ns(self, name: str) -> int:
         """Instant of a camera's next capture."""
         return self._origin_ns + self._due[name](self._tick[name])
@@ -250,22 +275,35 @@ class VirtualDeployment:
     def _capture(self, name: str, now_ns: int) -> None:
         camera, tick = self._cameras[name], self._tick[name]
         self._tick[name] = tick + 1
-        stamped_ns = self._node_clocks[name].stamp_ns(now_ns)
+        stamped_ns, offset_ns = self._stamp(name, now_ns)
         frame = Frame(
             camera=name,
-            session=SESSION,
+            session=self.session,
             sequence=tick,
             generated_ns=stamped_ns,
             pose=_NO_POSE,
             intrinsics=camera.source.intrinsics,
             codec=camera.codec,
             payload=b"",
-            # A clock exchange that takes no time knows the offset exactly.
-            clock_offset_ns=now_ns - stamped_ns,
+            clock_offset_ns=offset_ns,
         )
-        size = len(self._with_image(frame).payload) if self._weigh else 0
         self.captured[name] += 1
-        self._take(self._links[name].offer(now_ns - self._origin_ns, frame, size)[1])
+        self._send(frame, now_ns)
+
+    def _stamp(self, name: str, now_ns: int) -> tuple[int, int]:
+        """What a camera's clock shows, and the node's estimate of the edge's clock minus that one: a clock
+        exchange that takes no time knows it exactly."""
+        stamped_ns = self._node_clocks[name].stamp_ns(now_ns)
+        return stamped_ns, now_ns - stamped_ns
+
+    def _send(self, frame: Frame, now_ns: int) -> None:
+        """Offer a frame to its link."""
+        size = len(self._with_image(frame).payload) if self._weigh else 0
+        self._take(self._links[frame.camera].offer(now_ns - self._channel_origin_ns, frame, size)[1])
+
+    def _advance_links(self, now_ns: int) -> None:
+        for link in self._links.values():
+            self._take(link.advance(now_ns - self._channel_origin_ns))
 
     def _take(self, events: Sequence[Event]) -> None:
         for event in events:
@@ -275,9 +313,10 @@ class VirtualDeployment:
     def _flush(self, now_ns: int) -> None:
         """Abort transmissions (thesis 6.5: nothing is considered to be in transit)."""
         for link in self._links.values():
-            self._take(link.flush(now_ns - self._origin_ns))
+            self._take(link.flush(now_ns - self._channel_origin_ns))
 
-    def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> None:
+    def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> str | None:
+        """A frame arrives at the edge; the reason if it is refused."""
         now_ns = self.clock.now_ns()
         try:
             if flips:
@@ -291,14 +330,17 @@ class VirtualDeployment:
             self._admission.admit(frame, now_ns)
         except FrameRejected as error:
             self.rejected[error.reason] += 1
-            return
+            return error.reason
         self.delivered[frame.camera] += 1
         self.updates.buffer.put(frame, now_ns)
         if self._wake.on_arrival:
             self._wake = WakeCondition(now_ns)
+        return None
 
     def _with_image(self, frame: Frame) -> Frame:
-        """The frame with its image and pose, made now."""
+        """The frame with its image and pose, made now unless it came with them."""
+        if frame.payload:
+            return frame
         shot = self._cameras[frame.camera].capture(frame.sequence)
         return dataclasses.replace(
             frame,
@@ -310,7 +352,7 @@ class VirtualDeployment:
 
     # --- the edge -------------------------------------------------------------------------------------
 
-    def _run_edge(self) -> Iterator[WakeCondition]:
+    def _run_edge(self) -> Generator[WakeCondition, None, None]:
         """The edge's loop; it yields when it wants to go on."""
         updates, settings = self.updates, self.settings
         steps = settings.first_steps or settings.steps
@@ -319,6 +361,8 @@ class VirtualDeployment:
         else:  # with the cameras that have reported by then: the instants are given
             yield WakeCondition(self._origin_ns + round(settings.first_ms * 1e6))
         while True:
+            if self.next_policy is not None:
+                updates.policy, self.next_policy = self.next_policy, None
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
             if plan.flush:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
+from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState
 
@@ -46,9 +47,10 @@ class EdgeCollector:
         yield GaugeMetricFamily("freshfield_update_seconds", "last update", value=last.update_ms / 1e3)
         yield GaugeMetricFamily("freshfield_aaoi_seconds", "mean age of selection", value=last.aaoi_ms / 1e3)
         yield GaugeMetricFamily("freshfield_selected_views", "views used last", value=len(last.selected))
+        about = fidelity_title([scored.scored_on if scored else None])
         for name in ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual"):
             if (value := getattr(scored, name, None)) is not None:
-                yield GaugeMetricFamily(f"freshfield_{name}", "fidelity at the present", value=value)
+                yield GaugeMetricFamily(f"freshfield_{name}", about, value=value)
 
 
 def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:

@@ -34,7 +34,7 @@ def test_what_comes_from_outside_is_escaped():
     pages = [
         markup.status(summary(scenario=evil, field=evil, doing=evil, scored_on=evil, condition="live")),
         markup.table([camera]),
-        markup.comparison_caption(evil, None, 0),
+        markup.comparison_caption(evil, None, 0, True),
         markup.chart_caption(evil, [(evil, (0, 0, 0))]),
         markup.chart_caption("", [], evil),
         markup.note(evil),

@@ -5,13 +5,12 @@ its decision (``subtract_sibling_baseline``), which reduces the variance of the 
 
 The seed decides everything: episodes by their numbers, actions by the learner's own stream, rewards by the
 field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from its
-last checkpoint.
+last checkpoint, on the same kind of processor.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import choice_of_action
 from edge_server.experiments.training.scheduler.episode import DecisionPoint, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
@@ -255,7 +255,8 @@ class _Checkpoint:
             raise TrainingError(f"{path}: damaged: choose another --out, or delete it") from None
         if key != self.key:
             raise TrainingError(
-                f"{self.out} holds a training with other settings: choose another --out, or delete it"
+                f"{self.out} holds a training with other settings or of another kind of processor: "
+                "choose another --out, or delete it"
             )
         try:
             lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
@@ -278,8 +279,7 @@ class _Checkpoint:
 def _settings_key(setting: Setting, config: TrainingConfig) -> str:
     settings = dataclasses.asdict(config)
     settings.pop("checkpoint_every")  # decides when the disk is written, not what is learned
-    text = json.dumps([setting.key, settings], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
+    return content_key(json.dumps([setting.key, settings], sort_keys=True, default=str), 24)
 
 
 def _progress_text(config: TrainingConfig, row: Row) -> str:

@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+from edge_server.experiments.common import result_store
 from edge_server.experiments.common.result_store import Interrupted, ResultStore, content_key
 from edge_server.experiments.common.tables import markdown_table, number, write_csv
 
@@ -18,8 +19,9 @@ def never():
 def test_a_known_result_of_the_same_settings_is_not_computed_again():
     saved = []
     store = ResultStore({}, lambda path, result: saved.append((path, dict(result))))
+    about = {"seconds": [1.0, 2.0], "processor": result_store.processor()}
     first = store.get("room", "ngp", compute=lambda: {"db": 20.0}, settings={"seconds": (1.0, 2.0)})
-    assert store.results == {"room": {"ngp": {"db": 20.0, "settings": {"seconds": [1.0, 2.0]}}}}
+    assert store.results == {"room": {"ngp": {"db": 20.0, "settings": about}}}
     assert saved == [(("room", "ngp"), first)]
     again = ResultStore(json.loads(json.dumps(store.results)))
     assert again.get("room", "ngp", compute=never, settings={"seconds": (1.0, 2.0)}) == first
@@ -60,6 +62,15 @@ def test_a_content_key_is_of_the_content_and_not_of_its_order():
         content_key({"a": 1, "b": [2]}) == content_key({"b": [2], "a": 1}) != content_key({"a": 1, "b": [3]})
     )
     assert len(content_key([], 40)) == 40
+
+
+def test_results_of_another_kind_of_processor_are_not_taken_for_known(monkeypatch):
+    store, settings = ResultStore(), {"steps": 3}
+    key = content_key([settings])
+    store.get("a", compute=dict, settings=settings)
+    assert store.find("a", settings=settings) is not None
+    monkeypatch.setattr(result_store, "processor", lambda: "x86_64 haswell")
+    assert content_key([settings]) != key and store.find("a", settings=settings) is None
 
 
 def test_tables_hold_every_row_and_what_is_missing_stays_empty(tmp_path):

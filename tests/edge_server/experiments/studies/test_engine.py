@@ -147,6 +147,11 @@ def test_the_key_is_of_all_that_decides(tmp_path: Path):
     assert content_key(TRIAL, NO_DATA) == content_key(replace(TRIAL), NO_DATA)
 
 
+def test_a_task_of_another_kind_of_processor_is_refused():
+    with pytest.raises(StudyError, match="other last bits than x86_64 pentium"):
+        run_task([TRIAL.mapping()], NO_DATA, "x86_64 pentium")
+
+
 def test_pictures_are_of_the_trial(tmp_path: Path):
     truth, shown, row = last_images(TRIAL, NO_DATA)
     assert truth.shape == shown.shape == (24, 24, 3)

@@ -1,0 +1,264 @@
+"""``edge-server chaos``: deployments in virtual time with faults from seeds; what must hold after each."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import logging
+import multiprocessing
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.common.arguments import at_least, command_parser
+from edge_server.experiments.common.result_store import ResultStore, content_key, processor
+from edge_server.experiments.common.source_digest import source_digest
+from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
+from edge_server.experiments.virtual.fault_plan import (
+    FAULTS_OVER_S,
+    QUEUE_LIMIT,
+    SECONDS,
+    Fault,
+    draw_faults,
+    scenario_of,
+)
+from edge_server.experiments.virtual.from_scenario import training_cameras
+from edge_server.experiments.virtual.simulate import digest
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
+from edge_server.report.frame_accounting import FrameCounts, account_frames
+from freshfield.limits import MAX_SESSIONS_PER_CAMERA
+from freshfield.machine_load import usable_cores
+
+DESCRIPTION = """\
+Run small deployments in virtual time, each with faults that its seed draws: processes that crash and stall,
+full disks, cameras that go away, clocks that step, hostile messages, policies switched, checkpoints resumed.
+
+  edge-server chaos --seeds 0..99 --jobs 2
+  edge-server chaos --seeds 0..9999 --out runs/chaos.jsonl     # resumes where it was stopped
+  edge-server chaos --seeds 17 --faults 2,5                    # one seed, only these of its faults
+
+After each run: every frame is accounted for as it really ended (ledgers against what happened), queues and
+memory are within their bounds, no number is NaN, every camera and the field are up to date again within 2 s
+of the last fault, and a second run has the same digest. Cameras that share one line may starve each other by
+its discipline: of these one must be up to date. For a seed that fails, its faults are reduced to those that
+it takes, and the command that repeats it is printed.
+"""
+_SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0,
+                        epoch_ms=100.0, score_every_ms=None)  # fmt: skip
+RECOVERY_S = 2.0
+# Of a link: in service, waiting and not sampled yet; a queue's limit may count the frame in service apart.
+_MOST_INSIDE = QUEUE_LIMIT + 2
+
+
+def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
+    """One seed, twice. only: numbers of its faults that happen; None: all.
+
+    Returns {seed, problems: one line each, faults, digest, recovery_ms, counts: of the ledgers' accounting}.
+    """
+    scenario = scenario_of(seed)
+    faults = [f for f in draw_faults(seed, scenario.training) if only is None or f.number in only]
+    found: dict[str, Any] = {"seed": seed, "faults": [str(f) for f in faults], "problems": []}
+    try:
+        first, second = _run(seed, faults), _run(seed, faults)
+    except Exception as error:  # a part of the program broke: that is what is looked for
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        found["problems"] = [f"{type(error).__name__} in {Path(place.filename).name}, {place.name}: {error}"]
+        return found
+    found |= first
+    if first["digest"] != second["digest"]:
+        found["problems"].append("a second run has another digest")
+    return found
+
+
+def _run(seed: int, faults: Sequence[Fault]) -> dict[str, Any]:
+    scenario = scenario_of(seed)
+    logging.getLogger("freshfield.files").setLevel(logging.ERROR)  # a full disk is one of the faults
+    with tempfile.TemporaryDirectory() as folder:
+        deployment = ChaosDeployment(scenario, training_cameras(scenario), _SETTINGS, faults, Path(folder))
+        deployment.run(SECONDS)
+        deployment.end()
+        account = account_frames(Path(folder))
+        recovery_ms = _recovery_ms(deployment, faults)
+        text = json.dumps([sorted(deployment.really.items()), account.as_dict()])
+        return {
+            "problems": [*_accounting(deployment, account), *_state(deployment), *_recovery(recovery_ms)],
+            "digest": hashlib.sha256((digest(deployment) + text).encode()).hexdigest(),
+            "recovery_ms": recovery_ms,
+            "counts": account.total.as_dict(),
+        }
+
+
+def _accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
+    """The ledgers' accounting against what really happened."""
+    if account.contradictions and not deployment.lines_lost:
+        yield f"contradiction: {account.contradictions[0]}"
+    if account.lines_lost > deployment.lines_lost:
+        yield f"{account.lines_lost} ledger lines lost, really {deployment.lines_lost}"
+    if deployment.lines_lost:
+        # A process that was killed with its disk full cannot say what it lost.
+        if account.lines_lost and not account.doubts:
+            yield f"{account.lines_lost} ledger lines were lost, and the account closes"
+        return
+    yield from account.doubts
+    truth = FrameCounts()
+    for what, count in deployment.really.items():
+        if what != "strangers":
+            truth.count_end(what, count)
+    if truth.as_dict() != account.total.as_dict():
+        wrong = [k for k, v in truth.as_dict().items() if v != account.total.as_dict()[k]]
+        about = ", ".join(f"{k} {account.total.as_dict()[k]} (really {truth.as_dict()[k]})" for k in wrong)
+        yield f"the ledgers say {about}"
+    if account.unknown_origin.total() != deployment.really["strangers"]:
+        yield f"strangers: {account.unknown_origin.total()} (really {deployment.really['strangers']})"
+
+
+def _state(deployment: ChaosDeployment) -> Iterator[str]:
+    """Bounds of queues and memory, and numbers that are none."""
+    if deployment.most_inside > _MOST_INSIDE:
+        yield f"{deployment.most_inside} frames inside a link, at most {_MOST_INSIDE} expected"
+    if deployment.damaged_admitted:
+        yield f"{deployment.damaged_admitted} frames with a wrong checksum were taken in"
+    sessions = max(len(s) for s in deployment._admission._sessions.values())
+    if sessions > MAX_SESSIONS_PER_CAMERA:
+        yield f"{sessions} sessions remembered of a camera, at most {MAX_SESSIONS_PER_CAMERA} expected"
+    held = max((len(frames) for frames in deployment._used.values()), default=0)
+    if held > 2:
+        yield f"{held} images kept of a camera, at most 2 expected"
+    for name, array in deployment.updates.field.state().items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            yield f"the field's {name} is not finite"
+    for publication in deployment.publications:
+        numbers = (publication.aaoi_ms, publication.loss or 0.0, *publication.ages_ms)
+        if not np.isfinite(numbers).all():
+            yield f"publication {publication.number}: a number is not finite"
+
+
+def _recovery_ms(deployment: ChaosDeployment, faults: Sequence[Fault]) -> float | None:
+    """From the end of the last fault until every camera has arrived again and the field was published anew;
+    None where that never happened. A clock that stepped back is behind for as long as it stepped."""
+    back_ms = max((-f.value for f in faults if f.kind == "clock_step"), default=0.0)
+    over_ms = max((f.at_ms + f.for_ms for f in faults), default=FAULTS_OVER_S * 1e3)
+    over_ns = round((over_ms + max(0.0, back_ms)) * 1e6)
+    arrivals = list(deployment.arrivals.values())
+    if deployment.shared:
+        arrivals = [sorted(at for each in arrivals for at in each)]
+    instants = [*arrivals, [p.published_ns for p in deployment.publications]]
+    again = [next((at for at in each if at >= over_ns), None) for each in instants]
+    known = [at for at in again if at is not None]
+    return (max(known) - over_ns) / 1e6 if len(known) == len(again) else None
+
+
+def _recovery(recovery_ms: float | None) -> Iterator[str]:
+    if recovery_ms is None or recovery_ms > RECOVERY_S * 1e3:
+        after = "never" if recovery_ms is None else f"only after {recovery_ms:.0f} ms"
+        yield f"cameras and field were {after} up to date again"
+
+
+def shrink(seed: int, numbers: Sequence[int], problem: str) -> list[int]:
+    """The faults that it takes for a seed to fail as it does: without any one of them it does not."""
+    kind = _kind(problem)
+    kept, size = list(numbers), len(numbers)
+    while size:
+        for start in range(0, len(kept), size):
+            fewer = kept[:start] + kept[start + size :]
+            if any(_kind(p) == kind for p in run_seed(seed, fewer)["problems"]):
+                kept = fewer
+                break
+        else:
+            size //= 2
+            continue
+        size = min(size, len(kept))
+    return kept
+
+
+def _kind(problem: str) -> str:
+    """A problem without its numbers."""
+    return "".join(c for c in problem.partition("(")[0] if not c.isdigit())[:40]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status: 1 where a seed fails."""
+    parser = command_parser("chaos", DESCRIPTION)
+    add = parser.add_argument
+    add("--seeds", type=_seeds, required=True, metavar="A..B", help="from A to B, or A alone")
+    add("--faults", type=_numbers, metavar="K,...", help="only these of the seeds' faults")
+    add("--jobs", type=at_least(1), default=1, metavar="N", help="processes [%(default)s]")
+    add("--out", type=Path, metavar="FILE", help="keep results in this file; known ones are not run again")
+    args = parser.parse_args(argv)
+    began, failed, slowest = time.monotonic(), 0, 0.0
+    store = ResultStore.in_lines(args.out) if args.out else ResultStore()
+    for number, found in enumerate(_results(args, store), 1):
+        slowest = max(slowest, found.get("recovery_ms") or 0.0)
+        if found["problems"]:
+            failed += 1
+            print(_failure(found, args.faults), flush=True)
+        if number % 100 == 0:
+            print(f"  {number} seeds, {failed} failed, {time.monotonic() - began:.0f} s", flush=True)
+    print(
+        f"{len(args.seeds)} seeds, {failed} failed; slowest recovery {slowest:.0f} ms; "
+        f"{time.monotonic() - began:.0f} s on {processor()}"
+    )
+    return 1 if failed else 0
+
+
+def _results(args: argparse.Namespace, store: ResultStore) -> Iterator[dict[str, Any]]:
+    """Each seed's result, in order; those that are not known are computed."""
+    keys = {seed: content_key([source_digest(), seed, args.faults]) for seed in args.seeds}
+    wanted = [seed for seed in args.seeds if store.find(keys[seed]) is None]
+    jobs = min(args.jobs, len(wanted))
+    spawn = multiprocessing.get_context("spawn")
+    share = (max(1, usable_cores() // max(1, jobs)),)
+    with ProcessPoolExecutor(jobs, spawn, init_worker, share) if jobs > 1 else nullcontext() as pool:
+        try:
+            each = map if pool is None else pool.map
+            computed = each(run_seed, wanted, [args.faults] * len(wanted))
+            for seed in args.seeds:
+                yield store.find(keys[seed]) or store.put(keys[seed], result=next(computed))
+        except BaseException:
+            if pool is not None:
+                end_at_once(pool)
+            raise
+
+
+def _failure(found: dict[str, Any], only: Sequence[int] | None) -> str:
+    """What is wrong with a seed, the faults that it takes, and the command that repeats it."""
+    seed, problems = found["seed"], found["problems"]
+    numbers = [
+        f.number for f in draw_faults(seed, scenario_of(seed).training) if only is None or f.number in only
+    ]
+    kept = shrink(seed, numbers, problems[0])
+    faults = [f"    {text}" for text in found["faults"] if int(text.partition(":")[0]) in kept]
+    words = ",".join(map(str, kept)) or "none"
+    return "\n".join([
+        f"seed {seed} fails:", *(f"  {problem}" for problem in problems),
+        f"  it takes {len(kept)} of its {len(numbers)} faults:", *faults,
+        f"  edge-server chaos --seeds {seed} --faults {words}",
+    ])  # fmt: skip
+
+
+def _seeds(text: str) -> range:
+    first, dots, last = text.partition("..")
+    if not first.isdigit() or (dots and not last.isdigit()) or int(last or first) < int(first):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected A..B, such as 0..99, or one seed")
+    return range(int(first), int(last or first) + 1)
+
+
+def _numbers(text: str) -> list[int]:
+    words = [] if text == "none" else text.split(",")
+    if not all(word.isdigit() for word in words):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected numbers of faults, such as 2,5, or none")
+    return sorted({int(word) for word in words})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

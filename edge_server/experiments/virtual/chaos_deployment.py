@@ -1,0 +1,364 @@
+"""A deployment in virtual time whose processes crash, stall and lose their disks; each writes its ledger.
+
+What lives in a process dies with it. Node: captures and the waiting frame. Emulator: links and what is inside
+them. Edge: buffer, sessions, policy, decisions and what the field has learned since its last checkpoint. What
+happens to a frame is written to the ledger of the process that would write it live, and counted in ``really``
+whether that process can still write or not, so that the accounting of the ledgers can be compared with what
+really happened.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import inf, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.capture import Camera
+from channel_emu.live.upstream import CREDITS
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.faults.corruption import damage
+from channel_emu.model.link import Event, EventKind
+from channel_emu.model.nanoseconds import NEVER_NS
+from edge_server.config import read_config
+from edge_server.experiments.virtual.fault_plan import ROLES, Fault
+from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment, WakeCondition
+from edge_server.fields import checkpoint
+from edge_server.fields.registry import make_field
+from edge_server.live.field_updater import FieldUpdater, open_updater
+from edge_server.live.ingest import FrameAdmission
+from edge_server.scheduler import make_policy, parse_policy
+from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
+from freshfield.ledger import Ledger
+from freshfield.scenario import Scenario, seed_sequence
+from freshfield.v1 import frames_pb2 as pb
+
+# A node asks for the edge's time this often; until then it goes by the clock before a step.
+_CLOCK_PERIOD_NS = 10**9
+
+
+class ChaosDeployment(VirtualDeployment):
+    """``run``, then ``end``. faults: carried out at their instants. out: of ledgers and checkpoint.
+
+    really: frames and copies by what became of them, with the names of ``FrameCounts``; refusals as
+    ``rejected:reason``, those of unknown origin as ``strangers``. arrivals: instants of deliveries by camera.
+    damaged_admitted: frames taken in although their checksum was wrong.
+    most_inside: most frames that a link held. lines_lost: to full disks. restarts: of processes, by role.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        cameras: list[Camera],
+        settings: RunSettings,
+        faults: Sequence[Fault],
+        out: Path,
+    ) -> None:
+        self.scenario = scenario
+        self.really: Counter[str] = Counter()
+        self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
+        self.most_inside = self.lines_lost = self.damaged_admitted = 0
+        self.restarts: Counter[str] = Counter()
+        self._out = out
+        self._down: set[str] = set()
+        self._stalled: set[str] = set()
+        self._away: Counter[str] = Counter()
+        self._steps: dict[str, list[tuple[int, int]]] = {camera.name: [] for camera in cameras}
+        self._synced_ns = 0  # when the node last asked for the edge's time for other reasons than its period
+        self._waiting: dict[str, Frame] = {}  # at the node, while the emulator takes none
+        self._upstream: deque[Event] = deque()  # sent to an edge that does not answer
+        self._ledgers: dict[str, Ledger] = {}
+        self._rng = np.random.default_rng(seed_sequence(scenario.seed, "chaos", "hostile"))
+        self._attempts = 0
+        config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel")
+        self._config = config
+        self.shared = config.server.shared
+        super().__init__(cameras, config, self._new_updater(0), settings, scenario.seed)
+        for role in ROLES:
+            self._open_ledger(role)
+        for fault in faults:
+            self.at(round(fault.at_ms * 1e6), partial(getattr(self, f"_do_{fault.kind}"), fault))
+
+    def end(self) -> None:
+        """All processes end in order, the node first."""
+        now_ns = self.clock.now_ns()
+        for frame in self._waiting.values():
+            self._count("waiting", "node", frame)
+        if "emulator" not in self._down:
+            for link in self._links.values():
+                for transit in link.pending():
+                    self._count("in_flight", "emulator", transit.item)
+            self._break_upstream()
+        for ledger in self._ledgers.values():
+            ledger.close(now_ns)
+            self.lines_lost += ledger.lines_lost
+
+    # --- faults ---------------------------------------------------------------------------------------
+
+    def _do_crash(self, fault: Fault) -> None:
+        """Kill -9 of a process, which is started again ``for_ms`` later."""
+        role = fault.target
+        if role in self._down:
+            return
+        self._down.add(role)
+        self._stalled.discard(role)
+        ledger = self._ledgers.pop(role)
+        ledger._lines.close()  # without the line ``closed``
+        self.lines_lost += ledger.lines_lost
+        if role == "node":
+            self.really["waiting"] += len(self._waiting)
+            self._waiting.clear()
+        elif role == "emulator":
+            self.really["cut_off"] += sum(link.in_flight for link in self._links.values()) + len(
+                self._upstream
+            )
+            self._links.clear()
+            self._upstream.clear()
+        else:
+            self._break_upstream()
+            self._edge.close()
+            self._wake = WakeCondition()
+        self._after(fault, lambda: self._restart(role, bool(fault.value)))
+
+    def _restart(self, role: str, resume: bool) -> None:
+        now_ns = self.clock.now_ns()
+        self._down.discard(role)
+        self.restarts[role] += 1
+        self._open_ledger(role)
+        if role == "node":
+            self.session = f"restart-{self.restarts[role]}"
+            self._synced_ns = now_ns
+        elif role == "emulator":
+            self._channel_origin_ns = now_ns
+            channel = Channel(self._config, self.scenario.seed)
+            self._links.update({name: channel.link(name) for name in self._cameras})
+            self._send_waiting()
+        else:
+            self.updates = self._new_updater(now_ns, resume)
+            self.updates.materialize = self.with_images
+            self._admission = FrameAdmission(self.updates.buffer.cameras, ())
+            self._used.clear()
+            self._edge = self._run_edge()
+            self._wake = next(self._edge)
+
+    def _do_stall(self, fault: Fault) -> None:
+        """SIGSTOP of a process, and SIGCONT ``for_ms`` later."""
+        role = fault.target
+        if role in self._down | self._stalled:
+            return
+        self._stalled.add(role)
+        self._after(fault, lambda: self._go_on(role))
+
+    def _go_on(self, role: str) -> None:
+        if role not in self._stalled:
+            return  # killed meanwhile
+        self._stalled.discard(role)
+        if role == "emulator":
+            self._advance_links(self.clock.now_ns())
+        self._send_waiting()
+        while role == "edge" and self._upstream:
+            self._arrive(self._upstream.popleft())
+
+    def _do_full_disk(self, fault: Fault) -> None:
+        """Every write to a process's ledger fails for a while."""
+        if fault.target in self._down:
+            return
+        lines = self._ledgers[fault.target]._lines
+        kept, full = os.dup(lines._fd), os.open("/dev/full", os.O_WRONLY)
+        os.dup2(full, lines._fd)
+        os.close(full)
+
+        def space_again() -> None:
+            if lines._fd >= 0:  # the process lives
+                os.dup2(kept, lines._fd)
+            os.close(kept)
+
+        self._after(fault, space_again)
+
+    def _do_away(self, fault: Fault) -> None:
+        """A camera is unplugged for a while."""
+        self._away[fault.target] += 1
+        self._after(fault, lambda: self._away.subtract([fault.target]))
+
+    def _do_clock_step(self, fault: Fault) -> None:
+        """A camera's clock jumps by ``value`` ms."""
+        self._steps[fault.target].append((self.clock.now_ns(), round(fault.value * 1e6)))
+
+    def _do_policy(self, fault: Fault) -> None:
+        name, value = parse_policy(fault.target)
+        self.next_policy = make_policy(name, value, self.scenario.rng("policy", name))
+
+    def _do_checkpoint(self, fault: Fault) -> None:
+        if "edge" not in self._down | self._stalled:
+            checkpoint.save(self._out / "field.npz", self.updates.field.state(), durable=False)
+
+    def _do_hostile(self, fault: Fault) -> None:
+        """Messages to the edge from somebody who is no node of this deployment."""
+        if "edge" in self._down | self._stalled:
+            return
+        for _ in range(round(fault.value)):
+            request = self._garble()
+            header = request.header
+            try:
+                reason = self._deliver(from_request(request), ())
+                self.damaged_admitted += not reason and checksum(header, request.payload) != request.crc32c
+            except FrameRejected as error:
+                reason = error.reason
+                self.rejected[reason] += 1
+            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
+            self._write(
+                "edge", "rejected" if reason else "delivered", camera, session, header.sequence, reason or ""
+            )
+            if reason and (session == "?" or camera not in self._cameras):
+                self.really["strangers"] += 1
+            else:
+                self.really.update(("captured", "sent", f"rejected:{reason}" if reason else "delivered"))
+
+    def _garble(self) -> pb.PushRequest:
+        """A message with one to three fields out of place; its checksum is right most of the time."""
+        rng, cameras = self._rng, list(self._cameras)
+        camera = self._cameras[cameras[rng.integers(len(cameras))]]
+        shot, now_ns = camera.capture(0), self.clock.now_ns()
+        self._attempts += 1
+        sequence = 2**40 + self._attempts
+        frame = Frame(
+            camera.name, "hostile", sequence, now_ns, shot.pose, shot.intrinsics, camera.codec, shot.payload
+        )
+        request = to_request(frame)
+        header, data = request.header, shot.payload
+        wrong: list[tuple[Any, str, list[Any]]] = [
+            (header, "camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
+            (header, "session_id", ["a\nb", "", "x" * 1000]),
+            (header, "generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
+            (header, "clock_offset_ns", [10**9, -(10**9), -(2**63), 2**63 - 1]),
+            (header, "clock_uncertainty_ns", [-1, 2**63 - 1]),
+            (header, "pose_gap_ns", [-1, 2**63 - 1]),
+            (header, "codec", [-1, 0, 99]),
+            (header, "role", [-7, 0, 2, 99]),
+            (header, "width", [0, 1, 33, 4097, 2**31 - 1]),
+            (header, "height", [0, 1, 33, 4097, 2**31 - 1]),
+            *((header.pose, name, [0.0, 1.0, nan, inf, 1e300, 5e-324]) for name in ("qw", "qz")),
+            *((header.pose, name, [1e7, nan, -inf, 3.0]) for name in ("tx_m", "tz_m")),
+            *((header.intrinsics, name, [0.0, -5.0, 1e-9, 1e9, nan]) for name in ("fx", "cy", "k1", "p2")),
+            (request, "payload", [b"", data[: len(data) // 2], bytes(rng.bytes(200)), data + data,
+                                  damage(data, tuple((float(rng.random()), 255) for _ in range(20)))]),
+        ]  # fmt: skip
+        for k in rng.permutation(len(wrong))[: rng.integers(1, 4)]:
+            message, name, values = wrong[k]
+            setattr(message, name, values[rng.integers(len(values))])
+        if rng.random() < 0.9:
+            request.crc32c = checksum(header, request.payload)
+        return request
+
+    # --- what a frame meets ---------------------------------------------------------------------------
+
+    def _capture(self, name: str, now_ns: int) -> None:
+        if "node" in self._down | self._stalled or self._away[name] > 0:
+            self._tick[name] += 1
+            return
+        super()._capture(name, now_ns)
+
+    def _stamp(self, name: str, now_ns: int) -> tuple[int, int]:
+        stamped_ns, offset_ns = super()._stamp(name, now_ns)
+        steps = self._steps[name]
+        known = [by for at, by in steps if at + _CLOCK_PERIOD_NS <= now_ns or at <= self._synced_ns]
+        return stamped_ns + sum(by for _, by in steps), offset_ns - sum(known)
+
+    def _send(self, frame: Frame, now_ns: int) -> None:
+        self._count("captured", "node", frame)
+        if "emulator" not in self._down | self._stalled:
+            self._offer(frame, now_ns)
+            return
+        if frame.camera in self._waiting:
+            self._count("replaced", "node", self._waiting[frame.camera])
+        self._waiting[frame.camera] = frame
+
+    def _send_waiting(self) -> None:
+        """What waits at the node leaves, once both the node and the emulator run."""
+        if {"node", "emulator"} & (self._down | self._stalled):
+            return
+        for frame in self._waiting.values():
+            self._offer(frame, self.clock.now_ns())
+        self._waiting.clear()
+
+    def _offer(self, frame: Frame, now_ns: int) -> None:
+        self._count("sent", "node", frame)
+        self._write("emulator", "received", frame.camera, frame.session, frame.sequence)
+        super()._send(frame, now_ns)
+        self.most_inside = max(self.most_inside, self._links[frame.camera].in_flight)
+
+    def _take(self, events: Sequence[Event]) -> None:
+        for event in events:
+            frame = event.transit.item
+            if event.kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
+                if event.kind is EventKind.DUPLICATED:
+                    self._count("duplicated", "emulator", frame)
+                self._forward(event)
+            elif event.kind is not EventKind.STARTED:
+                self._count(str(event.kind), "emulator", frame)
+
+    def _forward(self, event: Event) -> None:
+        frame = event.transit.item
+        if "edge" in self._down or len(self._upstream) >= CREDITS:
+            self._count("broken", "emulator", frame)
+            return
+        self._write("emulator", "forwarded", frame.camera, frame.session, frame.sequence)
+        if "edge" in self._stalled:
+            self._upstream.append(event)
+        else:
+            self._arrive(event)
+
+    def _arrive(self, event: Event) -> None:
+        frame = event.transit.item
+        reason = self._deliver(frame, event.transit.flips)
+        self._count(f"rejected:{reason}" if reason else "delivered", "edge", frame)
+        self.damaged_admitted += bool(event.transit.flips and not reason)
+        if not reason:
+            self.arrivals[frame.camera].append(self.clock.now_ns())
+
+    def _break_upstream(self) -> None:
+        while self._upstream:
+            self._count("broken", "emulator", self._upstream.popleft().transit.item)
+
+    def _link_event_ns(self) -> int:
+        return NEVER_NS if "emulator" in self._stalled else super()._link_event_ns()
+
+    def _wake_ns(self) -> int:
+        stands = "edge" in self._down | self._stalled
+        return NEVER_NS if stands else max(self._wake.at_ns, self.clock.now_ns())
+
+    # --- processes ------------------------------------------------------------------------------------
+
+    def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
+        """An edge's updater as it is after a start; resume: from the last checkpoint, if there is one."""
+        scenario, config = self.scenario, read_config(self.scenario)
+        field = make_field(config.field, config.field_options, seed=scenario.seed)
+        file = self._out / "field.npz"
+        if resume and file.exists():
+            field.load_state(checkpoint.load(file)[0])
+        name, value = config.policy.name, config.policy.value
+        policy = make_policy(name, value, scenario.rng("policy", name))
+        return open_updater(scenario, config, policy, field, now_ns, resume)
+
+    def _open_ledger(self, role: str) -> None:
+        self._ledgers[role] = Ledger(self._out, role, "chaos", self.clock.now_ns())
+
+    def _count(self, what: str, role: str, frame: Frame) -> None:
+        """Something happened to a frame: count it, and let a process write it."""
+        self.really[what] += 1
+        event, _, detail = what.partition(":")
+        self._write(role, event, frame.camera, frame.session, frame.sequence, detail)
+
+    def _write(
+        self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = ""
+    ) -> None:
+        self._ledgers[role].write(self.clock.now_ns(), camera, session, sequence, event, detail)
+
+    def _after(self, fault: Fault, action: Callable[[], None]) -> None:
+        self.at(self.clock.now_ns() + round(fault.for_ms * 1e6), action)

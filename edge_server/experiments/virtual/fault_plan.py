@@ -1,0 +1,111 @@
+"""Deployments and faults drawn from a seed: what ``edge-server chaos`` runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from freshfield.scenario import Scenario, parse, seed_sequence
+
+ROLES = ("node", "emulator", "edge")
+POLICIES = (
+    "all",
+    "threshold:120",
+    "wait:80",
+    "freshest-k:2",
+    "round-robin:2",
+    "random",
+    "age-driven",
+    "periodic:300",
+)
+DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
+QUEUE_LIMIT = 4
+SECONDS = 4.5
+# Faults begin within this part of a run and are over by FAULTS_OVER_S, so that the rest shows the recovery.
+_FAULTS_BEGIN_S = (0.3, 2.0)
+FAULTS_OVER_S = 2.5
+_SMALL: dict[str, dict[str, Any]] = {
+    "voxel": {"sizes": [16, 24], "refine_at": [10], "rays": 512, "cells": 16},
+    "ngp": {"device": "cpu", "levels": 4, "log2_table": 12, "finest_resolution": 64, "batch_samples": 4096,
+            "rays": 512, "samples": 32, "cells": 32},
+    "splat": {"gaussians": 300, "start": 200, "seed_cells": 12},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fault:
+    """kind: crash, stall and full_disk of the process ``target``, ``value``: whether an edge that crashed
+    resumes its last checkpoint; away and clock_step (by ``value`` ms) of the camera ``target``; hostile
+    (``value`` messages), policy (``target``) and checkpoint at the edge. for_ms: until it is over, where it
+    lasts."""
+
+    number: int
+    kind: str
+    at_ms: float
+    for_ms: float = 0.0
+    target: str = ""
+    value: float = 0.0
+
+    def __str__(self) -> str:
+        lasts = f" for {self.for_ms:.0f} ms" if self.for_ms else ""
+        value = f" ({self.value:g})" if self.value else ""
+        return f"{self.number}: {self.kind} {self.target}{value} at {self.at_ms:.0f} ms{lasts}"
+
+
+def scenario_of(seed: int) -> Scenario:
+    """A small deployment: four cameras, and a channel, a field and a policy that the seed chooses."""
+    rng = np.random.default_rng(seed_sequence(seed, "chaos", "scenario"))
+    discipline = str(rng.choice(DISCIPLINES))
+    channel: dict[str, Any] = {"preset": str(rng.choice(["ch5", "ch6"])), "discipline": discipline}
+    if discipline in ("newest-waits", "fcfs", "lcfs-preempt") and rng.random() < 0.5:
+        channel["server"] = {"shared": True}
+    if discipline in ("fcfs", "parallel"):
+        channel["queue_limit"] = QUEUE_LIMIT
+    faults = {"loss": {"probability": 0.1}, "duplication": {"probability": 0.1},
+              "corruption": {"probability": 0.1}, "reset": {"at_ms": [900.0]}}  # fmt: skip
+    channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
+    field = str(rng.choice(sorted(_SMALL)))
+    policy, _, value = str(rng.choice(POLICIES)).partition(":")
+    chosen = {"name": policy, **({"value": float(value)} if value else {})}
+    return parse(
+        {
+            "name": f"chaos-{seed}",
+            "seed": seed,
+            "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
+            "source": {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+                       "params": {"supersample": 1}},
+            "channel": channel,
+            "edge": {"field": field, "field_options": _SMALL[field], "policy": chosen},
+        },
+        Path(f"chaos-{seed}.yaml"),
+    )  # fmt: skip
+
+
+def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
+    """Three to ten faults, in the order of their instants."""
+    rng = np.random.default_rng(seed_sequence(seed, "chaos", "faults"))
+    instants = np.sort(rng.uniform(*_FAULTS_BEGIN_S, rng.integers(3, 11)) * 1e3)
+    return tuple(_draw(rng, k, float(at_ms), cameras) for k, at_ms in enumerate(instants))
+
+
+def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
+    kind = str(
+        rng.choice(["crash", "stall", "full_disk", "away", "clock_step", "hostile", "policy", "checkpoint"])
+    )
+    for_ms, value, target = float(rng.uniform(20.0, 1e3 * FAULTS_OVER_S - _FAULTS_BEGIN_S[1] * 1e3)), 0.0, ""
+    if kind in ("crash", "stall", "full_disk"):
+        target, value = str(rng.choice(ROLES)), float(kind == "crash" and rng.random() < 0.7)
+    elif kind in ("away", "clock_step"):
+        target = str(rng.choice(cameras))
+        if kind == "clock_step":
+            value = round(float(rng.uniform(-500.0, 500.0)), 3)
+    elif kind == "hostile":
+        value = float(rng.integers(1, 40))
+    elif kind == "policy":
+        target = str(rng.choice(POLICIES))
+    if kind in ("clock_step", "hostile", "policy", "checkpoint"):
+        for_ms = 0.0
+    return Fault(number, kind, at_ms, for_ms, target, value)

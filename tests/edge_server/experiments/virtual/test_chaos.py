@@ -1,0 +1,194 @@
+"""``edge-server chaos``: fixed seeds hold; what is broken on purpose is found, reduced and repeatable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.virtual import chaos, chaos_deployment
+from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
+from edge_server.experiments.virtual.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
+from edge_server.report import frame_accounting
+from freshfield.frame import checksum, from_request
+
+CAMERAS = ("cam01", "cam02", "cam03", "cam04")
+
+
+@pytest.mark.parametrize("seed", [2, 4, 7, 11, 23, 89])
+def test_a_seed_holds(seed: int) -> None:
+    found = chaos.run_seed(seed)
+    assert found["problems"] == [] and found["counts"]["delivered"] > 20
+
+
+def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
+    drawn = [fault for seed in range(50) for fault in draw_faults(seed, CAMERAS)]
+    kinds = {name.removeprefix("_do_") for name in dir(ChaosDeployment) if name.startswith("_do_")}
+    assert {f.kind for f in drawn} == kinds
+    assert {f.target for f in drawn if f.kind == "crash"} == {"node", "emulator", "edge"}
+    assert all(f.at_ms + f.for_ms <= 1e3 * FAULTS_OVER_S for f in drawn)
+    assert draw_faults(3, CAMERAS) == draw_faults(3, CAMERAS) != draw_faults(4, CAMERAS)
+    assert len({str(scenario_of(seed).channel) for seed in range(50)}) > 10
+
+
+CRASHES = tuple(
+    Fault(k, "crash", 500.0 + 200 * k, 150.0, role) for k, role in enumerate(("node", "emulator", "edge"))
+)
+
+
+def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeployment:
+    scenario = scenario_of(seed)
+    deployment = ChaosDeployment(
+        scenario, chaos.training_cameras(scenario), chaos._SETTINGS, faults, tmp_path
+    )
+    deployment.run(2.0)
+    deployment.end()
+    return deployment
+
+
+def test_what_a_crashed_process_held_is_gone_and_accounted_for(tmp_path: Path) -> None:
+    deployment = run(tmp_path, CRASHES)
+    assert deployment.restarts == {"node": 1, "emulator": 1, "edge": 1}
+    sessions = {f.frame.session for f in deployment.updates.buffer.newest().values()}
+    assert sessions == {"restart-1"}
+    assert deployment.really["broken"] > 0, "the edge was away"
+    assert deployment.updates.start_ns > 10**9 > deployment.publications[0].published_ns
+    assert list(chaos._accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
+
+
+def test_an_edge_goes_on_from_its_checkpoint_if_it_is_told_to(tmp_path: Path) -> None:
+    saved = Fault(0, "checkpoint", 900.0)
+    state = []
+    for resume in (0.0, 1.0):
+        (folder := tmp_path / str(resume)).mkdir()
+        crash = replace(
+            CRASHES[2], at_ms=1000.0, for_ms=990.0, value=resume
+        )  # it is back just before the end
+        state.append(run(folder, (saved, crash)).updates.field.state())
+    kept = np.load(tmp_path / "1.0" / "field.npz")
+    trained = [name for name in state[0] if not np.array_equal(state[0][name], kept[name])]
+    assert trained and all(np.array_equal(state[1][name], kept[name]) for name in state[1])
+
+
+def test_hostile_messages_are_refused_by_many_reasons_and_counted_apart(tmp_path: Path) -> None:
+    deployment = run(tmp_path, (Fault(0, "hostile", 600.0, value=300.0),))
+    assert len(deployment.rejected) >= 8 and deployment.really["strangers"] > 20
+    assert list(chaos._accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
+
+
+def test_a_full_disk_keeps_the_account_from_closing(tmp_path: Path) -> None:
+    deployment = run(tmp_path, (Fault(0, "full_disk", 500.0, 300.0, "emulator"),))
+    account = frame_accounting.account_frames(tmp_path)
+    assert account.lines_lost == deployment.lines_lost > 5
+    assert f"{account.lines_lost} lines of the ledgers were lost" in account.doubts
+
+
+def lose_a_line(patch: pytest.MonkeyPatch) -> None:
+    written = []
+    whole = ChaosDeployment._write
+
+    def write(self, role, event, *about):
+        written.append(event)
+        if written.count("delivered") % 20 or event != "delivered":
+            whole(self, role, event, *about)
+
+    patch.setattr(ChaosDeployment, "_write", write)
+
+
+def forget_kills(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(frame_accounting, "_cut_off_ends", lambda ledgers: [])
+
+
+def never_restart_the_edge(patch: pytest.MonkeyPatch) -> None:
+    whole = ChaosDeployment._restart
+    patch.setattr(
+        ChaosDeployment, "_restart", lambda self, role, *_: role == "edge" or whole(self, role, False)
+    )
+
+
+def learn_what_is_no_number(patch: pytest.MonkeyPatch) -> None:
+    whole = ChaosDeployment.end
+
+    def end(self) -> None:
+        whole(self)
+        state = {"params": np.full(3, np.nan, np.float32)}
+        self.updates.field.state = lambda: state
+
+    patch.setattr(ChaosDeployment, "end", end)
+
+
+def check_no_checksum(patch: pytest.MonkeyPatch) -> None:
+    """Whatever arrives is given the checksum that it should have."""
+
+    def repaired(request):
+        kept, request.crc32c = request.crc32c, checksum(request.header, request.payload)
+        try:
+            return from_request(request)
+        finally:
+            request.crc32c = kept
+
+    patch.setattr(chaos_deployment, "from_request", repaired)
+
+
+def draw_without_seed(patch: pytest.MonkeyPatch) -> None:
+    whole = ChaosDeployment._stamp
+    draw = np.random.default_rng()
+
+    def stamp(self, name, now_ns):
+        stamped_ns, offset_ns = whole(self, name, now_ns)
+        return stamped_ns, offset_ns + int(draw.integers(10**6))
+
+    patch.setattr(ChaosDeployment, "_stamp", stamp)
+
+
+def break_a_part(patch: pytest.MonkeyPatch) -> None:
+    def policy(self, fault):
+        raise KeyError("omega")
+
+    patch.setattr(ChaosDeployment, "_do_policy", policy)
+
+
+@pytest.mark.parametrize(
+    "broken, seed, says, kind",
+    [
+        (lose_a_line, 6, "off by", None),
+        (forget_kills, 20, "in no ledger", "crash emulator"),
+        (never_restart_the_edge, 2, "never up to date again", "crash edge"),
+        (learn_what_is_no_number, 2, "the field's params is not finite", None),
+        (check_no_checksum, 6, "with a wrong checksum were taken in", "hostile"),
+        (draw_without_seed, 2, "a second run has another digest", None),
+        (break_a_part, 7, "KeyError in test_chaos.py, policy: 'omega'", "policy"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)  # fmt: skip
+def test_what_is_broken_is_found_and_its_faults_are_reduced(
+    broken, seed: int, says: str, kind: str | None, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    broken(monkeypatch)
+    assert chaos.main(["--seeds", str(seed)]) == 1
+    out = capsys.readouterr().out
+    assert says in out
+    kept = [line for line in out.splitlines() if line.startswith("    ")]
+    assert len(kept) == (kind is not None) and (kind is None or kind in kept[0])
+    command = out.splitlines()[-2].split()
+    assert command[:4] == ["edge-server", "chaos", "--seeds", str(seed)]
+    assert chaos.main(command[2:]) == 1 and says in capsys.readouterr().out
+
+
+def test_known_results_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    words = ["--seeds", "2..3", "--out", str(tmp_path / "chaos.jsonl")]
+    assert chaos.main(words) == 0
+    monkeypatch.setattr(chaos, "run_seed", lambda *_: pytest.fail("it is known"))
+    assert chaos.main(words) == 0
+    assert capsys.readouterr().out.count("2 seeds, 0 failed") == 2
+
+
+@pytest.mark.parametrize(
+    "words", [["--seeds", "3..1"], ["--seeds", "a"], ["--seeds", "1", "--faults", "x"], []]
+)
+def test_wrong_words_are_refused(words: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        chaos.main(words)
+    assert ended.value.code == 2
