@@ -21,14 +21,13 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from channel_emu.live.camera_flow import CameraFlow
-from channel_emu.live.live_link import ServedCall
+from channel_emu.live.live_link import Flips, ServedCall
 from channel_emu.live.proxy import Proxy
 from channel_emu.live.status import snapshot
 from channel_emu.live.upstream import PUSH
-from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model.counter_rng import stream_key
 from freshfield.files import write_json
-from freshfield.frame import valid_id
+from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
 from freshfield.transport import CLIENT_OPTIONS
@@ -133,8 +132,6 @@ class FrameStream:
                 while (raw := await context.read()) is not grpc.aio.EOF:
                     response, flow = self._take(raw, flow, call)
                     await context.write(response.SerializeToString())
-            except WireError as error:
-                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
             finally:
                 self._streams -= 1
                 if flow is not None:
@@ -144,7 +141,10 @@ class FrameStream:
         self, raw: bytes, flow: CameraFlow | None, call: ServedCall
     ) -> tuple[frames_pb2.PushResponse, CameraFlow | None]:
         """One frame, after one of ``flow`` on the same stream: the answer, and the frame's own flow."""
-        header = header_of(raw)
+        try:
+            header = parse(raw).header
+        except FrameRejected as error:
+            return self._reject(frames_pb2.FrameHeader(), error.reason, str(error)), flow
         if flow is None or flow.camera != header.camera_id:
             if flow is not None:
                 flow.link.calls.discard(call)
@@ -163,8 +163,8 @@ class FrameStream:
 
     def _reject(self, header: frames_pb2.FrameHeader, reason: str, detail: str) -> frames_pb2.PushResponse:
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
-        ids = [i if valid_id(i) else "?" for i in (header.camera_id, header.session_id)]
-        self._ledger.write(self._proxy.clock.now_ns(), ids[0], ids[1], header.sequence, "rejected", reason)
+        ids = counted_ids(header, self.flows)
+        self._ledger.write(self._proxy.clock.now_ns(), *ids, header.sequence, "rejected", reason)
         return frames_pb2.PushResponse(
             sequence=header.sequence, outcome=frames_pb2.OUTCOME_REJECTED, reason=reason, detail=detail
         )
@@ -188,3 +188,12 @@ class FrameStream:
             self._proxy.channel, list(self.flows.values()), self._proxy.stats, self.rejected,
             self._proxy.events.now_ns(), self._priority, final,
         )  # fmt: skip
+
+
+def damage_payload(raw: bytes, flips: Flips) -> bytes:
+    """The message with bytes of its payload flipped. The checksum stays the sender's: so the edge notices."""
+    from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
+
+    request = frames_pb2.PushRequest.FromString(raw)
+    request.payload = damage(request.payload, flips)
+    return request.SerializeToString()

@@ -15,7 +15,8 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from channel_emu.live.live_link import STREAM_ENDED, Message
-from freshfield.transport import backoff_s
+from freshfield.limits import MAX_REASONS
+from freshfield.transport import backoff_s, peer_text
 from freshfield.v1 import frames_pb2 as pb
 
 log = logging.getLogger("channel-emu")
@@ -114,7 +115,7 @@ class Upstream:
                 if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
             code, details = await call.code(), await call.details()
-            self._log_trouble(f"{code.name}: {details}" if details else code.name)
+            self._log_trouble(f"{code.name}: {peer_text(details)}" if details else code.name)
             return reader.done() and not reader.cancelled() and reader.result()
         finally:
             self.connected = False
@@ -149,7 +150,9 @@ class Upstream:
                 if not answered:
                     answered, self._trouble = True, ""
                 if response.outcome == pb.OUTCOME_REJECTED:
-                    self.rejected[response.reason[:48] or "unspecified"] += 1
+                    reason = peer_text(response.reason[:48]) or "unspecified"
+                    known = reason in self.rejected or len(self.rejected) < MAX_REASONS
+                    self.rejected[reason if known else "other"] += 1
                 if self._held is not None:
                     self._outbox.append(self._held)
                     self._held = None
@@ -170,7 +173,7 @@ class Upstream:
     def _log_trouble(self, trouble: Any) -> None:
         """Log what broke, once per kind of trouble and not once per attempt."""
         if isinstance(trouble, grpc.aio.AioRpcError):
-            trouble = f"{trouble.code().name}: {trouble.details()}"
+            trouble = f"{trouble.code().name}: {peer_text(trouble.details())}"
         if str(trouble) != self._trouble:
             self._trouble = str(trouble)
             log.warning("%s: stream to the edge ended (%s); trying again", self.camera, self._trouble)

@@ -16,7 +16,7 @@ from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
 from freshfield.transport import Transport
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +167,7 @@ class GrpcThread:
 
     async def _serve(self) -> None:
         server = self._transport.aio_server()
-        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self._ingest, server)
+        self._ingest.add_to_server(server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
         edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
         checker = health.aio.HealthServicer()

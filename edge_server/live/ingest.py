@@ -17,10 +17,12 @@ import grpc.aio
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
 from freshfield.clock import Clock
-from freshfield.frame import Frame, FrameRejected, from_request, valid_id
+from freshfield.frame import Frame, FrameRejected, counted_ids, from_request, parse
 from freshfield.ledger import Ledger
+from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.v1 import frames_pb2 as pb
-from freshfield.v1 import frames_pb2_grpc
+
+_SERVICE = pb.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
 
 
 @dataclass
@@ -33,19 +35,33 @@ class _Session:
 
 
 class FrameAdmission:
-    """Checks the order and the time of frames, by camera and session."""
+    """Checks the order and the time of frames, by camera and session, and their size.
 
-    def __init__(self, training: Collection[str], held_out: Collection[str]) -> None:
+    max_side_px: of an image, see ``Scenario.max_side_px``.
+    """
+
+    def __init__(
+        self, training: Collection[str], held_out: Collection[str], max_side_px: int = MAX_IMAGE_SIDE_PX
+    ) -> None:
+        self._max_side_px = max_side_px
         self._roles = {c: False for c in training} | {c: True for c in held_out}
+        self.cameras: Collection[str] = self._roles.keys()
         self._sessions: dict[str, OrderedDict[str, _Session]] = {c: OrderedDict() for c in self._roles}
 
     def admit(self, frame: Frame, now_ns: int) -> None:
-        """Raises FrameRejected with reason unknown_camera, wrong_role, replayed_sequence, time_reversed,
-        from_future or too_old. now_ns: on the edge's clock."""
+        """Raises FrameRejected with reason unknown_camera, wrong_role, too_large, replayed_sequence,
+        time_reversed, from_future or too_old. now_ns: on the edge's clock."""
         if frame.camera not in self._roles:
             raise FrameRejected("unknown_camera", f"camera {frame.camera!r} is not part of this scenario")
         if frame.held_out != self._roles[frame.camera]:
             raise FrameRejected("wrong_role", f"{frame.camera} is held out on one side and not on the other")
+        k = frame.intrinsics
+        if max(k.width, k.height) > self._max_side_px:
+            raise FrameRejected(
+                "too_large",
+                f"{k.width} x {k.height}: the scenario (source.width, source.height) has images of at most "
+                f"{self._max_side_px} pixels a side",
+            )
         sessions = self._sessions[frame.camera]
         session = sessions.get(frame.session, _Session())
         if frame.sequence <= session.sequence:
@@ -71,9 +87,10 @@ class FrameAdmission:
             sessions.popitem(last=False)
 
 
-class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
+class Ingest:
     """FrameStreamService of the edge.
 
+    max_side_px: see ``FrameAdmission``.
     on_held_out(frame), on_accepted(request, now_ns): called on the event loop for held-out frames and for
     every accepted one; they must not block.
     Counts are plain numbers; readers see them without a lock.
@@ -87,10 +104,11 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         ledger: Ledger,
         on_held_out: Callable[[Frame], None],
         on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
+        max_side_px: int = MAX_IMAGE_SIDE_PX,
     ) -> None:
         self._clock = clock
         self._buffer = buffer
-        self._admission = FrameAdmission(buffer.cameras, held_out)
+        self._admission = FrameAdmission(buffer.cameras, held_out, max_side_px)
         self._ledger = ledger
         self._on_held_out = on_held_out
         self._on_accepted = on_accepted
@@ -102,30 +120,36 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         self._streams = 0
         self._max_streams = limits.MAX_STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
 
-    async def Push(
-        self, request_iterator: AsyncIterator[pb.PushRequest], context: grpc.aio.ServicerContext
+    def add_to_server(self, server: grpc.aio.Server) -> None:
+        """Messages are parsed in ``take``: gRPC would end the stream at one that cannot be."""
+        push = grpc.stream_stream_rpc_method_handler(self._push, None, pb.PushResponse.SerializeToString)
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, {"Push": push}),))
+
+    async def _push(
+        self, messages: AsyncIterator[bytes], context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.PushResponse]:
         if self._streams >= self._max_streams:
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
         self._streams += 1
         try:
-            async for request in request_iterator:
-                yield self.take(request)
+            async for message in messages:
+                yield self.take(message)
         finally:
             self._streams -= 1
 
-    def take(self, request: pb.PushRequest) -> pb.PushResponse:
+    def take(self, message: bytes | pb.PushRequest) -> pb.PushResponse:
         """Check and buffer one frame and enter it in the ledger; the response says what became of it."""
         start_s = time.perf_counter()
         now_ns = self._clock.now_ns()
-        header = request.header
+        header = pb.FrameHeader()
         try:
+            request = parse(message) if isinstance(message, bytes) else message
+            header = request.header
             frame = from_request(request)
             self._admission.admit(frame, now_ns)
         except FrameRejected as error:
             self.rejected[error.reason] += 1
-            # A hostile id must not break the ledger's lines.
-            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
+            camera, session = counted_ids(header, self._admission.cameras)
             self.rejected_by_camera[camera] += 1
             self._ledger.write(now_ns, camera, session, header.sequence, "rejected", error.reason)
             return pb.PushResponse(

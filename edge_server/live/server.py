@@ -121,7 +121,7 @@ class EdgeServer:
             log.info("recording to %s", self.recorder.file)
         self.ingest = Ingest(
             self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
-            None if self.recorder is None else self.recorder.frame,
+            None if self.recorder is None else self.recorder.frame, scenario.max_side_px,
         )  # fmt: skip
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
         self.loop = UpdateLoop(

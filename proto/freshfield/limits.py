@@ -20,8 +20,20 @@ MAX_IMAGE_SIDE_PX = 4096
 MAX_PNG_CHUNKS = 10_000
 """Of one PNG, all of which a decoder looks at. Encoders write 8 kB or more into a chunk: 1000 in 8 MB."""
 
+MAX_JPEG_SEGMENTS = 1000
+"""Before a JPEG's first scan, fill bytes included. A camera writes some ten; a 16 MB profile takes 250."""
+
+MAX_JPEG_SCANS = 16
+"""Of one JPEG: a baseline one has 1 to 3, a progressive one some 10. A decoder visits every block in each."""
+
 MAX_ID_CHARS = 64
-"""Of a camera or session id: it becomes part of file names and of ledger lines."""
+"""Of a camera or session id: it becomes part of file names and of ledger lines. Of a policy's name too."""
+
+MAX_PEER_TEXT_CHARS = 200
+"""Of a peer's words in a log line."""
+
+MAX_REASONS = 32
+"""Different reasons of a peer's refusals that are counted apart: a broken peer may make them up."""
 
 # --- streams and cameras ----------------------------------------------------------------------
 

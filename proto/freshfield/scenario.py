@@ -29,7 +29,7 @@ import numpy as np
 import yaml
 
 from freshfield.frame import valid_id
-from freshfield.limits import MAX_CAMERAS
+from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
 
 PHASES = ("locked", "spread")
 T = TypeVar("T")
@@ -77,6 +77,14 @@ class Scenario:
     @property
     def training(self) -> tuple[str, ...]:
         return tuple(c for c in self.cameras if c not in self.held_out)
+
+    @property
+    def max_side_px(self) -> int:
+        """The largest image side that its cameras send: of the source's width and height, where it has both,
+        else whatever is accepted at all."""
+        sides = [self.source.get(name) for name in ("width", "height")]
+        whole = [side for side in sides if type(side) is int and side > 0]
+        return max(whole) if len(whole) == len(sides) else MAX_IMAGE_SIDE_PX
 
     def phase_ns(self, camera: str, fps: float) -> int:
         """How much later than the ticks of its rate a camera captures (``cameras.phase``)."""

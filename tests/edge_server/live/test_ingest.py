@@ -9,8 +9,10 @@ import pytest
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
+from freshfield import payload
 from freshfield.clock import VirtualClock
 from freshfield.frame import FrameRejected, checksum, to_request
+from freshfield.geometry import Pinhole
 from freshfield.ledger import Ledger, LedgerReader
 from freshfield.v1 import frames_pb2 as pb
 from tests.edge_server.frames import frame
@@ -24,7 +26,7 @@ def ingest(tmp_path):
     clock = VirtualClock(NOW)
     held = []
     ledger = Ledger(tmp_path, "edge", "edge", NOW)
-    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append)
+    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append, max_side_px=128)
     made.test_clock, made.test_held, made.test_ledger = clock, held, ledger
     yield made
     ledger.close(NOW)
@@ -62,8 +64,17 @@ def bad(kind: str) -> pb.PushRequest:
         request.header.pose.qw = 7.0
         request.crc32c = checksum(request.header, request.payload)
         return request
+    if kind in ("unknown_codec", "bad_header"):  # an enum on the wire may be negative
+        request = to_request(base)
+        setattr(request.header, "codec" if kind == "unknown_codec" else "role", -7)
+        request.crc32c = checksum(request.header, request.payload)
+        return request
     changes = {
         "unknown_camera": {"camera": "cam77"},
+        "too_large": {
+            "intrinsics": Pinhole.from_fov(4096, 4096, 60.0),
+            "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8)),
+        },
         "wrong_role": {"held_out": True},
         "bad_id": {"camera": "../../etc"},
         "from_future": {"generated_ns": NOW + 3600 * 10**9},
@@ -76,7 +87,8 @@ def bad(kind: str) -> pb.PushRequest:
 
 
 KINDS = ["crc_mismatch", "bad_pose", "unknown_camera", "wrong_role", "bad_id", "from_future", "too_old",
-         "size_mismatch", "bad_payload", "bad_intrinsics"]  # fmt: skip
+         "size_mismatch", "bad_payload", "bad_intrinsics", "unknown_codec", "bad_header",
+         "too_large"]  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,6 +101,23 @@ def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
     assert ingest.take(to_request(good(sequence=1))).outcome == pb.OUTCOME_ACCEPTED
     events = [e.event for e in LedgerReader(ingest.test_ledger.path).events]
     assert events == ["rejected", "delivered"]
+
+
+def test_bytes_that_are_no_message_are_counted_and_the_next_ones_are_read(ingest):
+    raw = to_request(good()).SerializeToString()
+    answer = ingest.take(raw + b"\0\0")
+    assert (answer.outcome, answer.reason) == (pb.OUTCOME_REJECTED, "unparsable")
+    assert ingest.take(raw).outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.rejected == {"unparsable": 1}
+    events = [(e.camera, e.event, e.detail) for e in LedgerReader(ingest.test_ledger.path).events]
+    assert events == [("?", "rejected", "unparsable"), ("cam01", "delivered", "")]
+
+
+def test_a_thousand_made_up_cameras_are_counted_as_one(ingest):
+    for i in range(1000):
+        ingest.take(to_request(good(camera=f"made-up-{i}", session=f"s{i}")))
+    assert ingest.rejected_by_camera == {"?": 1000}
+    assert {(e.camera, e.session) for e in LedgerReader(ingest.test_ledger.path).events} == {("?", "?")}
 
 
 def test_replay_and_reversed_time_are_refused_within_a_session_only():

@@ -13,6 +13,7 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
+from edge_server.live.policies import ServerPolicies
 from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import frame as wire
 from freshfield import payload, scenario
@@ -23,6 +24,7 @@ from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, fr
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
 from tests.ports import free_port
+from tests.work import MOST_MS, work_ms
 
 
 def tiny_scenario(tmp_path, held_out=("cam00",)):
@@ -164,6 +166,9 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
         edge.SetPolicy(edge_pb2.SetPolicyRequest(name="best"))
     assert unknown.value.code() == grpc.StatusCode.INVALID_ARGUMENT
     assert "freshest-k" in unknown.value.details()
+    with pytest.raises(grpc.RpcError) as long:
+        edge.SetPolicy(edge_pb2.SetPolicyRequest(name="n" * 8_000_000))
+    assert long.value.code() == grpc.StatusCode.INVALID_ARGUMENT and len(long.value.details()) < 200
     path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
     assert checkpoint.load(path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())
@@ -175,6 +180,17 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
     decisions.cancel()
     feed.stop()
     channel.close()
+
+
+def test_a_name_of_eight_megabytes_is_no_policy(tmp_path):
+    made = tiny_scenario(tmp_path)
+    policies = ServerPolicies(made, read_config(made), None, tmp_path)
+
+    def ask():
+        with pytest.raises(ValueError, match="8000000 characters"):
+            policies.make("n" * 8_000_000, None)
+
+    assert work_ms(ask) < MOST_MS
 
 
 def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(serve, tmp_path):
