@@ -37,6 +37,7 @@ from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, TransportError
+from freshfield.untrusted import stored_bytes
 
 if TYPE_CHECKING:  # imported at run time only where a run is recorded
     from edge_server.live.output.recorder import Recorder
@@ -91,7 +92,7 @@ class EdgeServer:
         self.field = make_field(config.field, {"nice": SERVER_NICE, **field_options}, seed=scenario.seed)
         resumed_updates = 0
         if options.resume is not None:
-            state, about = checkpoint.load(options.resume)
+            state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
             self.field.load_state(state)
             # Numbers continue, so that a snapshot does not take the name of an earlier one.
             resumed_updates = max(0, int(about.get("updates", 0)))

@@ -35,6 +35,21 @@ MAX_PEER_TEXT_CHARS = 200
 MAX_REASONS = 32
 """Different reasons of a peer's refusals that are counted apart: a broken peer may make them up."""
 
+# --- files ------------------------------------------------------------------------------------
+
+MAX_YAML_CHARS = 2**17
+"""Of one scenario or other YAML file: a thousand cameras with the longest ids take half of it, and its reader
+takes 2 s for as many characters."""
+
+MAX_ERROR_CHARS = 1000
+"""Of what an error quotes from a file."""
+
+MAX_CHUNK_BYTES = 16 * 2**20
+"""Of a recording's compressed chunk, unpacked: writers end one at 1 MB, but for the largest image."""
+
+MAX_UNPACKED_PER_BYTE = 20
+"""Of all compressed chunks of a recording together: most of it is images, which do not compress."""
+
 # --- streams and cameras ----------------------------------------------------------------------
 
 MAX_CAMERAS = 1000

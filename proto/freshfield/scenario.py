@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 
 from freshfield.frame import valid_id
-from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
+from freshfield.limits import MAX_CAMERAS, MAX_ERROR_CHARS, MAX_IMAGE_SIDE_PX
+from freshfield.untrusted import UntrustedError, read_yaml
 
 PHASES = ("locked", "spread")
 T = TypeVar("T")
@@ -40,7 +40,10 @@ SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot run. The message is one line: file, key, what was expected."""
+    """A scenario that cannot run. The message is one line, cut short: file, key, what was expected."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message if len(message) <= MAX_ERROR_CHARS else f"{message[:MAX_ERROR_CHARS]} ...")
 
 
 @dataclass(frozen=True)
@@ -117,12 +120,14 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
     if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
         file = SCENARIO_FOLDER / f"{file}.yaml"
     try:
-        data = yaml.safe_load(file.read_text())
+        data = read_yaml(file.read_text())
     except OSError as error:
         shipped = ", ".join(sorted(p.stem for p in SCENARIO_FOLDER.glob("*.yaml")))
         raise ScenarioError(f"{file}: {error.strerror}; shipped scenarios: {shipped or 'none'}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{file}: not YAML: {' '.join(str(error).split())}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{file}: not YAML: {error}") from None
+    except UntrustedError as error:
+        raise ScenarioError(f"{file}: {error}") from None
     return parse(data, file, seed)
 
 

@@ -30,6 +30,7 @@ from camera_node.sources.datasets.records import (
     PosedImage,
     errors_at,
     find_files,
+    path_within,
     read_json,
 )
 from freshfield.geometry import se3_inverse
@@ -125,7 +126,9 @@ def _from_json(file: Path) -> list[_Entry]:
 
 def _entry(entry: dict[str, Any], where: str) -> _Entry:
     name = entry.get("cameraId")
-    if not isinstance(name, str) or len(Path(name).parts) != 2 or ".." in Path(name).parts:
+    with errors_at(where):
+        inside = isinstance(name, str) and len(path_within(name).parts) == 2
+    if not inside:
         raise DatasetError(f"{where}: cameraId is {name!r}, expected CAMERA/IMAGE")
     where = f"{where} ({name})"
     k = _matrix(entry, "K", 3, where)

@@ -23,7 +23,9 @@ from camera_node.sources.datasets.records import (
     DatasetError,
     Image,
     PosedImage,
+    errors_at,
     find_files,
+    path_within,
     read_json,
 )
 from freshfield.geometry import OPENGL_TO_OPENCV, GeometryError, Pinhole, Pose
@@ -97,6 +99,8 @@ def _find_image(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise DatasetError(f"{where}: 'file_path' is missing")
+    with errors_at(where):
+        path_within(name)
     for extension in _EXTENSIONS:
         path = folder / (name + extension)
         if path.is_file():
