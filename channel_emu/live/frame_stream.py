@@ -21,7 +21,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from channel_emu.live.camera_flow import CameraFlow
-from channel_emu.live.live_link import Flips, ServedCall
+from channel_emu.live.live_link import Flips
 from channel_emu.live.proxy import Proxy
 from channel_emu.live.status import snapshot
 from channel_emu.live.upstream import PUSH
@@ -30,6 +30,7 @@ from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
+from freshfield.streams import OpenStreams, ServedCall, SessionStreams
 from freshfield.transport import CLIENT_OPTIONS
 from freshfield.v1 import clock_pb2, frames_pb2
 
@@ -62,7 +63,8 @@ class FrameStream:
         """Frames refused here, by reason."""
         self._out = out
         self._priority = priority
-        self._streams = 0
+        self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(self.cameras))
+        self._sessions = SessionStreams(self.cameras)
 
     def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
         self._proxy = proxy
@@ -121,11 +123,8 @@ class FrameStream:
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
         """One stream of a node. Every message is answered once, as soon as the link has decided."""
-        if self._streams >= MAX_STREAMS_PER_CAMERA * len(self.flows):
-            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
         flow: CameraFlow | None = None
-        self._streams += 1
-        async with ServedCall(context) as call:
+        async with self.streams.open(context) as call:
             try:
                 # Nodes wait for this before they send.
                 await context.send_initial_metadata(())
@@ -133,7 +132,6 @@ class FrameStream:
                     response, flow = self._take(raw, flow, call)
                     await context.write(response.SerializeToString())
             finally:
-                self._streams -= 1
                 if flow is not None:
                     flow.link.calls.discard(call)
 
@@ -155,6 +153,13 @@ class FrameStream:
         if not valid_id(header.session_id):
             detail = "session ids are 1 to 64 letters, digits, '.', '_', '-'"
             return self._reject(header, "bad_id", detail), flow
+        try:
+            self._sessions.claim(flow.camera, header.session_id, call, self._proxy.clock.now_ns())
+        except FrameRejected as error:
+            return self._reject(header, error.reason, str(error)), flow
+        if not flow.link.has_room(raw):
+            return self._reject(header, "queue_full", "the emulator holds as many bytes as it may"), flow
+        self.streams.use(call)
         try:
             return flow.take(raw, header), flow
         except Exception as error:

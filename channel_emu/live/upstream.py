@@ -15,7 +15,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from channel_emu.live.live_link import STREAM_ENDED, Message
-from freshfield.limits import MAX_REASONS
+from freshfield.limits import MAX_MESSAGE_BYTES, MAX_REASONS
 from freshfield.transport import backoff_s, peer_text
 from freshfield.v1 import frames_pb2 as pb
 
@@ -68,13 +68,18 @@ class Upstream:
         """Send a frame that is due now. Never blocks."""
         if not self.connected:
             self._broken(frame)
-        elif len(self._outbox) + len(self._unanswered) >= CREDITS:
+        elif self._full(frame):
             if self._held is not None:
                 self._broken(self._held)
             self._held = frame
         else:
             self._outbox.append(frame)
             self._wake.set()
+
+    def _full(self, frame: Message) -> bool:
+        """Whether the credits are used up, which hold for bytes as well as for frames."""
+        out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
+        return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
 
     @property
     def pending(self) -> int:

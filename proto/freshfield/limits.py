@@ -57,13 +57,32 @@ MAX_CAMERAS = 1000
 
 MAX_STREAMS_PER_CAMERA = 4
 """Streams open at once at a process, for each of its cameras: one is in use, others may be closing after a
-restart."""
+restart. Beyond that a new stream ends the one of least use."""
+
+MAX_WATCHERS = 32
+"""Of decisions, at once. Each takes a look at the state twenty times a second."""
+
+MAX_SNAPSHOTS = 20
+"""In the folder of one run: whoever asks for more is told to move some away."""
+
+MAX_SCRAPES = 8
+"""Connections open at once to the metrics: a new one ends the oldest."""
+
+SCRAPE_TIMEOUT_S = 5.0
+"""How long one of them may say nothing."""
+
+MAX_QUEUED_BYTES = 256 * 2**20
+"""Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""
 
 MAX_CONCURRENT_STREAMS = 1024
 """Of one gRPC connection: a stream for each camera of the largest scenario, and some calls beside them."""
 
 MAX_SESSIONS_PER_CAMERA = 64
 """Sessions remembered for a camera. A forgotten session could be replayed, so many are remembered."""
+
+SESSION_IDLE_NS = 2 * 10**9
+"""After as long without a frame, another stream may go on with a session: a node whose stream is gone without
+a word opens another one."""
 
 # --- time -------------------------------------------------------------------------------------
 

@@ -12,7 +12,8 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live.live_link import HardLimit
+from channel_emu.live import live_link
+from channel_emu.live.live_link import HardLimit, Message
 from channel_emu.live.upstream import CREDITS, PUSH
 from channel_emu.model import trace
 from channel_emu.virtual.replay import compare
@@ -237,6 +238,68 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
     refused = Counter((e.camera, e.session, e.detail) for e in ledger.events if e.event == "rejected")
     expected = {("?", "?", "unknown_camera"): 2, ("cam00", "?", "bad_id"): 1, ("?", "?", "unparsable"): 6}
     assert refused == expected
+
+
+def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with emulate(tmp_path, {}) as r:
+            camera = r.cameras["cam00"]
+            await camera.stream(2, 0)
+            async with Transport().aio_channel(f"127.0.0.1:{r.proxy.port}") as channel:
+                silent = []
+                for _ in range(30):
+                    silent.append(channel.stream_stream(PUSH)())
+                    await silent[-1].initial_metadata()
+                spoof = to_request(frame_of("cam00", camera.session, 2**63, r.proxy.clock.now_ns()))
+                await silent[-1].write(spoof.SerializeToString())
+                answer = pb.PushResponse.FromString(await silent[-1].read())
+                assert answer.reason == "session_in_use"
+                await camera.stream(3, 0)
+                await r.cameras["cam01"].stream(1, 0)  # opens a stream of its own only now
+                assert r.stream.streams.ended > 10
+            assert camera.answers == {"accepted": 5}
+            await r.settled()
+            assert r.edge.ingest.delivered["cam00"] == 5 and not r.edge.ingest.rejected
+
+    run(live())
+
+
+def test_what_is_inside_the_links_is_bounded_in_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 20_000)
+
+    async def live() -> None:
+        section = {"service": {"law": "deterministic", "mean_ms": 200.0}, "discipline": "fcfs"}
+        async with emulate(tmp_path, section, cameras=("cam00", "cam01")) as r:
+            for name in r.cameras:
+                await r.cameras[name].stream(5, 0)
+            inside = [len(t.item.raw) for f in r.stream.flows.values() for t in f.link.model.pending()]
+            assert 0 < sum(inside) == r.proxy._room.held_bytes <= 20_000
+            full = r.stream.rejected["queue_full"]
+            assert full == 10 - len(inside) and r.cameras["cam01"].reasons["queue_full"] > 0
+            await r.settled()
+            assert r.proxy._room.held_bytes == 0
+            await r.cameras["cam00"].stream(1, 0)
+            assert r.stream.rejected["queue_full"] == full
+
+    run(live())
+    frame_account(tmp_path)
+
+
+def test_the_credits_at_the_edge_hold_for_bytes_too(tmp_path: Path) -> None:
+    async def live() -> None:
+        edge = await Peer(respond=silence).start()
+        proxy, (flow,) = make(tmp_path, edge.address, {})
+        await proxy.start()
+        large = Message(bytes(5 * 2**20), "s", 0, flow)
+        for _ in range(6):
+            flow.upstream.send(large)
+        assert flow.upstream.pending == 2 and flow.broken == 4  # one on its way, the newest held
+        await proxy.stop()
+        await edge.stop()
+
+    run(live())
 
 
 def test_a_message_that_cannot_be_damaged_does_not_end_the_emulator(tmp_path: Path) -> None:

@@ -20,11 +20,12 @@ from channel_emu.live import timer
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.frame_stream import damage_payload
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.live_link import Message, ServedCall
+from channel_emu.live.live_link import Message
 from channel_emu.live.timer import LoopTimer
 from channel_emu.model import ages
 from channel_emu.model.link import EventKind
 from freshfield.frame import FrameRejected, from_request, to_request
+from freshfield.streams import ServedCall
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import frame_of
 

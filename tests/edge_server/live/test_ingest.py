@@ -132,6 +132,41 @@ def test_replay_and_reversed_time_are_refused_within_a_session_only():
     admission.admit(good(sequence=0, session="s2"), NOW)
 
 
+def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
+    class Stream:
+        open = True
+
+    mine, spoofer = Stream(), Stream()
+    ingest.streams.use = lambda stream: None
+    assert ingest.take(to_request(good(1)), mine).outcome == pb.OUTCOME_ACCEPTED
+    last = frame(sequence=2**63, generated_ns=NOW)
+    assert ingest.take(to_request(last), spoofer).reason == "session_in_use"
+    assert ingest.take(to_request(good(2)), mine).outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.rejected == {"session_in_use": 1}
+
+
+def test_two_nodes_of_one_name_are_told_apart_and_said(caplog):
+    admission = FrameAdmission(["cam01"], [])
+    for k in range(1, 6):
+        now_ns = NOW + k * 10**9
+        admission.admit(frame(sequence=k, generated_ns=now_ns, session="first"), now_ns)
+        if k > 2:
+            admission.admit(frame(sequence=k, generated_ns=now_ns + 1, session="second"), now_ns)
+    assert admission.doubled == {"cam01": 1}
+    (said,) = [r.getMessage() for r in caplog.records]
+    assert said.startswith("cam01: two nodes send as this camera")
+
+
+def test_a_node_that_restarts_is_one_node(caplog):
+    """Frames of its old session may still be on their way."""
+    admission = FrameAdmission(["cam01"], [])
+    arrivals = [("s1", 0), ("s1", 1), ("s2", 20), ("s1", 2), ("s2", 21), ("s1", 3), ("s2", 40)]
+    for session, tenths in arrivals:
+        at_ns = NOW + tenths * 100 * MS
+        admission.admit(frame(sequence=tenths, generated_ns=at_ns, session=session), NOW + 5 * 10**9)
+    assert not admission.doubled and not caplog.records
+
+
 def test_a_thousand_sessions_do_not_grow_the_admission():
     admission = FrameAdmission(["cam01"], [])
     for i in range(1000):
