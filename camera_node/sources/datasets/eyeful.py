@@ -127,8 +127,8 @@ def _from_json(file: Path) -> list[_Entry]:
 def _entry(entry: dict[str, Any], where: str) -> _Entry:
     name = entry.get("cameraId")
     with errors_at(where):
-        inside = isinstance(name, str) and len(path_within(name).parts) == 2
-    if not inside:
+        parts = path_within(name).parts if isinstance(name, str) else ()
+    if not isinstance(name, str) or len(parts) != 2:
         raise DatasetError(f"{where}: cameraId is {name!r}, expected CAMERA/IMAGE")
     where = f"{where} ({name})"
     k = _matrix(entry, "K", 3, where)

@@ -83,7 +83,9 @@ _HARMLESS = {
 class _Plain(pickle._Unpickler):
     """Python's own: the one in C makes room for what a few bytes claim."""
 
-    dispatch: ClassVar = dict(pickle._Unpickler.dispatch)
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+
+    stack: list[Any]
 
     def load_build(self) -> None:
         state, built = self.stack.pop(), self.stack[-1]
