@@ -15,8 +15,8 @@ import numpy as np
 from camera_node.outbox import Outbox
 from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
-from freshfield.limits import MAX_CAPTURE_AGE_NS
-from freshfield.transport import backoff_s
+from freshfield.limits import MAX_CAPTURE_AGE_NS, MAX_REASONS
+from freshfield.transport import backoff_s, peer_text
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc as rpc
 
@@ -29,8 +29,6 @@ OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
 # An offset that was never measured may be anything: zero with a small uncertainty would be wrong.
 UNKNOWN_OFFSET = Offset(0, MAX_CAPTURE_AGE_NS)
-# A peer that is broken must not fill the ledger with names that it makes up.
-_MAX_REASONS = 32
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
 
 _OUTCOMES = {
@@ -175,9 +173,9 @@ class Sender:
         if outcome is None:
             reason = response.reason if _REASON.fullmatch(response.reason) else "unspecified"
             if reason not in self._reasons:
-                if len(self._reasons) >= _MAX_REASONS:
+                if len(self._reasons) >= MAX_REASONS:
                     reason = "other"
-                log.warning("%s: frame refused: %s (%s)", frame.camera, reason, response.detail[:200])
+                log.warning("%s: frame refused: %s (%s)", frame.camera, reason, peer_text(response.detail))
             self._reasons[reason] = self._reasons.get(reason, 0) + 1
             outcome = f"rejected:{reason}"
         self.outbox.record(frame.sequence, "answered", outcome)
@@ -185,7 +183,7 @@ class Sender:
     def _report(self, error: Exception) -> None:
         """Log what broke, once per kind of trouble and not once per attempt."""
         if isinstance(error, grpc.aio.AioRpcError):
-            text = f"{error.code().name}: {error.details()}"
+            text = f"{error.code().name}: {peer_text(error.details())}"
         else:
             text = str(error) or "peer not reachable"
         if text != self.trouble:
@@ -196,4 +194,4 @@ class Sender:
 async def _status(call: grpc.aio.StreamStreamCall) -> Exception:
     """Why a stream ended, as an exception."""
     code, details = await call.code(), await call.details()
-    return ProtocolError(f"stream ended: {code.name}{': ' + details if details else ''}")
+    return ProtocolError(f"stream ended: {code.name}{': ' + peer_text(details) if details else ''}")

@@ -31,9 +31,9 @@ import numpy as np
 
 from channel_emu.live.priority import raise_priority
 from channel_emu.live.upstream import PUSH
-from channel_emu.live.wire import header_of
 from channel_emu.model import trace
 from freshfield.clock import WallClock
+from freshfield.frame import parse
 from freshfield.machine_load import cpu_s, machine_ticks, rss_mb
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
@@ -185,7 +185,7 @@ async def _serve_sink(pipe: Connection, file: Path) -> None:
     async def push(_: Any, context: grpc.aio.ServicerContext) -> None:
         while (raw := await context.read()) is not grpc.aio.EOF:
             now_ns = clock.now_ns()
-            header = header_of(raw)
+            header = parse(raw).header
             arrivals.append((int(header.camera_id[3:]), header.sequence, now_ns))
             answer = pb.PushResponse(sequence=header.sequence, outcome=pb.OUTCOME_ACCEPTED)
             await context.write(answer.SerializeToString())

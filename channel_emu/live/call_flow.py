@@ -9,8 +9,9 @@ from typing import Any
 
 import grpc.aio
 
-from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message, ServedCall
+from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
 from channel_emu.model.link import EventKind
+from freshfield.streams import ServedCall
 
 # Messages that are read ahead of the one being written, at most; then the sender waits. Behind a message that
 # is still in the link any number are read, because the link decides about each at once. Those it drops are
@@ -112,6 +113,9 @@ class CallFlow:
                 self._messages.append(message)
                 if self._link is None:
                     self.settle(message, EventKind.DELIVERED)
+                elif not self._link.has_room(raw):
+                    self._link.overfull += 1
+                    self.settle(message, EventKind.DROPPED_BUSY)
                 else:
                     self._link.offer(message, self._now_ns())
                 if len(self._messages) >= _MOST_READY and self._messages[0].delivered is not None:

@@ -21,16 +21,16 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from channel_emu.live.camera_flow import CameraFlow
-from channel_emu.live.live_link import ServedCall
+from channel_emu.live.live_link import Flips
 from channel_emu.live.proxy import Proxy
 from channel_emu.live.status import snapshot
 from channel_emu.live.upstream import PUSH
-from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model.counter_rng import stream_key
 from freshfield.files import write_json
-from freshfield.frame import valid_id
+from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
+from freshfield.streams import OpenStreams, ServedCall, SessionStreams
 from freshfield.transport import CLIENT_OPTIONS
 from freshfield.v1 import clock_pb2, frames_pb2
 
@@ -63,7 +63,8 @@ class FrameStream:
         """Frames refused here, by reason."""
         self._out = out
         self._priority = priority
-        self._streams = 0
+        self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(self.cameras))
+        self._sessions = SessionStreams(self.cameras)
 
     def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
         self._proxy = proxy
@@ -124,21 +125,15 @@ class FrameStream:
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
         """One stream of a node. Every message is answered once, as soon as the link has decided."""
-        if self._streams >= MAX_STREAMS_PER_CAMERA * len(self.flows):
-            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
         flow: CameraFlow | None = None
-        self._streams += 1
-        async with ServedCall(context) as call:
+        async with self.streams.open(context) as call:
             try:
                 # Nodes wait for this before they send.
                 await context.send_initial_metadata(())
                 while (raw := await context.read()) is not grpc.aio.EOF:
                     response, flow = self._take(raw, flow, call)
                     await context.write(response.SerializeToString())
-            except WireError as error:
-                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
             finally:
-                self._streams -= 1
                 if flow is not None:
                     flow.link.calls.discard(call)
 
@@ -146,7 +141,10 @@ class FrameStream:
         self, raw: bytes, flow: CameraFlow | None, call: ServedCall
     ) -> tuple[frames_pb2.PushResponse, CameraFlow | None]:
         """One frame, after one of ``flow`` on the same stream: the answer, and the frame's own flow."""
-        header = header_of(raw)
+        try:
+            header = parse(raw).header
+        except FrameRejected as error:
+            return self._reject(frames_pb2.FrameHeader(), error.reason, str(error)), flow
         if flow is None or flow.camera != header.camera_id:
             if flow is not None:
                 flow.link.calls.discard(call)
@@ -158,6 +156,13 @@ class FrameStream:
             detail = "session ids are 1 to 64 letters, digits, '.', '_', '-'"
             return self._reject(header, "bad_id", detail), flow
         try:
+            self._sessions.claim(flow.camera, header.session_id, call, self._proxy.clock.now_ns())
+        except FrameRejected as error:
+            return self._reject(header, error.reason, str(error)), flow
+        if not flow.link.has_room(raw):
+            return self._reject(header, "queue_full", "the emulator holds as many bytes as it may"), flow
+        self.streams.use(call)
+        try:
             return flow.take(raw, header), flow
         except Exception as error:
             self._proxy.fail(error)
@@ -165,8 +170,8 @@ class FrameStream:
 
     def _reject(self, header: frames_pb2.FrameHeader, reason: str, detail: str) -> frames_pb2.PushResponse:
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
-        ids = [i if valid_id(i) else "?" for i in (header.camera_id, header.session_id)]
-        self._ledger.write(self._proxy.clock.now_ns(), ids[0], ids[1], header.sequence, "rejected", reason)
+        ids = counted_ids(header, self.flows)
+        self._ledger.write(self._proxy.clock.now_ns(), *ids, header.sequence, "rejected", reason)
         return frames_pb2.PushResponse(
             sequence=header.sequence, outcome=frames_pb2.OUTCOME_REJECTED, reason=reason, detail=detail
         )
@@ -190,3 +195,12 @@ class FrameStream:
             self._proxy.channel, list(self.flows.values()), self._proxy.stats, self.rejected,
             self._proxy.events.now_ns(), self._priority, final,
         )  # fmt: skip
+
+
+def damage_payload(raw: bytes, flips: Flips) -> bytes:
+    """The message with bytes of its payload flipped. The checksum stays the sender's: so the edge notices."""
+    from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
+
+    request = frames_pb2.PushRequest.FromString(raw)
+    request.payload = damage(request.payload, flips)
+    return request.SerializeToString()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import grpc
 import grpc.aio
@@ -20,6 +20,8 @@ from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
+from freshfield.limits import MAX_QUEUED_BYTES
+from freshfield.streams import ServedCall
 
 STREAM_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
 """How gRPC says that a stream is over."""
@@ -69,34 +71,19 @@ class DelayStats:
         self.error: Histogram = Histogram(None if total is None else total.error)
 
 
-class ServedCall:
-    """``async with`` around the handling of a call: ``reset`` ends it as a reset of the network would."""
+@dataclass
+class Room:
+    """held_bytes: of the messages inside some links."""
 
-    def __init__(self, context: grpc.aio.ServicerContext) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self.task = task
-        self._context = context
-        self._was_reset = False
-
-    def reset(self) -> None:
-        self._was_reset = True
-        self.task.cancel()
-
-    async def __aenter__(self) -> ServedCall:
-        return self
-
-    async def __aexit__(self, kind: type[BaseException] | None, *_: Any) -> None:
-        if self._was_reset and kind is asyncio.CancelledError:
-            self.task.uncancel()
-            await self._context.abort(grpc.StatusCode.UNAVAILABLE, "the emulated network reset this stream")
+    held_bytes: int = 0
 
 
 class LiveLink:
     """``offer`` messages; the event queue calls ``advance`` when something is due.
 
     name: decides the link's draws, together with the channel's seed. stats: its messages are counted there.
-    failed: told of a HardLimit. damage: how the bytes of a message are flipped.
+    failed: told of a HardLimit. damage: how the bytes of a message are flipped. room: for the bytes inside,
+        shared with other links.
     """
 
     def __init__(
@@ -109,6 +96,7 @@ class LiveLink:
         damage: Callable[[bytes, Flips], bytes],
         trace: TraceWriter | None = None,
         hard_limit_ms: float | None = None,
+        room: Room | None = None,
     ) -> None:
         self.name = name
         self.model = model
@@ -123,6 +111,9 @@ class LiveLink:
         """Messages handed on."""
         self.cancelled = 0
         """Messages that the link delivered after their call was over."""
+        self.overfull = 0
+        """Messages dropped before the link, because there was no room for their bytes."""
+        self._room = Room() if room is None else room
         self._events = events
         self._failed = failed
         self._damage = damage
@@ -134,9 +125,14 @@ class LiveLink:
     def next_event_ns(self) -> int:
         return self.model.next_event_ns
 
+    def has_room(self, raw: bytes) -> bool:
+        """Whether a message may be offered: what is inside all links is bounded in bytes as well."""
+        return self._room.held_bytes + len(raw) <= MAX_QUEUED_BYTES
+
     def offer(self, message: Message, at_ns: int) -> Transit:
         """A message came in at the channel's instant ``at_ns``: let the link decide, and act on it."""
         self.last_ns = at_ns
+        self._room.held_bytes += len(message.raw)
         transit, events = self.model.offer(at_ns, message, len(message.raw))
         message.transit = transit
         self._act(events)
@@ -189,6 +185,8 @@ class LiveLink:
             if kind is EventKind.STARTED:
                 self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
+            if kind is not EventKind.DUPLICATED:
+                self._room.held_bytes -= len(message.raw)
             if kind is EventKind.DELIVERED and event.transit.flips:
                 message.raw = self._damage(message.raw, event.transit.flips)
             message.receiver.settle(message, kind)
@@ -197,4 +195,4 @@ class LiveLink:
         if self.model.resets != self._resets:
             self._resets = self.model.resets
             for call in list(self.calls):
-                call.reset()
+                call.end(grpc.StatusCode.UNAVAILABLE, "the emulated network reset this stream")

@@ -26,7 +26,7 @@ import grpc.aio
 
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.event_queue import EventQueue
-from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, HardLimit, LiveLink, ServedCall
+from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, HardLimit, LiveLink, Room
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.report import Report, figures_of
 from channel_emu.model.channel import Channel
@@ -34,6 +34,7 @@ from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind, Link
 from channel_emu.model.trace import Trace, TraceWriter
 from freshfield.clock import WallClock
+from freshfield.streams import ServedCall
 from freshfield.transport import CLIENT_OPTIONS, Transport
 
 log = logging.getLogger("channel-emu")
@@ -114,6 +115,7 @@ class Proxy(grpc.GenericRpcHandler):
         self.channel = Channel(config, seed)
         self.stats = DelayStats()
         """Of all links together."""
+        self._room = Room()
         self.links: dict[str, LiveLink] = {}
         self.port = 0
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -227,7 +229,7 @@ class Proxy(grpc.GenericRpcHandler):
             log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
             name, model, self.events, DelayStats(self.stats), self.fail, damage or _damage_any_byte,
-            self._trace, self.channel.config.hard_limit_ms,
+            self._trace, self.channel.config.hard_limit_ms, self._room,
         )  # fmt: skip
         # A fault may act before the first message.
         self.events.schedule(link)

@@ -18,7 +18,7 @@ class Figures:
     """Of one link, or of all links together: offered = delivered + dropped + in_flight.
 
     outcomes: by ``link.EventKind``, with ``forwarded`` (handed on) and ``cancelled`` (delivered after the
-        call was over).
+        call was over) and ``overfull`` (dropped before the link: no room for more bytes, not in offered).
     mean_age_ms, peak_age_ms: age of the newest message handed on, counted from when the proxy received it,
         between the first one handed on and the last that came in or went out; the mean over links, None where
         there is none.
@@ -57,7 +57,7 @@ def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
     outcomes: Counter[str] = Counter()
     for link in links:
         outcomes.update({str(kind): count for kind, count in link.model.counts.items()})
-        outcomes.update(forwarded=link.forwarded, cancelled=link.cancelled)
+        outcomes.update(forwarded=link.forwarded, cancelled=link.cancelled, overfull=link.overfull)
     return Figures(
         offered=sum(link.model.offered for link in links),
         delivered=outcomes[EventKind.DELIVERED],

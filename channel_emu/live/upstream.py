@@ -15,7 +15,8 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from channel_emu.live.live_link import STREAM_ENDED, Message
-from freshfield.transport import backoff_s
+from freshfield.limits import MAX_MESSAGE_BYTES, MAX_REASONS
+from freshfield.transport import backoff_s, peer_text
 from freshfield.v1 import frames_pb2 as pb
 
 log = logging.getLogger("channel-emu")
@@ -67,13 +68,18 @@ class Upstream:
         """Send a frame that is due now. Never blocks."""
         if not self.connected:
             self._broken(frame)
-        elif len(self._outbox) + len(self._unanswered) >= CREDITS:
+        elif self._full(frame):
             if self._held is not None:
                 self._broken(self._held)
             self._held = frame
         else:
             self._outbox.append(frame)
             self._wake.set()
+
+    def _full(self, frame: Message) -> bool:
+        """Whether the credits are used up, which hold for bytes as well as for frames."""
+        out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
+        return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
 
     @property
     def pending(self) -> int:
@@ -114,7 +120,7 @@ class Upstream:
                 if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
             code, details = await call.code(), await call.details()
-            self._log_trouble(f"{code.name}: {details}" if details else code.name)
+            self._log_trouble(f"{code.name}: {peer_text(details)}" if details else code.name)
             return reader.done() and not reader.cancelled() and reader.result()
         finally:
             self.connected = False
@@ -149,7 +155,9 @@ class Upstream:
                 if not answered:
                     answered, self._trouble = True, ""
                 if response.outcome == pb.OUTCOME_REJECTED:
-                    self.rejected[response.reason[:48] or "unspecified"] += 1
+                    reason = peer_text(response.reason[:48]) or "unspecified"
+                    known = reason in self.rejected or len(self.rejected) < MAX_REASONS
+                    self.rejected[reason if known else "other"] += 1
                 if self._held is not None:
                     self._outbox.append(self._held)
                     self._held = None
@@ -170,7 +178,7 @@ class Upstream:
     def _log_trouble(self, trouble: Any) -> None:
         """Log what broke, once per kind of trouble and not once per attempt."""
         if isinstance(trouble, grpc.aio.AioRpcError):
-            trouble = f"{trouble.code().name}: {trouble.details()}"
+            trouble = f"{trouble.code().name}: {peer_text(trouble.details())}"
         if str(trouble) != self._trouble:
             self._trouble = str(trouble)
             log.warning("%s: stream to the edge ended (%s); trying again", self.camera, self._trouble)

@@ -89,7 +89,7 @@ class Backbone:
 def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -> Backbone:
     """Load the detector at ``path``. tap, size: as in EmbeddingConfig. Raises EmbeddingError."""
     data = _read(path)
-    model = _parse(data, path)
+    model = parse_model(data, path)
     meta = {p.key: p.value for p in model.metadata_props}
     image = _image_input(model, path)
     at = _find_tap(model, tap, path)
@@ -114,7 +114,7 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
 def cut_layers(path: Path, taps: tuple[str, ...]) -> tuple[bytes, str]:
     """Cut the detector at ``path`` after the feature maps ``taps``. Returns its ONNX bytes and the name of
     its input; the outputs are the maps, under their own names. Raises EmbeddingError."""
-    model = _parse(_read(path), path)
+    model = parse_model(_read(path), path)
     image = _image_input(model, path)
     cut = _cut(model, image.name, {_find_tap(model, tap, path): None for tap in taps}, path)
     return cut.SerializeToString(), image.name
@@ -131,13 +131,21 @@ def _read(path: Path) -> bytes:
         raise EmbeddingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _parse(data: bytes, path: Path) -> onnx.ModelProto:
+def parse_model(data: bytes, path: Path) -> onnx.ModelProto:
+    """The model of an ONNX file, without subgraphs: a loop of 2^62 rounds fits into a hundred bytes. Raises
+    EmbeddingError."""
     try:
         model = onnx.load_model_from_string(data)
     except (DecodeError, ValueError, RuntimeError):
         raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the detector again") from None
     if not model.graph.node or not model.opset_import:
         raise EmbeddingError(f"{path}: not an ONNX model; export the detector with format=onnx")
+    loops = sorted({n.op_type for n in model.graph.node for a in n.attribute if a.HasField("g") or a.graphs})
+    if loops or model.functions:
+        raise EmbeddingError(
+            f"{path}: holds {', '.join(loops) or 'functions'}, which no network of images needs; export it "
+            "without control flow"
+        )
     words = [w for n in model.graph.node for w in (n.op_type, n.name, *n.input, *n.output)]
     words += [named.name for part in (model.graph.initializer, model.graph.input) for named in part]
     if not all(isinstance(word, str) for word in words):  # bytes: no UTF-8

@@ -14,6 +14,7 @@ from edge_server.export import ExportError, PosedImage, file_names
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
 from freshfield.geometry import GeometryError, Pose
+from freshfield.untrusted import stored_bytes
 
 # In order: a run's last checkpoint, a fit's checkpoint.
 NAMES = ("field.npz", "field")
@@ -47,7 +48,7 @@ def open_source(path: Path) -> Source:
     none, or it cannot be read."""
     file = find_checkpoint(path)
     try:
-        state, about = checkpoint.load(file)
+        state, about = checkpoint.load(file, most_bytes=stored_bytes(file))
         name = str(about["field"])
         options: dict[str, Any] = dict(about.get("options") or {})
         field = make_field(name, _saved_options(name, options, state), seed=int(about.get("seed", 0)))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, model_path
-from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, USUAL_SIDE
+from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, USUAL_SIDE, parse_model
 from edge_server.embed.embedder import open_session
 from edge_server.embed.letterbox import blob, checked
 from edge_server.foreground import ForegroundError
@@ -111,7 +111,9 @@ def open_model(file: Path, provider: str, threads: int) -> Any:
     try:
         if file.stat().st_size > MAX_FILE_BYTES:
             raise ForegroundError(f"{file}: larger than {MAX_FILE_BYTES >> 20} MB")
-        return open_session(file.read_bytes(), provider, threads, str(file))[0]
+        data = file.read_bytes()
+        parse_model(data, file)
+        return open_session(data, provider, threads, str(file))[0]
     except OSError as error:
         raise ForegroundError(
             f"{file}: cannot be read: {error.strerror}; name a model in ONNX format"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import AsyncIterator
 
 import grpc
 import grpc.aio
@@ -15,8 +14,10 @@ from grpc_reflection.v1alpha import reflection
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
+from freshfield.limits import MAX_WATCHERS
+from freshfield.streams import OpenStreams
 from freshfield.transport import Transport
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
 
     def __init__(self, state: EdgeState) -> None:
         self._state = state
+        self._watchers = OpenStreams(MAX_WATCHERS)
 
     async def GetStatus(
         self, request: edge_pb2.GetStatusRequest, context: grpc.aio.ServicerContext
@@ -72,14 +74,15 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
 
     async def WatchDecisions(
         self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext
-    ) -> AsyncIterator[edge_pb2.WatchDecisionsResponse]:
+    ) -> None:
         last = self._state.newest()
         seen = -1 if last is None else last.number
-        while True:
-            for publication in self._state.publications(since=seen):
-                seen = publication.number
-                yield edge_pb2.WatchDecisionsResponse(decision=to_decision(publication))
-            await asyncio.sleep(_WATCH_S)
+        async with self._watchers.open(context):
+            while True:
+                for publication in self._state.publications(since=seen):
+                    seen = publication.number
+                    await context.write(edge_pb2.WatchDecisionsResponse(decision=to_decision(publication)))
+                await asyncio.sleep(_WATCH_S)
 
     async def ResetField(
         self, request: edge_pb2.ResetFieldRequest, context: grpc.aio.ServicerContext
@@ -167,7 +170,7 @@ class GrpcThread:
 
     async def _serve(self) -> None:
         server = self._transport.aio_server()
-        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self._ingest, server)
+        self._ingest.add_to_server(server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
         edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
         checker = health.aio.HealthServicer()

@@ -6,9 +6,10 @@ checked and the frame is buffered.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import grpc
@@ -17,10 +18,15 @@ import grpc.aio
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
 from freshfield.clock import Clock
-from freshfield.frame import Frame, FrameRejected, from_request, valid_id
+from freshfield.frame import Frame, FrameRejected, counted_ids, from_request, parse
 from freshfield.ledger import Ledger
+from freshfield.limits import MAX_IMAGE_SIDE_PX
+from freshfield.streams import OpenStreams, ServedCall, SessionStreams
 from freshfield.v1 import frames_pb2 as pb
-from freshfield.v1 import frames_pb2_grpc
+
+log = logging.getLogger(__name__)
+
+_SERVICE = pb.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
 
 
 @dataclass
@@ -30,22 +36,40 @@ class _Session:
 
     sequence: int = -1
     generated_ns: int = -(2**63)
+    began_ns: int = 0
+    """Capture time of its first admitted frame, on the edge's clock."""
 
 
 class FrameAdmission:
-    """Checks the order and the time of frames, by camera and session."""
+    """Checks the order and the time of frames, by camera and session, and their size.
 
-    def __init__(self, training: Collection[str], held_out: Collection[str]) -> None:
+    max_side_px: of an image, see ``Scenario.max_side_px``.
+    """
+
+    def __init__(
+        self, training: Collection[str], held_out: Collection[str], max_side_px: int = MAX_IMAGE_SIDE_PX
+    ) -> None:
+        self._max_side_px = max_side_px
         self._roles = {c: False for c in training} | {c: True for c in held_out}
+        self.cameras: Collection[str] = self._roles.keys()
+        self.doubled: Counter[str] = Counter()
+        """Frames that came from a second node of the same name, by camera."""
         self._sessions: dict[str, OrderedDict[str, _Session]] = {c: OrderedDict() for c in self._roles}
 
     def admit(self, frame: Frame, now_ns: int) -> None:
-        """Raises FrameRejected with reason unknown_camera, wrong_role, replayed_sequence, time_reversed,
-        from_future or too_old. now_ns: on the edge's clock."""
+        """Raises FrameRejected with reason unknown_camera, wrong_role, too_large, replayed_sequence,
+        time_reversed, from_future or too_old. now_ns: on the edge's clock."""
         if frame.camera not in self._roles:
             raise FrameRejected("unknown_camera", f"camera {frame.camera!r} is not part of this scenario")
         if frame.held_out != self._roles[frame.camera]:
             raise FrameRejected("wrong_role", f"{frame.camera} is held out on one side and not on the other")
+        k = frame.intrinsics
+        if max(k.width, k.height) > self._max_side_px:
+            raise FrameRejected(
+                "too_large",
+                f"{k.width} x {k.height}: the scenario (source.width, source.height) has images of at most "
+                f"{self._max_side_px} pixels a side",
+            )
         sessions = self._sessions[frame.camera]
         session = sessions.get(frame.session, _Session())
         if frame.sequence <= session.sequence:
@@ -65,15 +89,31 @@ class FrameAdmission:
             raise FrameRejected("too_old", f"captured {-ahead / 6e10:.0f} minutes ago: a wrong clock?")
         # Only an admitted frame changes the session: a refused one does not affect the next.
         session.sequence, session.generated_ns = frame.sequence, frame.generated_ns
-        sessions[frame.session] = session
+        if frame.session not in sessions:
+            session.began_ns = frame.generated_edge_ns
+            sessions[frame.session] = session
+        self._look_for_two_nodes(frame, sessions)
         sessions.move_to_end(frame.session)
         while len(sessions) > limits.MAX_SESSIONS_PER_CAMERA:
             sessions.popitem(last=False)
 
+    def _look_for_two_nodes(self, frame: Frame, sessions: OrderedDict[str, _Session]) -> None:
+        """A node that restarts captures nothing for its old session any more; two go on side by side."""
+        newest_began_ns = max(session.began_ns for session in sessions.values())
+        began_ns = sessions[frame.session].began_ns
+        if began_ns < newest_began_ns < frame.generated_edge_ns - limits.MAX_CLOCK_UNCERTAINTY_NS:
+            if frame.camera not in self.doubled:
+                log.warning(
+                    "%s: two nodes send as this camera, each in a session of its own: give one another id "
+                    "(cameras.ids)", frame.camera,
+                )  # fmt: skip
+            self.doubled[frame.camera] += 1
 
-class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
+
+class Ingest:
     """FrameStreamService of the edge.
 
+    max_side_px: see ``FrameAdmission``.
     on_held_out(frame), on_accepted(request, now_ns): called on the event loop for held-out frames and for
     every accepted one; they must not block.
     Counts are plain numbers; readers see them without a lock.
@@ -87,10 +127,11 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         ledger: Ledger,
         on_held_out: Callable[[Frame], None],
         on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
+        max_side_px: int = MAX_IMAGE_SIDE_PX,
     ) -> None:
         self._clock = clock
         self._buffer = buffer
-        self._admission = FrameAdmission(buffer.cameras, held_out)
+        self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px)
         self._ledger = ledger
         self._on_held_out = on_held_out
         self._on_accepted = on_accepted
@@ -99,38 +140,43 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         self.rejected_by_camera: Counter[str] = Counter()
         self.newest_held_out: dict[str, Frame] = {}
         self.check_ms = RollingPercentiles(4096)
-        self._streams = 0
-        self._max_streams = limits.MAX_STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
+        cameras = self.admission.cameras
+        self.streams = OpenStreams(limits.MAX_STREAMS_PER_CAMERA * len(cameras))
+        self._sessions = SessionStreams(cameras)
 
-    async def Push(
-        self, request_iterator: AsyncIterator[pb.PushRequest], context: grpc.aio.ServicerContext
-    ) -> AsyncIterator[pb.PushResponse]:
-        if self._streams >= self._max_streams:
-            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
-        self._streams += 1
-        try:
-            async for request in request_iterator:
-                yield self.take(request)
-        finally:
-            self._streams -= 1
+    def add_to_server(self, server: grpc.aio.Server) -> None:
+        """Messages are parsed in ``take``: gRPC would end the stream at one that cannot be."""
+        push = grpc.stream_stream_rpc_method_handler(self._push, None, pb.PushResponse.SerializeToString)
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, {"Push": push}),))
 
-    def take(self, request: pb.PushRequest) -> pb.PushResponse:
-        """Check and buffer one frame and enter it in the ledger; the response says what became of it."""
+    async def _push(self, _: object, context: grpc.aio.ServicerContext) -> None:
+        async with self.streams.open(context) as stream:
+            while (message := await context.read()) is not grpc.aio.EOF:
+                await context.write(self.take(message, stream))
+
+    def take(self, message: bytes | pb.PushRequest, stream: ServedCall | None = None) -> pb.PushResponse:
+        """Check and buffer one frame, which came on ``stream``, and enter it in the ledger; the response says
+        what became of it."""
         start_s = time.perf_counter()
         now_ns = self._clock.now_ns()
-        header = request.header
+        header = pb.FrameHeader()
         try:
+            request = parse(message) if isinstance(message, bytes) else message
+            header = request.header
             frame = from_request(request)
-            self._admission.admit(frame, now_ns)
+            if stream is not None and frame.camera in self.admission.cameras:
+                self._sessions.claim(frame.camera, frame.session, stream, now_ns)
+            self.admission.admit(frame, now_ns)
         except FrameRejected as error:
             self.rejected[error.reason] += 1
-            # A hostile id must not break the ledger's lines.
-            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
+            camera, session = counted_ids(header, self.admission.cameras)
             self.rejected_by_camera[camera] += 1
             self._ledger.write(now_ns, camera, session, header.sequence, "rejected", error.reason)
             return pb.PushResponse(
                 sequence=header.sequence, outcome=pb.OUTCOME_REJECTED, reason=error.reason, detail=str(error)
             )
+        if stream is not None:
+            self.streams.use(stream)
         if frame.held_out:
             self.newest_held_out[frame.camera] = frame
             self._on_held_out(frame)

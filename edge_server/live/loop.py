@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
+STOP_S = 10.0
+"""How long the server waits at its end for the update in progress."""
 
 
 class UpdateLoop:
@@ -65,8 +67,8 @@ class UpdateLoop:
     def start(self) -> None:
         self._thread.start()
 
-    def stop(self, timeout_s: float = 10.0) -> None:
-        """Ask the loop to end after the current update, and wait for it."""
+    def stop(self, timeout_s: float = STOP_S) -> None:
+        """Ask the loop to end after the current update, and wait for it; ``alive`` says whether it has."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)

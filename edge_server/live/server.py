@@ -25,7 +25,7 @@ from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import open_updater
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, RollingPercentiles
-from edge_server.live.loop import UpdateLoop
+from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.policies import ServerPolicies
@@ -35,8 +35,10 @@ from edge_server.live.update_budget import open_budget
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
+from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, TransportError
+from freshfield.untrusted import stored_bytes
 
 if TYPE_CHECKING:  # imported at run time only where a run is recorded
     from edge_server.live.output.recorder import Recorder
@@ -85,13 +87,14 @@ class EdgeServer:
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
+        self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
         budget, field_options = open_budget(scenario, config)
         self.field = make_field(config.field, {"nice": SERVER_NICE, **field_options}, seed=scenario.seed)
         resumed_updates = 0
         if options.resume is not None:
-            state, about = checkpoint.load(options.resume)
+            state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
             self.field.load_state(state)
             # Numbers continue, so that a snapshot does not take the name of an earlier one.
             resumed_updates = max(0, int(about.get("updates", 0)))
@@ -121,7 +124,7 @@ class EdgeServer:
             log.info("recording to %s", self.recorder.file)
         self.ingest = Ingest(
             self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
-            None if self.recorder is None else self.recorder.frame,
+            None if self.recorder is None else self.recorder.frame, scenario.max_side_px,
         )  # fmt: skip
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
         self.loop = UpdateLoop(
@@ -256,11 +259,17 @@ class EdgeServer:
     def _save_snapshot(self) -> Path:
         if not self.state.started:
             raise RuntimeError("the field has not been trained yet")
-        path = self.options.out / f"snapshot-{self.updater.number:06d}.npz"
+        if len(list(self.options.out.glob("snapshot-*.npz"))) >= MAX_SNAPSHOTS:
+            raise RuntimeError(f"{self.options.out} holds {MAX_SNAPSHOTS} already: move some away")
+        if not self._snapshot_lock.acquire(blocking=False):
+            raise RuntimeError("another one is being written")
         try:
+            path = self.options.out / f"snapshot-{self.updater.number:06d}.npz"
             return self.loop.request_checkpoint(path).result(_SNAPSHOT_TIMEOUT_S)
         except TimeoutError:
             raise RuntimeError(f"the update in progress took over {_SNAPSHOT_TIMEOUT_S:g} s") from None
+        finally:
+            self._snapshot_lock.release()
 
     def _write_checkpoint(self, path: Path) -> None:
         about = {
@@ -307,6 +316,8 @@ class EdgeServer:
                 _values(c, "camera", "held_out", "age_ms", "delivered", "rejected") for c in self._cameras()
             ],
             "rejected": dict(self.ingest.rejected),
+            "streams_ended": self.ingest.streams.ended,
+            "two_nodes": dict(self.ingest.admission.doubled),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
             "decisions_lost": self._decision_log.lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
@@ -341,8 +352,11 @@ class EdgeServer:
             if (comparison := self.state.comparison) is not None:
                 for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-            if self.state.started and not self.loop.alive:
-                self._write_checkpoint(self.options.out / "field.npz")
+            path = self.options.out / "field.npz"
+            if self.loop.alive:
+                log.error("%s: not written: the last update did not end within %g s", path, STOP_S)
+            elif self.state.started:
+                self._write_checkpoint(path)
             if self.trainer is not None:
                 self.trainer.close()
         except OSError as error:

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -168,7 +169,8 @@ class EdgeState:
     def publications(self, since: int = -1) -> list[Publication]:
         """Publications with a number above ``since``, oldest first."""
         with self._lock:
-            return [p for p in self._publications if p.number > since]
+            new = takewhile(lambda p: p.number > since, reversed(self._publications))
+            return list(new)[::-1]
 
     def newest(self, scored: bool = False) -> Publication | None:
         """The newest publication, or the newest one that has scores; None before the first."""

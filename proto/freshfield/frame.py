@@ -8,14 +8,17 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Container
 from dataclasses import dataclass
 
 import google_crc32c
+from google.protobuf.message import DecodeError
 
 from freshfield import limits, payload
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 
+OTHER = "?"
 _ID = re.compile(rf"[A-Za-z0-9._-]{{1,{limits.MAX_ID_CHARS}}}")
 _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
 CODEC_NAMES = {number: name for name, number in _CODECS.items()}
@@ -65,6 +68,15 @@ def valid_id(text: str) -> bool:
     return _ID.fullmatch(text) is not None
 
 
+def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, str]:
+    """Camera and session under which a refused frame is counted and written down: ``?`` for what is not an
+    id, and together for all who are not one of ``cameras``, because counts of made-up ids would stay."""
+    camera, session = header.camera_id, header.session_id
+    if camera not in cameras:
+        return OTHER, OTHER
+    return camera, session if valid_id(session) else OTHER
+
+
 def checksum(header: pb.FrameHeader, data: bytes) -> int:
     """CRC32C over the header's fields, packed in a fixed order, and the payload: a flipped bit must not turn
     into a wrong pose."""
@@ -108,6 +120,14 @@ def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
     p, k = h.pose, h.intrinsics
     lens = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
     return Pose((p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)), lens
+
+
+def parse(raw: bytes) -> pb.PushRequest:
+    """The message in ``raw``. Raises FrameRejected with reason unparsable."""
+    try:
+        return pb.PushRequest.FromString(raw)
+    except DecodeError:
+        raise FrameRejected("unparsable", f"{len(raw)} bytes that are no PushRequest") from None
 
 
 def from_request(request: pb.PushRequest) -> Frame:

@@ -20,8 +20,35 @@ MAX_IMAGE_SIDE_PX = 4096
 MAX_PNG_CHUNKS = 10_000
 """Of one PNG, all of which a decoder looks at. Encoders write 8 kB or more into a chunk: 1000 in 8 MB."""
 
+MAX_JPEG_SEGMENTS = 1000
+"""Before a JPEG's first scan, fill bytes included. A camera writes some ten; a 16 MB profile takes 250."""
+
+MAX_JPEG_SCANS = 16
+"""Of one JPEG: a baseline one has 1 to 3, a progressive one some 10. A decoder visits every block in each."""
+
 MAX_ID_CHARS = 64
-"""Of a camera or session id: it becomes part of file names and of ledger lines."""
+"""Of a camera or session id: it becomes part of file names and of ledger lines. Of a policy's name too."""
+
+MAX_PEER_TEXT_CHARS = 200
+"""Of a peer's words in a log line."""
+
+MAX_REASONS = 32
+"""Different reasons of a peer's refusals that are counted apart: a broken peer may make them up."""
+
+# --- files ------------------------------------------------------------------------------------
+
+MAX_YAML_CHARS = 2**17
+"""Of one scenario or other YAML file: a thousand cameras with the longest ids take half of it, and its reader
+takes 2 s for as many characters."""
+
+MAX_ERROR_CHARS = 1000
+"""Of what an error quotes from a file."""
+
+MAX_CHUNK_BYTES = 16 * 2**20
+"""Of a recording's compressed chunk, unpacked: writers end one at 1 MB, but for the largest image."""
+
+MAX_UNPACKED_PER_BYTE = 20
+"""Of all compressed chunks of a recording together: most of it is images, which do not compress."""
 
 # --- streams and cameras ----------------------------------------------------------------------
 
@@ -30,13 +57,32 @@ MAX_CAMERAS = 1000
 
 MAX_STREAMS_PER_CAMERA = 4
 """Streams open at once at a process, for each of its cameras: one is in use, others may be closing after a
-restart."""
+restart. Beyond that a new stream ends the one of least use."""
+
+MAX_WATCHERS = 32
+"""Of decisions, at once. Each takes a look at the state twenty times a second."""
+
+MAX_SNAPSHOTS = 20
+"""In the folder of one run: whoever asks for more is told to move some away."""
+
+MAX_SCRAPES = 8
+"""Connections open at once to the metrics: a new one ends the oldest."""
+
+SCRAPE_TIMEOUT_S = 5.0
+"""How long one of them may say nothing."""
+
+MAX_QUEUED_BYTES = 256 * 2**20
+"""Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""
 
 MAX_CONCURRENT_STREAMS = 1024
 """Of one gRPC connection: a stream for each camera of the largest scenario, and some calls beside them."""
 
 MAX_SESSIONS_PER_CAMERA = 64
 """Sessions remembered for a camera. A forgotten session could be replayed, so many are remembered."""
+
+SESSION_IDLE_NS = 2 * 10**9
+"""After as long without a frame, another stream may go on with a session: a node whose stream is gone without
+a word opens another one."""
 
 # --- time -------------------------------------------------------------------------------------
 

@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 
 from freshfield.frame import valid_id
-from freshfield.limits import MAX_CAMERAS
+from freshfield.limits import MAX_CAMERAS, MAX_ERROR_CHARS, MAX_IMAGE_SIDE_PX
+from freshfield.untrusted import UntrustedError, read_yaml
 
 PHASES = ("locked", "spread")
 # What every fidelity of a run without held-out cameras is called: on page, report, console and in metrics.
@@ -42,7 +42,10 @@ SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot run. The message is one line: file, key, what was expected."""
+    """A scenario that cannot run. The message is one line, cut short: file, key, what was expected."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message if len(message) <= MAX_ERROR_CHARS else f"{message[:MAX_ERROR_CHARS]} ...")
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,14 @@ class Scenario:
     def training(self) -> tuple[str, ...]:
         return tuple(c for c in self.cameras if c not in self.held_out)
 
+    @property
+    def max_side_px(self) -> int:
+        """The largest image side that its cameras send: of the source's width and height, where it has both,
+        else whatever is accepted at all."""
+        sides = [self.source.get(name) for name in ("width", "height")]
+        whole = [side for side in sides if type(side) is int and side > 0]
+        return max(whole) if len(whole) == len(sides) else MAX_IMAGE_SIDE_PX
+
     def phase_ns(self, camera: str, fps: float) -> int:
         """How much later than the ticks of its rate a camera captures (``cameras.phase``)."""
         return 0 if self.phase == "locked" else int(self.rng("phase", camera).random() * 1e9 / fps)
@@ -111,12 +122,14 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
     if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
         file = SCENARIO_FOLDER / f"{file}.yaml"
     try:
-        data = yaml.safe_load(file.read_text())
+        data = read_yaml(file.read_text())
     except OSError as error:
         shipped = ", ".join(sorted(p.stem for p in SCENARIO_FOLDER.glob("*.yaml")))
         raise ScenarioError(f"{file}: {error.strerror}; shipped scenarios: {shipped or 'none'}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{file}: not YAML: {' '.join(str(error).split())}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{file}: not YAML: {error}") from None
+    except UntrustedError as error:
+        raise ScenarioError(f"{file}: {error}") from None
     return parse(data, file, seed)
 
 

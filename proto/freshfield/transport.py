@@ -17,7 +17,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES
+from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES, MAX_PEER_TEXT_CHARS
 
 _KEEPALIVE_MS = 10_000
 
@@ -59,6 +59,11 @@ def backoff_s(failures: int, first_s: float, max_s: float, jitter: np.random.Gen
     jitter: one draw is taken, so that the cameras do not all come back at once.
     """
     return min(first_s * 2.0 ** min(failures, 60), max_s) * float(jitter.uniform(0.5, 1.0))
+
+
+def peer_text(text: str | None) -> str:
+    """What a peer said, for a log: on one line, without the characters that command a terminal, cut short."""
+    return repr((text or "")[:MAX_PEER_TEXT_CHARS])[1:-1]
 
 
 class TransportError(ValueError):

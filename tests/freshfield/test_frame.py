@@ -12,10 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from freshfield import payload
-from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
+from freshfield.frame import (
+    Frame,
+    FrameRejected,
+    checksum,
+    counted_ids,
+    from_request,
+    parse,
+    to_request,
+    valid_id,
+)
 from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 from tests.conftest import data_dir
+from tests.work import MOST_MS, work_ms
 
 IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
 DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}
@@ -124,6 +134,8 @@ def set_header(**values):
         (set_header(codec=pb.CODEC_UNSPECIFIED), "unknown_codec"),
         (set_header(role=pb.ROLE_UNSPECIFIED), "bad_header"),
         (set_header(role=7), "bad_header"),
+        (set_header(codec=-1), "unknown_codec"),
+        (set_header(role=-7), "bad_header"),
         (set_header(clock_uncertainty_ns=-1), "bad_header"),
         (set_header(pose_gap_ns=-1), "bad_header"),
         (set_header(pose__qw=math.nan), "bad_pose"),
@@ -245,3 +257,37 @@ def test_valid_ids_are_safe_in_file_names_and_ledgers(text):
     assert valid_id(text) == (
         1 <= len(text) <= 64 and all(c.isascii() and (c.isalnum() or c in "._-") for c in text)
     )
+
+
+RAW = to_request(frame()).SerializeToString()
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_message_or_unparsable(data):
+    try:
+        parse(data)
+    except FrameRejected as error:
+        assert error.reason == "unparsable"
+
+
+@pytest.mark.parametrize("raw", [RAW + b"\0\0", RAW[:-1], b"\xff" * 9, b"\x0b"], ids=bytes.hex)
+def test_bytes_that_are_no_message_are_refused(raw):
+    with pytest.raises(FrameRejected) as error:
+        parse(raw)
+    assert error.value.reason == "unparsable"
+
+
+@pytest.mark.parametrize("field", [b"\x78\0", b"\x0a\0"], ids=["unknown fields", "headers"])
+def test_four_million_fields_are_read_at_once(field):
+    raw = RAW + field * (4 * 2**20 - 1000)
+    assert parse(raw).header.camera_id == "cam07"
+    assert work_ms(lambda: parse(raw)) < MOST_MS
+
+
+def test_refusals_of_strangers_are_counted_together():
+    def ids(camera, session):
+        return counted_ids(pb.FrameHeader(camera_id=camera, session_id=session), ["cam07"])
+
+    assert ids("cam07", "s1") == ("cam07", "s1")
+    assert ids("cam07", "a\tb") == ("cam07", "?")
+    assert ids("cam08", "s1") == ids("made-up", "s2") == ("?", "?")

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
 from freshfield.payload import PayloadError, check, decode, encode
+from tests.work import MOST_MS, work_ms
 
 # --- what is encoded comes back ----------------------------------------------------------------
 
@@ -115,6 +116,10 @@ def claim(data: bytes, chunk: bytes, length: int) -> bytes:
 
 JPEG = encode(np.random.default_rng(2).integers(0, 256, (48, 64, 3), dtype=np.uint8), "jpeg")
 PNG = encode(np.random.default_rng(2).integers(0, 256, (48, 64, 3), dtype=np.uint8), "png")
+PROGRESSIVE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[
+    1
+].tobytes()
+SCAN = PROGRESSIVE[PROGRESSIVE.rindex(b"\xff\xda") : -2]
 FRAME_HEADER = bytes.fromhex("ffc0000b0800300040010111 00")  # a second one, 64 x 48, of one component
 BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
 
@@ -137,6 +142,9 @@ BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
         (JPEG[:3], "jpeg", (64, 48), "bad_payload"),
         # Two frame headers: decoders disagree on which one counts.
         (JPEG[:2] + FRAME_HEADER + JPEG[2:], "jpeg", (64, 48), "bad_payload"),
+        # As many scans as there is room for: a decoder visits every block of the image in each.
+        (PROGRESSIVE[:-2] + 7 * SCAN + PROGRESSIVE[-2:], "jpeg", (64, 48), "too_many_scans"),
+        (PROGRESSIVE[:-2] + 40_000 * SCAN + PROGRESSIVE[-2:], "jpeg", (64, 48), "too_many_scans"),
         # Decoders make room for what a chunk claims to hold, and look at every chunk.
         (claim(PNG, b"IDAT", 2**31), "png", (64, 48), "bad_payload"),
         (claim(PNG, b"IEND", 2**32 - 1), "png", (64, 48), "bad_payload"),
@@ -151,6 +159,35 @@ def test_hostile_headers_are_refused_by_check_alone(data, codec, size, reason):
     assert error.value.reason == reason
     with pytest.raises(PayloadError):
         decode(data, codec, *size)
+
+
+ROOM = MAX_PAYLOAD_BYTES - len(JPEG)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        JPEG[:2] + b"\xff" * ROOM + JPEG[2:],  # fill bytes
+        JPEG[:2] + b"\xff\xfe\0\x02" * (ROOM // 4) + JPEG[2:],  # empty comments
+        JPEG[:-2] + b"\xff" * ROOM + JPEG[-2:],
+        JPEG[:-2] + b"\xff\xda" * (ROOM // 2) + JPEG[-2:],
+    ],
+    ids=["fill bytes", "comments", "fill bytes in the scan", "scans"],
+)
+def test_eight_megabytes_that_keep_a_reader_busy(data):
+    def read():
+        try:
+            check(data, "jpeg", 64, 48)
+        except PayloadError:
+            return
+
+    assert work_ms(read) < MOST_MS
+
+
+def test_a_progressive_jpeg_and_one_with_fill_bytes_are_welcome():
+    assert decode(PROGRESSIVE, "jpeg", 64, 48).shape == (48, 64, 3)
+    padded = JPEG[:2] + b"\xff\xff" + JPEG[2:]
+    np.testing.assert_array_equal(decode(padded, "jpeg", 64, 48), decode(JPEG, "jpeg", 64, 48))
 
 
 def test_a_bomb_of_the_announced_size_is_bounded():

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, load, parse, read_section
 
 FILE = Path("s.yaml")
@@ -134,3 +135,11 @@ def test_phases_of_cameras(tmp_path):
     assert len(set(phases)) == 3 and all(0 <= phase < 1e9 / 15 for phase in phases)
     with pytest.raises(ScenarioError, match=r"cameras\.phase: expected locked or spread, got 'shifted'"):
         parse({"cameras": {**cameras, "phase": "shifted"}}, tmp_path / "a.yaml")
+
+
+def test_images_are_as_large_as_the_source_says_and_else_bounded():
+    def largest(**source):
+        return parse({"cameras": {"count": 2}, "source": source}, FILE).max_side_px
+
+    assert largest(width=128, height=96) == 128 and largest(width=96, height=128) == 128
+    assert largest() == largest(width=128) == largest(width="128", height=0) == MAX_IMAGE_SIDE_PX

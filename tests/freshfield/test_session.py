@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
+import zstandard
 
 from freshfield import frame as wire
 from freshfield import payload
 from freshfield.geometry import Pinhole, Pose, look_at
+from freshfield.limits import MAX_CHUNK_BYTES
 from freshfield.session import DECISIONS, SessionError
+from tests.work import MOST_MS, work_ms
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 
+import lz4.frame
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
+from freshfield.session import reader
 from freshfield.session.reader import Session
 from freshfield.session.writer import SessionWriter
 
@@ -196,3 +204,46 @@ def test_a_recording_is_never_overwritten(tmp_path):
     shutil.copy(tmp_path / "a.mcap", tmp_path / "b.mcap")
     with pytest.raises(FileExistsError):
         SessionWriter(tmp_path / "b.mcap", {})
+
+
+def chunk_of(data: bytes, says: int, how: str) -> bytes:
+    """A file of one compressed chunk that says how many bytes it has."""
+    head = struct.pack("<QQQI", 0, 0, says, 0) + struct.pack("<I", len(how)) + how.encode()
+    body = head + struct.pack("<Q", len(data)) + data
+    return MCAP0_MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(body)) + body
+
+
+ZEROS = zstandard.ZstdCompressor(level=19).compress(bytes(2**28))
+LZ4_ZEROS = lz4.frame.compress(bytes(2**28))
+EMPTY_RECORDS = zstandard.compress(b"\x80" + bytes(8) + (b"\x80" + bytes(8)) * 1_000_000)
+BOMBS = {
+    "zstd": chunk_of(ZEROS, 2**28, "zstd"),
+    "zstd that says less": chunk_of(ZEROS, 1000, "zstd"),
+    "lz4": chunk_of(LZ4_ZEROS, 2**28, "lz4"),
+    "lz4 that says less": chunk_of(LZ4_ZEROS, 1000, "lz4"),
+    "no records": chunk_of(EMPTY_RECORDS, 9_000_009, "zstd"),
+    "another method": chunk_of(b"x" * 100, 100, "rot13"),
+    "damaged": chunk_of(ZEROS[:50], 2**28, "zstd"),
+}
+
+
+@pytest.mark.parametrize("data", BOMBS.values(), ids=BOMBS.keys())
+def test_a_chunk_bomb_is_left_out_and_said(tmp_path, data):
+    (tmp_path / "a.mcap").write_bytes(data)
+
+    def read():
+        session = Session(tmp_path / "a.mcap")
+        assert "1 damaged chunks or records left out" in session.cut and not session.frames
+        session.close()
+
+    assert work_ms(read) < MOST_MS
+
+
+def test_many_small_bombs_are_not_unpacked_one_after_the_other(tmp_path):
+    data = zstandard.ZstdCompressor(level=19).compress(bytes(MAX_CHUNK_BYTES))
+    one = chunk_of(data, MAX_CHUNK_BYTES, "zstd")
+    (tmp_path / "a.mcap").write_bytes(one + one[len(MCAP0_MAGIC) :] * 500)
+    unpacked = []
+    with mock.patch.object(reader, "_unpack", side_effect=lambda chunk: unpacked.append(chunk) or b""):
+        session = Session(tmp_path / "a.mcap")
+    assert "501 damaged chunks" in session.cut and len(unpacked) == 1

@@ -21,6 +21,7 @@ from freshfield.transport import (
     backoff_s,
     from_arguments,
     host_port,
+    peer_text,
 )
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
@@ -259,3 +260,9 @@ def test_the_back_off_doubles_to_its_bound_and_draws_once_each_time():
     pauses = [backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
     expected = [0.2, 0.4, 0.8, 1.6, 3.0, 3.0, 3.0]
     assert pauses == [pause * same.uniform(0.5, 1.0) for pause in expected]
+
+
+def test_what_a_peer_says_stays_on_one_line_of_a_log():
+    assert peer_text(None) == "" and peer_text("a b") == "a b"
+    assert peer_text("\x1b[2J\r\nWARNING all is well\u202e") == r"\x1b[2J\r\nWARNING all is well\u202e"
+    assert len(peer_text("x" * 10**6)) == 200

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import Closable, FixedPose, PairedPose, PoseProvider
 from freshfield.geometry import GeometryError, Pose
+from freshfield.untrusted import UntrustedError, read_yaml
 
 MAX_OFFSET_S = 1e6
 """Bound of the time offset: a larger one is the difference between two clocks' epochs."""
@@ -75,8 +75,8 @@ class MountedCameraPoses:
 def read_hand_eye(path: Path) -> HandEye:
     """Read a hand-eye calibration. Raises HandEyeError."""
     try:
-        data = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        data = read_yaml(path.read_text())
+    except (OSError, UnicodeDecodeError, UntrustedError) as error:
         raise HandEyeError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict) or "transform" not in data:
         raise HandEyeError(

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from camera_node.pose.pairing import PairingCounts, sort_samples
@@ -23,6 +22,7 @@ from camera_node.robot.calibration.targets import Corners, Target, TargetPose, e
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
+from freshfield.untrusted import read_yaml
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # Lower bound in pixels, so that perfect (rendered) images do not make a corner exact.
@@ -89,11 +89,11 @@ def read_visp_pose(file: Path) -> Array:
     """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in metres and radians. Raises
     CalibrationError."""
     try:
-        data = yaml.safe_load(file.read_text())
+        data = read_yaml(file.read_text())
         values = np.array(data["data"], dtype=np.float64).ravel()
         if values.shape != (6,) or not np.isfinite(values).all():
             raise ValueError(f"{values.size} numbers")
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         why = " ".join(str(error).split())
         raise CalibrationError(
             f"{file}: expected ViSP's YAML of a pose, data: tx ty tz and theta u: {why}"

@@ -21,6 +21,7 @@ from camera_node.sources.datasets.records import (
     camera_to_world,
     errors_at,
     find_files,
+    path_within,
 )
 from freshfield.geometry import quaternion_to_matrix
 
@@ -81,9 +82,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
         where = f"{file.with_stem('images')}: {image.name}"
         if image.camera not in lenses:
             raise DatasetError(f"{where}: its camera {image.camera} is not in {file.name}")
-        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
-            raise DatasetError(f"{where}: leads out of the folder of images")
-        picture = folder / image.name
+        with errors_at(where):
+            picture = folder / path_within(image.name)
         if not picture.is_file():
             missing += 1
             continue

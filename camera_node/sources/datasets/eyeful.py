@@ -30,6 +30,7 @@ from camera_node.sources.datasets.records import (
     PosedImage,
     errors_at,
     find_files,
+    path_within,
     read_array,
     read_json,
 )
@@ -126,7 +127,9 @@ def _from_json(file: Path) -> list[_Entry]:
 
 def _entry(entry: dict[str, Any], where: str) -> _Entry:
     name = entry.get("cameraId")
-    if not isinstance(name, str) or len(Path(name).parts) != 2 or ".." in Path(name).parts:
+    with errors_at(where):
+        parts = path_within(name).parts if isinstance(name, str) else ()
+    if not isinstance(name, str) or len(parts) != 2:
         raise DatasetError(f"{where}: cameraId is {name!r}, expected CAMERA/IMAGE")
     where = f"{where} ({name})"
     k, transform = read_array(entry, "K", (3, 3), where).T, read_array(entry, "T", (4, 4), where).T

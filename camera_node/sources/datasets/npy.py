@@ -1,55 +1,145 @@
 """Python objects in a ``.npy`` file, without running code from it.
 
-Such a file is a pickle, and a pickle is a program: here it may only build arrays, numbers, text, lists and
-dictionaries.
+Such a file is a pickle, and a pickle is a program. Here it can only build numbers, text, lists, dictionaries
+and arrays. numpy's own functions for arrays take the pickle's word for what lies in memory, and crash; those
+here build an array of numbers from as many bytes as it needs, and refuse every other.
 """
 
 from __future__ import annotations
 
+import functools
+import io
+import math
 import pickle
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
+from freshfield.untrusted import refuse_expansion
+
+
+class _Dtype:
+    """Stands for a numpy.dtype of numbers or text: its code, such as ``f8``, then its byte order."""
+
+    def __init__(self, code: str, *_: Any) -> None:
+        self._code, self._order = str(code), "|"
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._order = state[1]
+
+    def real(self) -> np.dtype[Any]:
+        found = np.dtype(self._order + self._code if self._order in "<>" else self._code)
+        if found.kind not in "biufcSUO" or found.fields is not None:
+            raise pickle.UnpicklingError(f"arrays of {found} are no plain data")
+        return found
+
+
+class _Array:
+    """Stands for a numpy.ndarray until its state is known. value: the array then."""
+
+    value: Any = None
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, dtype, columns_first, raw = state
+        if dtype.real().hasobject:
+            if type(raw) is not list or len(shape) > 1 or math.prod(shape) != len(raw):
+                raise pickle.UnpicklingError("an array of objects without its objects, or not in a row")
+            self.value = raw if shape else raw[0]
+        else:
+            self.value = _array(raw, dtype, shape, "F" if columns_first else "C")
+
+
+@functools.cache  # a text that is referred to often takes memory once
+def _bytes(text: str, encoding: str) -> bytes:
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it asks for the encoding {encoding}")
+    return text.encode("latin1")
+
+
+def _array(raw: Any, dtype: _Dtype, shape: tuple[int, ...], order: Any = "C") -> np.ndarray:
+    data = _bytes(raw, "latin1") if isinstance(raw, str) else raw  # text is how old protocols write bytes
+    if not isinstance(data, bytes | bytearray) or dtype.real().hasobject:
+        raise pickle.UnpicklingError("an array of numbers without its bytes")
+    return np.frombuffer(data, dtype.real()).reshape(shape, order=order)
+
+
+def _scalar(dtype: _Dtype, raw: Any) -> Any:
+    return _array(raw, dtype, ())[()]
+
 
 _HARMLESS = {
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("_codecs", "encode"),  # how Python 2 and old protocols write bytes
+    ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(),
+    ("numpy._core.multiarray", "scalar"): _scalar,
+    ("numpy._core.numeric", "_frombuffer"): _array,
+    ("numpy", "ndarray"): "ndarray",  # only to be named
+    ("numpy", "dtype"): _Dtype,
+    ("_codecs", "encode"): _bytes,
 }
 
 
-class _Plain(pickle.Unpickler):
+class _Plain(pickle._Unpickler):
+    """Python's own: the one in C makes room for what a few bytes claim."""
+
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+
+    stack: list[Any]
+
+    def load_build(self) -> None:
+        state, built = self.stack.pop(), self.stack[-1]
+        if not isinstance(built, _Array | _Dtype):
+            raise pickle.UnpicklingError("it changes what is no array")
+        built.__setstate__(state)
+
+    dispatch[pickle.BUILD[0]] = load_build
+
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy.core", "numpy._core")  # what it was called before numpy 2
         if (module, name) not in _HARMLESS:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data does not need")
-        return super().find_class(module, name)
+        return _HARMLESS[module, name]
 
 
 def load_object(file: Path) -> Any:
-    """The one object that ``numpy.save`` wrote. Raises DatasetError."""
+    """The one object that ``numpy.save`` wrote; an array of objects in it becomes a list. Raises
+    DatasetError."""
     try:
-        with file.open("rb") as stream:
-            version = np.lib.format.read_magic(stream)
-            head = (
-                np.lib.format.read_array_header_1_0
-                if version == (1, 0)
-                else np.lib.format.read_array_header_2_0
-            )
-            shape, _, dtype = head(stream)
-            if not dtype.hasobject or shape != ():
-                raise DatasetError(f"{file}: expected one Python object, got an array of {dtype} {shape}")
-            return _Plain(stream, encoding="latin1").load().item()
+        stream = io.BytesIO(file.read_bytes())
+        version = np.lib.format.read_magic(stream)
+        head = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = head(stream)
+        if not dtype.hasobject or shape != ():
+            raise DatasetError(f"{file}: expected one Python object, got an array of {dtype} {shape}")
+        found = _Plain(stream, encoding="latin1").load()
+        refuse_expansion(found, len(stream.getvalue()), _parts)
+        return _plain(found)
     except DatasetError:
         raise
     except FileNotFoundError:
         raise DatasetError(f"{file}: no such file") from None
     except Exception as error:  # a damaged pickle raises anything
-        why = " ".join(str(error).split()) or type(error).__name__
+        why = " ".join(str(error).split())[:200] or type(error).__name__
         raise DatasetError(f"{file}: cannot be read: {why}; is it complete?") from None
+    finally:
+        _bytes.cache_clear()
+
+
+def _parts(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return (part for pair in value.items() for part in pair)
+    if isinstance(value, _Array):
+        return (value.value,)
+    return value if isinstance(value, list | tuple | set | frozenset) else ()
+
+
+def _plain(value: Any) -> Any:
+    """The value with real arrays in it."""
+    if isinstance(value, _Array):
+        return _plain(value.value)
+    if isinstance(value, dict):
+        return {_plain(k): _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value

@@ -86,6 +86,14 @@ class Dataset:
         return tuple(sorted(found, key=lambda image: 0.0 if image.time_s is None else image.time_s))
 
 
+def path_within(name: str) -> Path:
+    """The path of a file in a data set's folder, as the set names it. DatasetError where it leads out."""
+    path = Path(name)
+    if not name or path.is_absolute() or ".." in path.parts:
+        raise DatasetError(f"{name[:200]!r} does not lie within the folder of the data set")
+    return path
+
+
 def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """The files of a folder that match a pattern, in the order of the patterns."""
     return list(dict.fromkeys(file for pattern in patterns for file in sorted(folder.glob(pattern))))
@@ -106,7 +114,9 @@ def read_json(file: Path) -> Any:
         return json.loads(file.read_text())
     except FileNotFoundError:
         raise DatasetError(f"{file}: no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except RecursionError:
+        raise DatasetError(f"{file}: cannot be read as JSON: nested too deeply") from None
+    except (OSError, ValueError) as error:
         raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
 
 

@@ -18,7 +18,14 @@ from camera_node.config import BACKGROUNDS, TransformsConfig
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    errors_at,
+    find_files,
+    path_within,
+    read_json,
+)
 from freshfield.geometry import OPENGL_TO_OPENCV
 
 # First what nerfstudio and NeRF-synthetic start a training from.
@@ -81,6 +88,8 @@ def _find_image(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise DatasetError(f"{where}: 'file_path' is missing")
+    with errors_at(where):
+        path_within(name)
     for extension in _EXTENSIONS:
         path = folder / (name + extension)
         if path.is_file():

@@ -10,7 +10,15 @@ from pathlib import Path
 from camera_node.config import VideoConfig
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, find_files, read_json
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    errors_at,
+    find_files,
+    path_within,
+    read_json,
+)
 from camera_node.sources.datasets.video_clip import Clip
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.geometry import Pinhole
@@ -50,7 +58,11 @@ def load_rig(path: Path, files: Mapping[str, str]) -> VideoRig:
             raise DatasetError(f"{calibration}: has no camera {name!r}, for which a video is named")
     found: dict[str, Path] = {}
     for name in cameras:
-        places = [files[name]] if name in files else [p.format(name) for p in _PLACES]
+        if name in files:
+            places = [files[name]]
+        else:
+            with errors_at(str(calibration)):
+                places = [str(path_within(p.format(name))) for p in _PLACES]
         video = next((calibration.parent / p for p in places if (calibration.parent / p).is_file()), None)
         if video is not None:
             found[name] = video

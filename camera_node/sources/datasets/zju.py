@@ -21,7 +21,14 @@ from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, camera_to_world, errors_at
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    camera_to_world,
+    errors_at,
+    path_within,
+)
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)
@@ -100,9 +107,10 @@ def _listed(counts: dict[str, int]) -> str:
 
 def _path(name: Any, where: str) -> Path:
     text = str(name).replace("\\", "/")
-    path = Path(text)
-    if not text or path.is_absolute() or ".." in path.parts or len(path.parts) < 2:
-        raise DatasetError(f"{where}: {text!r} is no path of an image in a camera's folder")
+    with errors_at(where):
+        path = path_within(text)
+    if len(path.parts) < 2:
+        raise DatasetError(f"{where}: {text[:200]!r} is no path of an image in a camera's folder")
     return path
 
 

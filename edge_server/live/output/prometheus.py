@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import threading
 from collections.abc import Iterator
+from socketserver import ThreadingMixIn
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState
+from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
 
 
 class EdgeCollector:
@@ -53,8 +60,45 @@ class EdgeCollector:
                 yield GaugeMetricFamily(f"freshfield_{name}", about, value=value)
 
 
+class _Handler(WSGIRequestHandler):
+    timeout = SCRAPE_TIMEOUT_S  # of each read of the socket
+
+    def log_message(self, *_: Any) -> None:
+        """Scrapes are not worth a line."""
+
+
+class _Server(ThreadingMixIn, WSGIServer):
+    """A thread for each connection, of which there are at most MAX_SCRAPES: a new one ends the oldest."""
+
+    daemon_threads = True
+
+    def __init__(self, host: str, port: int) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._lock = threading.Lock()
+        self._open: list[socket.socket] = []
+        super().__init__((host, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        with self._lock:
+            self._open.append(request)
+            if len(self._open) > MAX_SCRAPES:
+                with contextlib.suppress(OSError):  # its thread reads the end of the request
+                    self._open.pop(0).shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock, contextlib.suppress(ValueError):
+            self._open.remove(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, *_: Any) -> None:
+        """A connection that broke is the client's matter."""
+
+
 def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:
     """Serve /metrics on a thread until the process ends."""
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
-    start_http_server(port, addr=host, registry=registry)
+    server = _Server(host.strip("[]"), port)
+    server.set_app(make_wsgi_app(registry))
+    threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()

@@ -22,6 +22,7 @@ from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload
+from freshfield.untrusted import stored_bytes
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +123,7 @@ def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
             f"{run}: decision {number} is not recorded; from {int(known[0].stem)} to {int(known[-1].stem)} "
             "there are some: every update has one, the newest are kept"
         )
-    arrays, about = checkpoint.load(path, kind=_KIND)
+    arrays, about = checkpoint.load(path, kind=_KIND, most_bytes=stored_bytes(path))
     try:
         actor = Actor.load(path.with_name(Path(about["policy"]).name))
         cameras = tuple(str(camera) for camera in about["cameras"])

@@ -14,25 +14,33 @@ from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
+import zstandard
+
+from freshfield.limits import MAX_CHUNK_BYTES, MAX_UNPACKED_PER_BYTE
 from freshfield.session import HEADER, IMAGE, INSTALL, SessionError
 from freshfield.v1 import frames_pb2 as pb
 
 try:
+    import lz4.frame
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from google.protobuf.message import DecodeError
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.opcode import Opcode
     from mcap.records import Channel, Chunk, Message
-    from mcap.stream_reader import get_chunk_data_stream
     from mcap.writer import MCAP0_MAGIC
 except ImportError:
     raise SessionError(INSTALL) from None
 
+_IN_CHUNKS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _RECORD_HEAD = struct.Struct("<BQ")
 # Times, uncompressed size, checksum, and the length of the compression's name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _KEPT_CHUNKS = 4
+# What damaged records raise; lz4's errors are plain RuntimeErrors.
+_UNREADABLE = (
+    McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError, MemoryError,
+)  # fmt: skip
 
 
 class _Location(NamedTuple):
@@ -71,6 +79,7 @@ class Session:
         self._file = path.open("rb")
         self._lock = threading.Lock()
         self._size = os.fstat(self._file.fileno()).st_size
+        self._unpacked = 0
         self._records = lru_cache(maxsize=_KEPT_CHUNKS)(self._decompressed)
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise SessionError(f"{path}: is no MCAP file")
@@ -86,10 +95,9 @@ class Session:
 
     def payload(self, frame: SessionFrame) -> bytes:
         """The payload of one of ``frames``, byte for byte. SessionError where the file has changed."""
-        body = self._body(frame.location)
         try:
-            return bytes(CompressedImage.FromString(_message(body).data).data)
-        except (DecodeError, McapError, struct.error, ValueError, EOFError) as error:
+            return bytes(CompressedImage.FromString(_message(self._body(frame.location)).data).data)
+        except (DecodeError, *_UNREADABLE) as error:
             raise SessionError(f"{self.path}: a message cannot be read again: {error}") from None
 
     def close(self) -> None:
@@ -138,7 +146,7 @@ class Session:
         if size < _CHUNK_HEAD.size:
             return
         data = self._at(at, size)
-        *_, crc, name = _CHUNK_HEAD.unpack_from(data)
+        *_, unpacked, crc, name = _CHUNK_HEAD.unpack_from(data)
         compressed, begin = bool(name), _CHUNK_HEAD.size + name + 8
         if compressed and not whole:
             return  # half of a compressed chunk cannot be read
@@ -146,12 +154,18 @@ class Session:
             self._damaged += 1
             return
         if compressed:
+            self._unpacked += unpacked
             try:
+                if self._unpacked > MAX_UNPACKED_PER_BYTE * self._size + MAX_CHUNK_BYTES:
+                    raise ValueError("the chunks before have unpacked to more than the file can hold")
                 data, begin = self._records(at), 0
-            except (ValueError, RuntimeError, EOFError, struct.error, MemoryError):
+            except _UNREADABLE:
                 self._damaged += 1
                 return
         for opcode, offset, length in _framed(data, begin):
+            if opcode not in _IN_CHUNKS:
+                self._damaged += 1
+                return
             place = _Location(at, offset, length) if compressed else _Location(None, at + offset, length)
             self._record(opcode, data[offset : offset + length], place)
 
@@ -159,13 +173,17 @@ class Session:
         """The records of the compressed chunk whose body is at ``at``."""
         _, size = _RECORD_HEAD.unpack(self._at(at - _RECORD_HEAD.size, _RECORD_HEAD.size))
         chunk = Chunk.read(ReadDataStream(BytesIO(self._at(at, size))))
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        return stream.read(length)
+        data = _unpack(chunk)
+        if len(data) != chunk.uncompressed_size:
+            raise ValueError(f"a chunk of {len(data)} bytes says that it has {chunk.uncompressed_size}")
+        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+            raise ValueError("the checksum of a chunk is wrong")
+        return data
 
     def _record(self, opcode: int, body: bytes, location: _Location) -> None:
         try:
             self._index(opcode, body, location)
-        except (McapError, struct.error, ValueError, EOFError):  # outside chunks there is no checksum
+        except _UNREADABLE:  # outside chunks there is no checksum
             self._damaged += 1
 
     def _index(self, opcode: int, body: bytes, location: _Location) -> None:
@@ -190,6 +208,21 @@ class Session:
                 before = self._headers.pop(camera, None)
                 if before is not None and before[:2] == (message.log_time, message.publish_time):
                     self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location))
+
+
+def _unpack(chunk: Chunk) -> bytes:
+    """A chunk's records. Decompressors make as much as the data asks for, unless they are told the most."""
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes, more than {MAX_CHUNK_BYTES}")
+    if chunk.compression == "zstd":
+        asked = zstandard.get_frame_parameters(chunk.data).content_size
+        if asked not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError(f"a chunk of {asked} bytes says that it has {size}")
+        return zstandard.decompress(chunk.data, max_output_size=size)
+    if chunk.compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size))
+    raise ValueError(f"chunks compressed by {chunk.compression[:40]!r} cannot be read")
 
 
 def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:

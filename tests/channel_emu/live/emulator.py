@@ -88,7 +88,7 @@ class Edge:
             lambda f: self.truth.append((f, clock.now_ns())),
         )
         self._server = self._transport.aio_server()
-        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self.ingest, self._server)
+        self.ingest.add_to_server(self._server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(clock), self._server)
         self.port = self._transport.bind(self._server, f"127.0.0.1:{self.port}")
         await self._server.start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections import Counter
 from pathlib import Path
 
 import grpc
@@ -11,15 +12,18 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live.live_link import HardLimit
+from channel_emu.live import live_link
+from channel_emu.live.live_link import HardLimit, Message
 from channel_emu.live.upstream import CREDITS, PUSH
 from channel_emu.model import trace
 from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import account_frames
+from freshfield.frame import to_request
+from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, emulate, make, offer, run
+from tests.channel_emu.live.emulator import CAMERAS, emulate, frame_of, make, offer, run
 from tests.integration.peer import Peer, silence
 
 # The thesis's channel six times faster, so that a test takes seconds.
@@ -208,29 +212,110 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
     async def live() -> None:
         async with emulate(tmp_path, {}) as r:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
+            call = channel.stream_stream(PUSH)()
 
-            async def send(raw: bytes) -> pb.PushResponse | None:
-                call = channel.stream_stream(PUSH)()
+            async def send(raw: bytes) -> str:
                 await call.write(raw)
-                try:
-                    return pb.PushResponse.FromString(await call.read())
-                except grpc.aio.AioRpcError as error:
-                    assert error.code() == grpc.StatusCode.INVALID_ARGUMENT
-                    return None
+                return pb.PushResponse.FromString(await call.read()).reason
 
             header = pb.FrameHeader(camera_id="cam77", session_id="s")
-            answer = await send(pb.PushRequest(header=header).SerializeToString())
-            assert answer is not None and answer.reason == "unknown_camera"
+            assert await send(pb.PushRequest(header=header).SerializeToString()) == "unknown_camera"
+            assert await send(b"") == "unknown_camera"
             header = pb.FrameHeader(camera_id="cam00", session_id="two\tcolumns\n")
-            answer = await send(pb.PushRequest(header=header, payload=b"x").SerializeToString())
-            assert answer is not None and answer.reason == "bad_id"
-            good = pb.PushRequest(header=pb.FrameHeader(camera_id="cam00")).SerializeToString()
-            for raw in (b"\xff\xff\xff", b"", good[:-1], b"\x12\x05abc", b"\x0a\x02\xff\xff", b"\x0b"):
-                assert await send(raw) is None
-            # And the cameras never noticed.
+            assert await send(pb.PushRequest(header=header, payload=b"x").SerializeToString()) == "bad_id"
+            good = to_request(frame_of("cam00", "s", 1, r.proxy.clock.now_ns())).SerializeToString()
+            wrong = (b"\xff\xff\xff", good[:-1], b"\x12\x05abc", b"\x0a\x02\xff\xff", b"\x0b", good + b"\0\0")
+            for raw in wrong:
+                assert await send(raw) == "unparsable"
+            # The stream goes on, and the cameras never noticed.
+            assert await send(good) == ""
             await r.cameras["cam01"].stream(3, 0)
-            assert r.stream.rejected == {"unknown_camera": 1, "bad_id": 1}
+            assert r.stream.rejected == {"unknown_camera": 2, "bad_id": 1, "unparsable": len(wrong)}
             await channel.close()
+
+    run(live())
+    (ledger,) = (one for one in read_all(tmp_path) if one.role == "emulator")
+    refused = Counter((e.camera, e.session, e.detail) for e in ledger.events if e.event == "rejected")
+    expected = {("?", "?", "unknown_camera"): 2, ("cam00", "?", "bad_id"): 1, ("?", "?", "unparsable"): 6}
+    assert refused == expected
+
+
+def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with emulate(tmp_path, {}) as r:
+            camera = r.cameras["cam00"]
+            await camera.stream(2, 0)
+            async with Transport().aio_channel(f"127.0.0.1:{r.proxy.port}") as channel:
+                silent = []
+                for _ in range(30):
+                    silent.append(channel.stream_stream(PUSH)())
+                    await silent[-1].initial_metadata()
+                spoof = to_request(frame_of("cam00", camera.session, 2**63, r.proxy.clock.now_ns()))
+                await silent[-1].write(spoof.SerializeToString())
+                answer = pb.PushResponse.FromString(await silent[-1].read())
+                assert answer.reason == "session_in_use"
+                await camera.stream(3, 0)
+                await r.cameras["cam01"].stream(1, 0)  # opens a stream of its own only now
+                assert r.stream.streams.ended > 10
+            assert camera.answers == {"accepted": 5}
+            await r.settled()
+            assert r.edge.ingest.delivered["cam00"] == 5 and not r.edge.ingest.rejected
+
+    run(live())
+
+
+def test_what_is_inside_the_links_is_bounded_in_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 20_000)
+
+    async def live() -> None:
+        section = {"service": {"law": "deterministic", "mean_ms": 200.0}, "discipline": "fcfs"}
+        async with emulate(tmp_path, section, cameras=("cam00", "cam01")) as r:
+            for name in r.cameras:
+                await r.cameras[name].stream(5, 0)
+            inside = [len(t.item.raw) for f in r.stream.flows.values() for t in f.link.model.pending()]
+            assert 0 < sum(inside) == r.proxy._room.held_bytes <= 20_000
+            full = r.stream.rejected["queue_full"]
+            assert full == 10 - len(inside) and r.cameras["cam01"].reasons["queue_full"] > 0
+            await r.settled()
+            assert r.proxy._room.held_bytes == 0
+            await r.cameras["cam00"].stream(1, 0)
+            assert r.stream.rejected["queue_full"] == full
+
+    run(live())
+    frame_account(tmp_path)
+
+
+def test_the_credits_at_the_edge_hold_for_bytes_too(tmp_path: Path) -> None:
+    async def live() -> None:
+        edge = await Peer(respond=silence).start()
+        proxy, (flow,) = make(tmp_path, edge.address, {})
+        await proxy.start()
+        large = Message(bytes(5 * 2**20), "s", 0, flow)
+        for _ in range(6):
+            flow.upstream.send(large)
+        assert flow.upstream.pending == 2 and flow.broken == 4  # one on its way, the newest held
+        await proxy.stop()
+        await edge.stop()
+
+    run(live())
+
+
+def test_a_message_that_cannot_be_damaged_does_not_end_the_emulator(tmp_path: Path) -> None:
+    """Field number 0: to be found before the link decides to flip its bytes."""
+
+    async def live() -> None:
+        async with emulate(tmp_path, {"faults": {"corruption": {"probability": 1.0}}}) as r:
+            good = to_request(frame_of("cam00", "s", 1, r.proxy.clock.now_ns())).SerializeToString()
+            async with Transport().aio_channel(f"127.0.0.1:{r.proxy.port}") as channel:
+                call = channel.stream_stream(PUSH)()
+                for raw in (good + b"\0\0", good):
+                    await call.write(raw)
+                    await call.read()
+            await r.settled()
+            r.proxy.check()
+            assert r.edge.ingest.rejected == {"crc_mismatch": 1}
 
     run(live())
 

@@ -18,13 +18,14 @@ from hypothesis import strategies as st
 import channel_emu
 from channel_emu.live import timer
 from channel_emu.live.call_flow import CallFlow
+from channel_emu.live.frame_stream import damage_payload
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.live_link import Message, ServedCall
+from channel_emu.live.live_link import Message
 from channel_emu.live.timer import LoopTimer
-from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model import ages
 from channel_emu.model.link import EventKind
 from freshfield.frame import FrameRejected, from_request, to_request
+from freshfield.streams import ServedCall
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import frame_of
 
@@ -90,28 +91,6 @@ def test_linear_bins_keep_the_count_and_the_shape() -> None:
     assert sum(counts) == pytest.approx(0.995 * 20_000, rel=0.002)
     # A logarithmic bin of 2.3 % is spread evenly: a few frames land next door.
     assert np.abs(np.array(counts) - exact).max() < 0.04 * 20_000
-
-
-def test_header_is_read_without_the_payload() -> None:
-    request = to_request(frame_of("cam05", "s1", 42, 123456789, held_out=True))
-    header = header_of(request.SerializeToString())
-    assert header == request.header and header.role == pb.ROLE_HELD_OUT
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_a_header_or_a_wire_error(data: bytes) -> None:
-    try:
-        header_of(data)
-    except WireError:
-        return
-    # What is taken must be what protobuf takes.
-    assert pb.PushRequest.FromString(data).HasField("header")
-
-
-def test_two_headers_are_refused() -> None:
-    raw = to_request(frame_of("cam05", "s1", 42, 5)).SerializeToString()
-    with pytest.raises(WireError, match="two headers"):
-        header_of(raw + raw)
 
 
 def test_damage_changes_the_payload_and_nothing_else() -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
+from edge_server.export import ExportError
 from edge_server.export.run_source import open_source, poses_of
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import field_names, make_field
 from freshfield.geometry import Pose, look_at
+from tests.work import MOST_MS, work_ms
 
 OPTIONS = {
     "splat": {"gaussians": 512, "start": 256, "seed_cells": 16},
@@ -192,3 +196,21 @@ def test_voxels_are_carved_for_a_mesh_and_only_unless_told_otherwise():
     assert carves("--mesh", "m.ply")
     assert not carves("--mesh", "m.ply", "--no-carve")
     assert not carves("--points", "p.ply")
+
+
+def test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked(tmp_path):
+    """Ours are written without compression: none is larger than its file."""
+    file = tmp_path / "field.npz"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as entry:
+        head = {"descr": "|u1", "fortran_order": False, "shape": (2**27,)}
+        np.lib.format.write_array_header_1_0(entry, head)
+        for _ in range(2**7):
+            entry.write(bytes(2**20))
+    tracemalloc.start()
+
+    def refuse():
+        with pytest.raises(ExportError, match=r"field\.npz: unpacked it has 134\d+ bytes, which no field's"):
+            open_source(file)
+
+    assert work_ms(refuse) < MOST_MS and tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()

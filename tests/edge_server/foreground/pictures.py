@@ -99,3 +99,32 @@ def save_orange_segmenter(path: Path, logits: bool = False) -> Path:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     onnx.save(model, str(path))
     return path
+
+
+def save_endless_loop(path: Path) -> Path:
+    """A segmentation ONNX that goes round 2^62 times before it answers."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    value, image, truth = helper.make_tensor_value_info, [1, 3, 64, 64], TensorProto.BOOL
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["on"]), helper.make_node("Sin", ["x"], ["y"])],
+        "round",
+        [value("i", TensorProto.INT64, []), value("go", truth, []), value("x", TensorProto.FLOAT, image)],
+        [value("on", truth, []), value("y", TensorProto.FLOAT, image)],
+    )
+    weight = np.ones((1, 3, 1, 1), np.float32)
+    constants = {"rounds": np.array(2**62), "true": np.array(True), "weight": weight}
+    graph = helper.make_graph(
+        [
+            helper.make_node("Loop", ["rounds", "true", "images"], ["turned"], body=body),
+            helper.make_node("Conv", ["turned", "weight"], ["map"]),
+        ],
+        "endless",
+        [value("images", TensorProto.FLOAT, image)],
+        [value("map", TensorProto.FLOAT, [1, 1, 64, 64])],
+        [numpy_helper.from_array(v, name) for name, v in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    onnx.save(model, str(path))
+    return path

@@ -16,9 +16,11 @@ from tests.edge_server.foreground.pictures import (
     box_of,
     disc,
     iou,
+    save_endless_loop,
     save_orange_detector,
     save_orange_segmenter,
 )
+from tests.work import MOST_MS, work_ms
 
 
 def needs_onnx() -> None:
@@ -187,6 +189,21 @@ def test_wrong_sections_are_refused_in_one_line(section, part):
     assert "scene.yaml: edge.foreground" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_model_that_loops_for_ever_is_refused(tmp_path):
+    needs_onnx()
+    model = save_endless_loop(tmp_path / "loop.onnx")
+    for config in (
+        ForegroundConfig(box=(0, 0, 1, 1), segment=str(model)),
+        ForegroundConfig(detector=str(model)),
+    ):
+
+        def refuse(config=config):
+            with pytest.raises(ForegroundError, match=r"loop\.onnx: holds Loop, which no network"):
+                make_foreground(config)
+
+        assert work_ms(refuse) < MOST_MS
+
+
 def test_wrong_models_are_refused_in_one_line(tmp_path):
     needs_onnx()
     (tmp_path / "text.onnx").write_text("no model")
@@ -194,10 +211,10 @@ def test_wrong_models_are_refused_in_one_line(tmp_path):
     detector = save_orange_detector(tmp_path / "orange.onnx")
     for config, part in (
         (ForegroundConfig(detector=str(tmp_path / "none.onnx")), "none.onnx: cannot be read"),
-        (ForegroundConfig(detector=str(tmp_path / "text.onnx")), "text.onnx: ONNX Runtime cannot load it"),
+        (ForegroundConfig(detector=str(tmp_path / "text.onnx")), "text.onnx: not an ONNX file"),
         (ForegroundConfig(detector=str(segmenter)), "not the boxes and scores"),
         (ForegroundConfig(detector=str(detector), kinds=["dog"]), "knows no dog; it knows apple"),
-        (ForegroundConfig(box=(0, 0, 1, 1), segment=str(tmp_path / "text.onnx")), "cannot load it"),
+        (ForegroundConfig(box=(0, 0, 1, 1), segment=str(tmp_path / "text.onnx")), "not an ONNX file"),
     ):
         with pytest.raises(ForegroundError, match=part) as caught:
             make_foreground(config)

@@ -9,8 +9,10 @@ import pytest
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
+from freshfield import payload
 from freshfield.clock import VirtualClock
 from freshfield.frame import FrameRejected, checksum, to_request
+from freshfield.geometry import Pinhole
 from freshfield.ledger import Ledger, LedgerReader
 from freshfield.v1 import frames_pb2 as pb
 from tests.edge_server.frames import frame
@@ -24,7 +26,7 @@ def ingest(tmp_path):
     clock = VirtualClock(NOW)
     held = []
     ledger = Ledger(tmp_path, "edge", "edge", NOW)
-    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append)
+    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append, max_side_px=128)
     made.test_clock, made.test_held, made.test_ledger = clock, held, ledger
     yield made
     ledger.close(NOW)
@@ -62,8 +64,17 @@ def bad(kind: str) -> pb.PushRequest:
         request.header.pose.qw = 7.0
         request.crc32c = checksum(request.header, request.payload)
         return request
+    if kind in ("unknown_codec", "bad_header"):  # an enum on the wire may be negative
+        request = to_request(base)
+        setattr(request.header, "codec" if kind == "unknown_codec" else "role", -7)
+        request.crc32c = checksum(request.header, request.payload)
+        return request
     changes = {
         "unknown_camera": {"camera": "cam77"},
+        "too_large": {
+            "intrinsics": Pinhole.from_fov(4096, 4096, 60.0),
+            "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8)),
+        },
         "wrong_role": {"held_out": True},
         "bad_id": {"camera": "../../etc"},
         "from_future": {"generated_ns": NOW + 3600 * 10**9},
@@ -76,7 +87,8 @@ def bad(kind: str) -> pb.PushRequest:
 
 
 KINDS = ["crc_mismatch", "bad_pose", "unknown_camera", "wrong_role", "bad_id", "from_future", "too_old",
-         "size_mismatch", "bad_payload", "bad_intrinsics"]  # fmt: skip
+         "size_mismatch", "bad_payload", "bad_intrinsics", "unknown_codec", "bad_header",
+         "too_large"]  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -91,6 +103,23 @@ def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
     assert events == ["rejected", "delivered"]
 
 
+def test_bytes_that_are_no_message_are_counted_and_the_next_ones_are_read(ingest):
+    raw = to_request(good()).SerializeToString()
+    answer = ingest.take(raw + b"\0\0")
+    assert (answer.outcome, answer.reason) == (pb.OUTCOME_REJECTED, "unparsable")
+    assert ingest.take(raw).outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.rejected == {"unparsable": 1}
+    events = [(e.camera, e.event, e.detail) for e in LedgerReader(ingest.test_ledger.path).events]
+    assert events == [("?", "rejected", "unparsable"), ("cam01", "delivered", "")]
+
+
+def test_a_thousand_made_up_cameras_are_counted_as_one(ingest):
+    for i in range(1000):
+        ingest.take(to_request(good(camera=f"made-up-{i}", session=f"s{i}")))
+    assert ingest.rejected_by_camera == {"?": 1000}
+    assert {(e.camera, e.session) for e in LedgerReader(ingest.test_ledger.path).events} == {("?", "?")}
+
+
 def test_replay_and_reversed_time_are_refused_within_a_session_only():
     admission = FrameAdmission(["cam01"], [])
     admission.admit(good(sequence=3), NOW)
@@ -101,6 +130,41 @@ def test_replay_and_reversed_time_are_refused_within_a_session_only():
         admission.admit(frame(sequence=4, generated_ns=NOW - 90 * MS), NOW)
     assert reversed_time.value.reason == "time_reversed"
     admission.admit(good(sequence=0, session="s2"), NOW)
+
+
+def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
+    class Stream:
+        open = True
+
+    mine, spoofer = Stream(), Stream()
+    ingest.streams.use = lambda stream: None
+    assert ingest.take(to_request(good(1)), mine).outcome == pb.OUTCOME_ACCEPTED
+    last = frame(sequence=2**63, generated_ns=NOW)
+    assert ingest.take(to_request(last), spoofer).reason == "session_in_use"
+    assert ingest.take(to_request(good(2)), mine).outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.rejected == {"session_in_use": 1}
+
+
+def test_two_nodes_of_one_name_are_told_apart_and_said(caplog):
+    admission = FrameAdmission(["cam01"], [])
+    for k in range(1, 6):
+        now_ns = NOW + k * 10**9
+        admission.admit(frame(sequence=k, generated_ns=now_ns, session="first"), now_ns)
+        if k > 2:
+            admission.admit(frame(sequence=k, generated_ns=now_ns + 1, session="second"), now_ns)
+    assert admission.doubled == {"cam01": 1}
+    (said,) = [r.getMessage() for r in caplog.records]
+    assert said.startswith("cam01: two nodes send as this camera")
+
+
+def test_a_node_that_restarts_is_one_node(caplog):
+    """Frames of its old session may still be on their way."""
+    admission = FrameAdmission(["cam01"], [])
+    arrivals = [("s1", 0), ("s1", 1), ("s2", 20), ("s1", 2), ("s2", 21), ("s1", 3), ("s2", 40)]
+    for session, tenths in arrivals:
+        at_ns = NOW + tenths * 100 * MS
+        admission.admit(frame(sequence=tenths, generated_ns=at_ns, session=session), NOW + 5 * 10**9)
+    assert not admission.doubled and not caplog.records
 
 
 def test_a_thousand_sessions_do_not_grow_the_admission():

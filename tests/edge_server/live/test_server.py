@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 import time
 import urllib.request
@@ -13,16 +14,20 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
+from edge_server.live.loop import UpdateLoop
+from edge_server.live.policies import ServerPolicies
 from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import frame as wire
 from freshfield import payload, scenario
 from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
+from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
 from tests.ports import free_port
+from tests.work import MOST_MS, work_ms
 
 
 def tiny_scenario(tmp_path, held_out=("cam00",)):
@@ -164,6 +169,9 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
         edge.SetPolicy(edge_pb2.SetPolicyRequest(name="best"))
     assert unknown.value.code() == grpc.StatusCode.INVALID_ARGUMENT
     assert "freshest-k" in unknown.value.details()
+    with pytest.raises(grpc.RpcError) as long:
+        edge.SetPolicy(edge_pb2.SetPolicyRequest(name="n" * 8_000_000))
+    assert long.value.code() == grpc.StatusCode.INVALID_ARGUMENT and len(long.value.details()) < 200
     path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
     assert checkpoint.load(path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())
@@ -175,6 +183,80 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
     decisions.cancel()
     feed.stop()
     channel.close()
+
+
+def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
+    server, _, _ = serve(metrics_port=(metrics := free_port()))
+    until(lambda: server.loop.alive)
+    half = []
+    for _ in range(100):
+        half.append(socket.create_connection(("127.0.0.1", metrics)))
+        half[-1].sendall(b"GET /metrics HTTP/1.1\r\n")
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=10) as page:
+        assert b"freshfield_frames_rejected" in page.read()
+    until(lambda: sum("process_request" in t.name for t in threading.enumerate()) <= MAX_SCRAPES)
+    for connection in half:
+        connection.close()
+
+
+def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
+    _, port, _ = serve()
+    with Transport().channel(f"127.0.0.1:{port}") as channel:
+        grpc.channel_ready_future(channel).result(30)
+        edge = edge_pb2_grpc.EdgeServiceStub(channel)
+        watching = [edge.WatchDecisions(edge_pb2.WatchDecisionsRequest()) for _ in range(MAX_WATCHERS + 20)]
+        until(lambda: sum(call.done() for call in watching) == 20)
+        assert watching[0].code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert not watching[-1].done()
+
+
+def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
+    server, port, _ = serve()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: server.state.publications())
+    with server._snapshot_lock, pytest.raises(RuntimeError, match="another one is being written"):
+        server.state.save_snapshot()
+    server.state.save_snapshot()
+    for k in range(MAX_SNAPSHOTS - 1):
+        (tmp_path / "out" / f"snapshot-9{k:05d}.npz").touch()
+    with pytest.raises(RuntimeError, match="holds 20 already: move some away"):
+        server.state.save_snapshot()
+    feed.stop()
+
+
+def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(UpdateLoop.stop, "__defaults__", (0.1,))
+    server, port, thread = serve()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: server.state.publications())
+    begun, goes_on, fit = threading.Event(), threading.Event(), server.updater.fit
+
+    def long_update(*arguments):
+        begun.set()
+        goes_on.wait(30)
+        return fit(*arguments)
+
+    monkeypatch.setattr(server.updater, "fit", long_update)
+    assert begun.wait(30)
+    feed.stop()
+    server.stop()
+    thread.join(20)
+    goes_on.set()
+    assert not (tmp_path / "out" / "field.npz").exists()
+    assert "field.npz: not written: the last update did not end" in caplog.text
+
+
+def test_a_name_of_eight_megabytes_is_no_policy(tmp_path):
+    made = tiny_scenario(tmp_path)
+    policies = ServerPolicies(made, read_config(made), None, tmp_path)
+
+    def ask():
+        with pytest.raises(ValueError, match="8000000 characters"):
+            policies.make("n" * 8_000_000, None)
+
+    assert work_ms(ask) < MOST_MS
 
 
 def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(serve, tmp_path):

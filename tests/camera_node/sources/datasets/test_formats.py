@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -170,6 +172,67 @@ def test_a_pickle_runs_nothing(tmp_path):
         pickle.loads(pickle.dumps(Trap())[:-1])
 
 
+class _Built:
+    """Pickled as a call of numpy's own, with a state to set."""
+
+    def __init__(self, call, arguments, state=None):
+        self.reduced = (call, arguments, state)
+
+    def __reduce__(self):
+        return self.reduced
+
+
+_OBJECTS = np.dtype("O")
+_POINTERS = b"\x41" * 64
+_HIDDEN = _Built(np.dtype, ("V8", False, True), (3, "|", None, ("a",), {"a": (_OBJECTS, 0)}, 8, 1, 0))
+
+
+def _array_of(shape, dtype, raw):
+    return _Built(np._core.multiarray._reconstruct, (np.ndarray, (0,), b"b"), (1, shape, dtype, False, raw))
+
+
+CRAFTED = {
+    "ndarray called": _Built(np.ndarray, ((), _OBJECTS, _POINTERS)),
+    "objects from bytes": _array_of((8,), _OBJECTS, _POINTERS),
+    "objects in a structure": _array_of((8,), _HIDDEN, _POINTERS),
+    "scalar of objects": _Built(np._core.multiarray.scalar, (_HIDDEN, _POINTERS[:8])),
+    "too few bytes": _array_of((2**40,), np.dtype("f8"), b""),
+    "a state of another kind": _Built(np.dtype, ("f8",), {"type": 3}),
+}
+
+
+@pytest.mark.parametrize("crafted", CRAFTED.values(), ids=CRAFTED.keys())
+def test_a_crafted_pickle_is_refused(tmp_path, crafted):
+    """In a process of its own: numpy's own functions crash."""
+    write_object(tmp_path / "annots.npy", crafted)
+    code = """
+import sys
+from pathlib import Path
+from camera_node.sources.datasets import zju
+from camera_node.sources.datasets.records import DatasetError
+try:
+    zju.load_dataset(Path(sys.argv[1]))
+except DatasetError as error:
+    print(error)
+"""
+    found = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    assert found.returncode == 0 and "cannot be read" in found.stdout, found.stderr
+
+
+def write_object(file, value):
+    np.save(file, np.array(None), allow_pickle=True)
+    head = file.read_bytes()
+    file.write_bytes(head[: head.index(b"\n") + 1] + pickle.dumps(value))
+
+
+def test_a_pickle_that_refers_to_itself_is_no_bomb(tmp_path):
+    value = ["x"]
+    for _ in range(60):
+        value = [value, value]
+    write_object(tmp_path / "annots.npy", {"cams": {key: value for key in "KDRT"}, "ims": [{"ims": value}]})
+    fails("references stand for more", zju.load_dataset, tmp_path)
+
+
 # --- Eyeful Tower -------------------------------------------------------------------------------
 
 
@@ -232,7 +295,9 @@ def test_eyeful_damage_is_named(tmp_path):
         (lambda e: e.pop("T"), r"KRT\[1\] \(10/10_DSC0001\): T is missing"),
         (lambda e: e.update(K=[1, 2]), r"K: expected finite numbers of shape \(3, 3\)"),
         (lambda e: e.update(distortion=[0.1]), "RadialAndTangential' with 1 coefficients"),
-        (lambda e: e.update(cameraId="../../x"), r"cameraId is '\.\./\.\./x'"),
+        (lambda e: e.update(cameraId="/x"), "does not lie within the folder"),
+        (lambda e: e.update(cameraId="x"), "cameraId is 'x'"),
+        (lambda e: e.update(cameraId="../../x"), "does not lie within the folder"),
         (lambda e: e.update(width=100), "another shape"),
     ):
         data = json.loads(whole)

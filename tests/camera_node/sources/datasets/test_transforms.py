@@ -201,3 +201,21 @@ def test_the_pose_flip_is_its_own_inverse(tmp_path):
     record = load_dataset(write_photos(tmp_path, 1))[0]
     stored = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]["transform_matrix"]
     np.testing.assert_allclose(record.camera_to_world @ OPENGL_TO_OPENCV, stored, atol=1e-12)
+
+
+@pytest.mark.parametrize("leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", ""])
+def test_images_outside_the_data_set_are_not_read(tmp_path, leads):
+    inside, outside = tmp_path / "set", tmp_path / "outside.png"
+    inside.mkdir()
+    cv2.imwrite(str(outside), picture(0))
+    path = leads.format(outside=outside.with_suffix(""))
+    file = edit(write_photos(inside, 2), lambda d: d["frames"][0].update(file_path=path))
+    with pytest.raises(DatasetError, match=r"frames\[0\].*(does not lie within the folder|is missing)"):
+        load_dataset(file)
+
+
+def test_json_that_is_nested_or_counts_too_far_is_one_line(tmp_path):
+    for text in ("[" * 10**5, '{"frames": ' + "9" * 5000 + "}"):
+        (tmp_path / "transforms.json").write_text(text)
+        with pytest.raises(DatasetError, match="cannot be read as JSON"):
+            load_dataset(tmp_path / "transforms.json")

@@ -1,0 +1,65 @@
+"""Files that a stranger may have written: references are followed only as far as the file's own size allows.
+
+A few hundred bytes of YAML or of a pickle can refer to themselves so often that they stand for gigabytes. An
+honest file has fewer values than bytes, however often it repeats some by reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from freshfield.limits import MAX_YAML_CHARS
+
+
+class UntrustedError(ValueError):
+    """A file that must not be read; the message says why."""
+
+
+def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]]) -> None:
+    """Raise UntrustedError if ``value``, with every reference written out, has more than ``most`` values.
+
+    parts(value): the values that it is directly made of.
+    """
+    waiting, seen = [value], 0
+    while waiting:
+        seen += 1
+        waiting.extend(parts(waiting.pop()))
+        if seen + len(waiting) > most:
+            raise UntrustedError(f"its references stand for more than {most} values")
+
+
+def stored_bytes(path: Path) -> int:
+    """Most bytes that an archive written without compression, as ours are, can hold; 0 where there is no
+    file."""
+    return path.stat().st_size if path.is_file() else 0
+
+
+def read_yaml(text: str) -> Any:
+    """The value of a YAML document, of plain types only; references are allowed. Raises UntrustedError."""
+    if len(text) > MAX_YAML_CHARS:
+        raise UntrustedError(f"not YAML: {len(text)} characters, more than {MAX_YAML_CHARS}")
+    loader = yaml.SafeLoader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        refuse_expansion(node, len(text) + 1, _node_parts)
+        return loader.construct_document(node)
+    except UntrustedError:
+        raise
+    except RecursionError:
+        raise UntrustedError("not YAML: nested too deeply") from None
+    except (yaml.YAMLError, ValueError) as error:  # numbers and dates that are none raise a plain ValueError
+        raise UntrustedError(f"not YAML: {' '.join(str(error).split())}") from None
+    finally:
+        loader.dispose()
+
+
+def _node_parts(node: Any) -> Iterable[Any]:
+    if isinstance(node, yaml.MappingNode):
+        return (part for pair in node.value for part in pair)
+    return node.value if isinstance(node, yaml.SequenceNode) else ()

@@ -1,0 +1,132 @@
+"""A server's open streams: nobody shuts the others out, and nobody goes on with another's session."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import grpc
+import grpc.aio
+import pytest
+
+from freshfield.frame import FrameRejected
+from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
+from freshfield.streams import OpenStreams, SessionStreams
+from freshfield.transport import Transport
+
+
+@asynccontextmanager
+async def echoing(streams: OpenStreams):
+    """A server that answers each message; ``use`` marks a stream that sent b"use". Yields a channel."""
+
+    async def answer(_, context):
+        async with streams.open(context) as call:
+            await context.send_initial_metadata(())
+            while (message := await context.read()) is not grpc.aio.EOF:
+                if message == b"use":
+                    streams.use(call)
+                await context.write(message)
+
+    handler = {"Echo": grpc.stream_stream_rpc_method_handler(answer)}
+    server = Transport().aio_server()
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t", handler),))
+    port = Transport().bind(server, "127.0.0.1:0")
+    await server.start()
+    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+        yield channel
+    await server.stop(None)
+
+
+async def opened(channel, say: bytes | None = None):
+    call = channel.stream_stream("/t/Echo")()
+    await call.initial_metadata()
+    if say is not None:
+        await call.write(say)
+        assert await call.read() == say
+    return call
+
+
+def run(scene):
+    async def limited():
+        async with asyncio.timeout(30):
+            await scene()
+
+    asyncio.run(limited())
+
+
+def test_silent_streams_shut_nobody_out():
+    async def scene():
+        streams = OpenStreams(4)
+        async with echoing(streams) as channel:
+            camera = await opened(channel, b"use")
+            silent = [await opened(channel) for _ in range(30)]
+            late = await opened(channel, b"use")
+            assert streams.ended == 28
+            for call in (camera, late):  # both still work
+                await call.write(b"x")
+                assert await call.read() == b"x"
+            assert await silent[0].code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert "too many are open" in await silent[0].details()
+
+    run(scene)
+
+
+def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
+    async def scene():
+        streams = OpenStreams(2)
+        async with echoing(streams) as channel:
+            first, second = await opened(channel, b"use"), await opened(channel, b"use")
+            await first.write(b"use")
+            await first.read()
+            await opened(channel)
+            assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            await first.write(b"x")
+            assert await first.read() == b"x"
+
+    run(scene)
+
+
+def test_a_closed_stream_leaves_its_place():
+    async def scene():
+        streams = OpenStreams(2)
+        async with echoing(streams) as channel:
+            for _ in range(10):
+                call = await opened(channel, b"use")
+                await call.done_writing()
+                assert await call.code() is grpc.StatusCode.OK
+            assert streams.ended == 0 and not streams._used and not streams._silent
+
+    run(scene)
+
+
+class Stream:
+    open = True
+
+
+def test_a_session_belongs_to_the_stream_that_sends_it():
+    sessions, mine, spoofer = SessionStreams(["cam00"]), Stream(), Stream()
+    sessions.claim("cam00", "s", mine, 0)
+    with pytest.raises(FrameRejected) as refused:
+        sessions.claim("cam00", "s", spoofer, 1)
+    assert refused.value.reason == "session_in_use"
+    sessions.claim("cam00", "s", mine, SESSION_IDLE_NS)
+    sessions.claim("cam00", "other", spoofer, SESSION_IDLE_NS)
+
+
+def test_a_node_that_comes_back_goes_on_with_its_session():
+    sessions, before, after = SessionStreams(["cam00"]), Stream(), Stream()
+    sessions.claim("cam00", "s", before, 0)
+    before.open = False
+    sessions.claim("cam00", "s", after, 1)  # its stream ended
+    again = Stream()
+    sessions.claim("cam00", "s", again, 1 + SESSION_IDLE_NS)  # or is gone without a word
+    with pytest.raises(FrameRejected):
+        sessions.claim("cam00", "s", after, 2 + SESSION_IDLE_NS)
+    sessions.claim("cam00", "s", after, 0)  # a clock that was set back delays nobody
+
+
+def test_a_thousand_sessions_leave_no_trace():
+    sessions, stream = SessionStreams(["cam00"]), Stream()
+    for k in range(1000):
+        sessions.claim("cam00", f"s{k}", stream, k)
+    assert len(sessions._sent["cam00"]) == MAX_SESSIONS_PER_CAMERA

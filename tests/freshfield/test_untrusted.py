@@ -1,0 +1,94 @@
+"""Bombs of references: refused before anything of their size is made."""
+
+from __future__ import annotations
+
+import tracemalloc
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
+from freshfield.scenario import ScenarioError, load
+from freshfield.untrusted import UntrustedError, read_yaml, refuse_expansion, stored_bytes
+from tests.work import work_ms
+
+LEVELS = "abcdefghijklmnop"
+
+
+def bomb(first: str, level: str) -> str:
+    """Each level names the one before ten times."""
+    lines = [f"a: &a {first}"]
+    lines += [f"{b}: &{b} {level.format(', '.join([f'*{a}'] * 10))}" for a, b in pairwise(LEVELS)]
+    return "\n".join(lines) + "\n"
+
+
+LISTS = bomb("[x, x]", "[{}]")
+MERGES = bomb("{k: v, l: w}", "{{<<: [{}]}}")
+
+
+@pytest.mark.parametrize("text", [LISTS, MERGES, "&a [*a, *a]"], ids=["lists", "merges", "itself"])
+def test_an_alias_bomb_is_refused_at_once(text):
+    tracemalloc.start()
+    with pytest.raises(UntrustedError, match="references stand for more than"):
+        read_yaml(text)
+    assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[" * 10_000, "nested too deeply"),
+        ("{a: " * 10_000, "nested too deeply"),
+        ("a: [1", "not YAML"),
+        ("a: " + "9" * 5000, "not YAML"),
+        ("a: 2001-99-99", "not YAML"),
+        ("x" * (MAX_YAML_CHARS + 1), "characters, more than"),
+        ("!!python/object/apply:os.system [true]", "could not determine a constructor"),
+    ],
+    ids=lambda v: v[:12],
+)
+def test_what_is_no_yaml_is_one_line(text, why):
+    with pytest.raises(UntrustedError, match=why) as error:
+        read_yaml(text)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+
+
+def test_honest_references_are_followed():
+    text = "base: &b {width: 128, height: 96}\none: *b\ntwo: {<<: *b, width: 64}\n"
+    assert read_yaml(text)["two"] == {"width": 64, "height": 96} and read_yaml(text)["one"]["width"] == 128
+    assert read_yaml("") is None and read_yaml("3") == 3
+
+
+@pytest.mark.parametrize(
+    "text", [f"edge: 1\n{LISTS}", "name: " + "[" * 5000, f"name: {'x' * 10**5}\ncameras: 1"]
+)
+def test_a_scenario_that_is_a_bomb_is_one_short_line(tmp_path, text):
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    with pytest.raises(ScenarioError) as error:
+        load(file)
+    assert len(str(error.value)) < MAX_ERROR_CHARS + 10 and "\n" not in str(error.value)
+
+
+def test_an_error_quotes_only_so_much(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text(f"cameras: {{count: {'x' * 10**5}}}")
+    with pytest.raises(ScenarioError, match=r"cameras\.count: expected a whole number") as error:
+        load(file)
+    assert len(str(error.value)) < MAX_ERROR_CHARS + 10
+
+
+def test_a_wide_value_takes_no_more_than_itself():
+    """Lists in lists: what waits is counted, not only what was seen."""
+    wide = [[0] * 1000] * 1000
+    with pytest.raises(UntrustedError):
+        refuse_expansion(wide, 5000, lambda v: v if isinstance(v, list) else ())
+    refuse_expansion(wide, 1_001_001, lambda v: v if isinstance(v, list) else ())
+
+
+def test_an_uncompressed_archive_holds_no_more_than_its_size(tmp_path):
+    np.savez(tmp_path / "a.npz", a=np.zeros(1000))
+    assert 8000 < stored_bytes(tmp_path / "a.npz") < 9000 and stored_bytes(tmp_path / "none") == 0
+    assert work_ms(lambda: stored_bytes(tmp_path / "a.npz")) < 5
