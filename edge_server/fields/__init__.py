@@ -61,9 +61,9 @@ class FitReport:
     """What one fit did: optimizer steps, wall seconds, mean loss of the last steps, rays and samples.
 
     dropped: rays and gradients that were not finite and were left out.
-    shed: views left out because the budget did not allow for them.
     refused: cameras whose view was left out as an outlier (``common.view_outliers``).
     note: why nothing was done, if so.
+    shed: views left out because the budget did not allow for them.
     """
 
     steps: int
@@ -72,9 +72,9 @@ class FitReport:
     rays: int
     samples: int
     dropped: int = 0
-    shed: int = 0
     refused: tuple[str, ...] = ()
     note: str = ""
+    shed: int = 0
 
 
 @dataclass(frozen=True)
