@@ -33,7 +33,7 @@ PY := .venv/bin/python
 export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
-WARM_UP := from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()
+WARM_UP := from edge_server.fields.registry import make_field; make_field("splat", {"layers": True}).warm_up()
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
 TORCH := $(call wanted,torch)

@@ -82,6 +82,7 @@ class LayeredField:
         self.tracker: MotionTracker | None = None
         self.layered = True  # False: a camera moved
         self.shown = False  # whether the layers are shown, and no longer the first field
+        self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
         self._published: LayeredSnapshot | None = None
@@ -130,7 +131,10 @@ class LayeredField:
             return replace(report, shed=shed)
         self._take_renderings(beside)
         note = "" if steps or pace.steps else "nothing is left to learn" if arrivals else "no new views"
-        return FitReport(steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note)
+        return FitReport(
+            steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note,
+            refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
+        )  # fmt: skip
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -235,7 +239,13 @@ class LayeredField:
             self.cameras[view.camera] = FixedCamera(view, plate)
         camera = self.cameras[view.camera]
         camera.taken.append(view.generated_ns)
-        foreground = camera.plate.take(view.image)
+        refused = self.refused | {view.camera}
+        may_refuse = self.tracker is not None and 4 * len(refused) <= len(self.cameras)
+        foreground = camera.plate.take(view.image, may_refuse)
+        if foreground is None:
+            self.refused = refused
+            return
+        self.refused -= {view.camera}
         self.observations.add(Observation(
             (view.shows_ns - self.origin_ns) / 1e9, view.camera,
             replace(view, camera_to_world=camera.view.camera_to_world), foreground,
@@ -346,6 +356,11 @@ class LayeredField:
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
             self._still = (key, gaussians(params, self.settings))
         return self._still[1]
+
+
+def _cameras(views: Sequence[View]) -> list[str]:
+    """The cameras of ``views``, in the order of their first appearance."""
+    return list(dict.fromkeys(view.camera for view in views))
 
 
 def _newest_of_each(views: Sequence[View]) -> list[View]:

@@ -51,12 +51,13 @@ def pack(field: Any) -> Arrays:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
     state |= _prefixed("first.", field.first.state()) | _prefixed("static.", field.static.field.state())
+    refused = sorted(field.refused)
     counters = {name: _number(getattr(field, name)) for name in COUNTERS}
     tracked = None
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
         tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
-    meta = {"version": 1, "field": NAME, "settings": asdict(field.settings), **counters,
+    meta = {"version": 1, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
             "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
@@ -88,6 +89,7 @@ def unpack(field: Any, state: Arrays) -> None:
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
     _set(field, COUNTERS, meta)
+    field.refused = set(meta["refused"])
     if meta["tracked"] is not None:
         if field.static.field.view_store.box is None:
             raise ValueError("the state has a moving set but no scene box")

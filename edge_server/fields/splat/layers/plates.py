@@ -32,6 +32,7 @@ LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that change
 GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
+REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
 HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
 
 
@@ -70,9 +71,12 @@ class Plate:
         """The plate as the camera would see it with the exposure of its first frame, float32 (H, W, 3)."""
         return self.picture / self.gain
 
-    def take(self, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W)."""
-        self._follow_exposure(image)
+    def take(self, image: NDArray[np.uint8], may_refuse: bool = False) -> NDArray[np.bool_] | None:
+        """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W).
+
+        may_refuse: a frame that is nearly all foreground changes nothing; None is returned for it.
+        """
+        gain = self._follow_exposure(image)
         blurred = cv2.boxFilter(image, cv2.CV_32F, (3, 3))
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
@@ -84,6 +88,10 @@ class Plate:
         votes = np.ones_like(foreground)
         if self.count > 0:
             foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
+            if may_refuse and foreground.mean() > REFUSED_SHARE:
+                if gain is not None:
+                    self._scale(1.0 / gain)
+                return None
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
             votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
         self.pool.run(
@@ -129,11 +137,11 @@ class Plate:
         self._held, self._static, self._static_blurred = mine["held"], mine["static"], mine["static_blurred"]
         self.count, self._has_static = int(mine["counters"][0]), bool(mine["counters"][1])
 
-    def _follow_exposure(self, image: NDArray[np.uint8]) -> None:
+    def _follow_exposure(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
         """Scale everything remembered when light or exposure change: by the median ratio of frame and plate,
-        for each channel, where that is off by more than GAIN_STEP for one."""
+        for each channel, where that is off by more than GAIN_STEP for one. Returns the ratios if so."""
         if self.count == 0:
-            return
+            return None
         counts = np.zeros((3, 3), np.int64)
         self.pool.run(count_exposure, image, self.arrays, counts)
         used = counts[:, 0]
@@ -142,12 +150,16 @@ class Plate:
             used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4
             or (2 * counts[:, 1:] <= used[:, None]).all()
         ):
-            return
+            return None
         plate = self.arrays.means[0, ::2, ::2]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
         gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
         if not ((gain > 1.0 / GAIN_MOST) & (gain < GAIN_MOST)).all():
-            return  # a black or broken frame
+            return None  # a black or broken frame
+        self._scale(gain)
+        return gain
+
+    def _scale(self, gain: NDArray[np.float32]) -> None:
         self.gain = self.gain * gain
         for array in (self.arrays.means, self.arrays.blurred):
             np.clip(array * gain, 0.0, 255.0, out=array)

@@ -221,6 +221,29 @@ def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
     assert _score(field.snapshot(round(50 * FRAME_S * 1e9)), 50 * FRAME_S) > 20.0
 
 
+@pytest.mark.parametrize("wrong", ["noise", "black"])
+def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing(wrong: str) -> None:
+    without, field = LayeredField(SMALL), LayeredField(SMALL)
+    rng = np.random.default_rng(0)
+    for f in (without, field):
+        f.load_state(_moving().state())
+    for frame in range(42, 46):
+        views = [_frame(k, frame, True) for k in range(len(CAMERAS))]
+        image = views[0].image
+        shown = rng.integers(0, 255, image.shape, np.uint8) if wrong == "noise" else np.zeros_like(image)
+        without.fit(views[1:], Budget(steps=5))
+        report = field.fit([replace(views[0], image=shown), *views[1:]], Budget(steps=5))
+        assert report.refused == (CAMERAS[0].camera,)
+    one, two = without.snapshot(), field.snapshot()
+    for a, b in zip((one.static, one.moving.params), (two.static, two.moving.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3)
+    resumed = LayeredField(SMALL)
+    resumed.load_state(field.state())
+    assert resumed.refused == {CAMERAS[0].camera}
+    views = [_frame(k, 46, True) for k in range(len(CAMERAS))]
+    assert resumed.fit(views, Budget(steps=5)).refused == ()
+
+
 def test_what_there_is_no_time_for_is_left_out_the_oldest_first() -> None:
     field, ticks = LayeredField(SMALL), itertools.count()
     views = [_frame(k, frame, True) for frame in range(3) for k in range(len(CAMERAS))]
