@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from edge_server.config import EdgeConfig
 from edge_server.scheduler import BANDIT, OFFERED, Policy, make_live_policy
-from freshfield.limits import MAX_ID_CHARS
+from freshfield.limits import MAX_POLICY_CHARS
 from freshfield.scenario import Scenario
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
@@ -34,8 +34,8 @@ class ServerPolicies:
 
     def make(self, name: str, value: float | None) -> Policy:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
-        if name not in self.offered and len(name) > MAX_ID_CHARS:
-            raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_ID_CHARS}")
+        if name not in self.offered and len(name) > MAX_POLICY_CHARS:
+            raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
         if name.startswith(BANDIT) and name not in self.offered:
             raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
         policy = self._make(name, value)

@@ -27,7 +27,10 @@ MAX_JPEG_SCANS = 16
 """Of one JPEG: a baseline one has 1 to 3, a progressive one some 10. A decoder visits every block in each."""
 
 MAX_ID_CHARS = 64
-"""Of a camera or session id: it becomes part of file names and of ledger lines. Of a policy's name too."""
+"""Of a camera or session id: it becomes part of file names and of ledger lines."""
+
+MAX_POLICY_CHARS = 1024
+"""Of a policy's name: it may hold a file's path."""
 
 MAX_PEER_TEXT_CHARS = 200
 """Of a peer's words in a log line."""
