@@ -19,10 +19,6 @@ from tests.stability.damage import follows_cameras_that_move, healthy
 VIEWS = ring(9, size=24)
 # Splat has its own variants in ``test_field_splat``.
 with_rays = pytest.mark.parametrize("name", [name for name in NAMES if name != "splat"])
-# Of what takes a minute, ngp's is for every day; the others are for CI.
-long = pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "ngp")) for n in NAMES if n != "splat"]
-)
 
 
 @every_field
@@ -99,7 +95,8 @@ def test_views_that_contradict_each_other(name: str) -> None:
     reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
-@long
+# The networks share their optimiser and their warm starts.
+@pytest.mark.parametrize("name", ["ngp", pytest.param("voxel", marks=pytest.mark.slow)])
 def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)
