@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -114,8 +115,10 @@ def _direction(*terms: tuple[float, Vector]) -> Vector:
 
 def _offset(p: Vector, *terms: tuple[float, Vector]) -> Vector:
     """p plus a weighted sum of vectors."""
-    x, y, z = (p[k] + sum(w * v[k] for w, v in terms) for k in range(3))
-    return x, y, z
+    x = y = z = 0.0
+    for w, (vx, vy, vz) in terms:
+        x, y, z = x + w * vx, y + w * vy, z + w * vz
+    return p[0] + x, p[1] + y, p[2] + z
 
 
 def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
@@ -205,6 +208,8 @@ def walking_person(walk: Walk) -> MovingBody:
     return MovingBody(tuple(part for _, part in _PARTS), matrices, contact)
 
 
+# The same walk is asked for by every process that builds a scene, several times: by truth, cameras, episodes.
+@lru_cache(256)
 def loop_length_m(walk: Walk) -> float:
     """Metres that the middles of the person's parts travel in one loop, averaged over the parts."""
 

@@ -35,7 +35,9 @@ class ServerPolicies:
     def make(self, name: str, value: float | None) -> Policy:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
         if name not in self.offered and len(name) > MAX_POLICY_CHARS:
-            raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
+            raise ValueError(
+                f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}"
+            )
         if name.startswith(BANDIT) and name not in self.offered:
             raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
         policy = self._make(name, value)

@@ -17,10 +17,6 @@ from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.edge_server.fields.small import NAMES, every_field, healthy, reaches, tiny
 
 VIEWS = ring(9, size=24)
-# Of what takes a minute, two are for every day; the others are for CI.
-long = pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in ("ngp", "splat"))) for n in NAMES]
-)
 
 
 @every_field
@@ -95,7 +91,8 @@ def test_views_that_contradict_each_other(name: str) -> None:
     reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
-@long
+# The networks share their optimiser and their warm starts.
+@pytest.mark.parametrize("name", ["ngp", "splat", pytest.param("voxel", marks=pytest.mark.slow)])
 def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)

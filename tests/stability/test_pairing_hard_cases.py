@@ -1,5 +1,5 @@
-"""Streams of poses as bad networks and restarting controllers deliver them, and rotations after a million
-steps: whatever comes, a pose is right, or refused and counted."""
+"""Streams of poses as bad networks and restarting controllers deliver them, and rotations after a hundred
+thousand steps: whatever comes, a pose is right, or refused and counted."""
 
 from __future__ import annotations
 
@@ -166,10 +166,10 @@ def test_unit_quaternions_after_ten_thousand_compositions(each):
     np.testing.assert_allclose(end, np.eye(3), atol=1e-11)
 
 
-@pytest.mark.slow
-def test_unit_quaternions_after_a_million_compositions():
-    end, furthest = composed(1_000_000, 10)
+def test_unit_quaternions_after_a_hundred_thousand_compositions():
+    end, furthest = composed(100_000, 10)
     assert furthest < 1e-14
-    # Rounding of the step's angle adds up in proportion to the number of steps, and in nothing else.
-    np.testing.assert_allclose(end, np.eye(3), atol=1e-9)
+    # Rounding of the step's angle adds up in proportion to the number of steps, and in nothing else: a tenth
+    # of what a million may come to.
+    np.testing.assert_allclose(end, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(end @ end.T, np.eye(3), atol=1e-14)

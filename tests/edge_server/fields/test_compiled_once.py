@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from edge_server.fields.registry import field_names
-
 FIT = """
 import hashlib, sys
 from edge_server.fields import Budget
@@ -30,7 +28,7 @@ print("digest", digest.hexdigest())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize("name", ["splat", "ngp"])  # what compiles and loads is shared; their kernels are not
 def test_results_do_not_depend_on_who_compiled_the_kernels(name: str, tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     digests = []

@@ -83,6 +83,7 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: dict(rates))
     monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "SIZE", 32)
     path = tmp_path / "results" / "field.json"
     found = bench("field", path, "--field", "ngp")
     text = path.with_suffix(".md").read_text()
@@ -125,6 +126,7 @@ def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_field, "table", lambda figures: "")
     monkeypatch.setattr(bench_field, "draw", lambda figures, path: None)
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "SIZE", 24)
     words = ("--resume", "--field", "ngp,voxel")
     bench("field", tmp_path / "bench.json", *words)
     everything = ["start ngp", "start voxel", "ngp", "voxel", "ngp", "voxel"]
