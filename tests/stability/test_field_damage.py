@@ -167,8 +167,5 @@ def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[Any], 
 @pytest.mark.slow
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Whole fits and renderings with numba's bounds checks, in one process: most kernels are shared."""
-    code = f"from {__name__} import *
-for kind in THROUGH_ALL: go_through_all(kind)
-print('kept')
-"
+    code = f"from {__name__} import *\nfor kind in THROUGH_ALL:\n    go_through_all(kind)\nprint('kept')\n"
     run_with_bounds_checks(code, tmp_path, request)
