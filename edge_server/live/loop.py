@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
+_TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
 STOP_S = 10.0
 """How long the server waits at its end for the update in progress."""
@@ -58,7 +59,7 @@ class UpdateLoop:
         self._next_policy: Policy | None = None
         self._reset = False
         self._last_update_ms = 0.0
-        self._made_no_step = False
+        self._without_steps = 0  # updates in a row
         self._shed, self._offered, self._shed_since_s = 0, 0, clock.now_ns() / 1e9
         self.paused = False
         self.failure: BaseException | None = None
@@ -155,14 +156,13 @@ class UpdateLoop:
 
     def _warn_without_steps(self, report: FitReport) -> None:
         """Log once, and again if it recurs, that updates are too short to learn anything."""
-        made_none = report.steps == 0 and not report.note
-        if made_none and not self._made_no_step:
+        self._without_steps = self._without_steps + 1 if report.steps == 0 and not report.note else 0
+        if self._without_steps == _TOO_SHORT:
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Give "
                 "updates more (edge.update_ms or edge.deadline_ms), or take a field that needs less of it",
                 report.seconds * 1e3,
             )
-        self._made_no_step = made_none
 
     def _warn_of_shed(self, report: FitReport, offered: int) -> None:
         """Log now and then what share of the frames was left out for lack of time."""
