@@ -29,10 +29,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
-# else meets clocks, ports or whole deployments and has the machine to itself.
+# What computes, in virtual time or none, or waits for what has minutes to come: whoever runs beside it
+# changes nothing but how long it takes. All else meets clocks, ports or whole deployments and has the machine
+# to itself.
 _SIDE_BY_SIDE = (
     "camera_node/robot/calibration", "camera_node/robot/arm/test_viewpoint_tour.py", "camera_node/synthetic",
+    "camera_node/sources/test_with_effects.py", "deploy/test_wheel.py", "test_architecture.py",
     "channel_emu/estimate", "channel_emu/model", "channel_emu/virtual", "edge_server/embed",
     "edge_server/experiments", "edge_server/export", "edge_server/fidelity", "edge_server/fields",
     "edge_server/report", "edge_server/scheduler", "edge_server/surface", "edge_server/treatments",
