@@ -13,7 +13,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +82,7 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
 
 def _run(seed: int, faults: Sequence[Fault]) -> dict[str, Any]:
     scenario = scenario_of(seed)
-    logging.getLogger("freshfield.files").setLevel(logging.ERROR)  # a full disk is one of the faults
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _full_disks_are_expected():
         deployment = ChaosDeployment(scenario, training_cameras(scenario), _SETTINGS, faults, Path(folder))
         deployment.run(SECONDS)
         deployment.end()
@@ -96,6 +95,18 @@ def _run(seed: int, faults: Sequence[Fault]) -> dict[str, Any]:
             "recovery_ms": recovery_ms,
             "counts": account.total.as_dict(),
         }
+
+
+@contextmanager
+def _full_disks_are_expected() -> Iterator[None]:
+    """No warnings of files that cannot be written: a full disk is one of the faults."""
+    log = logging.getLogger("freshfield.files")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def _accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:

@@ -18,4 +18,6 @@ def write(out: Path, role: str, lines, name: str = "x", start_ns: int = 1, close
         ledger.write(t_ns, camera, session, sequence, event, *detail)
     if closed:
         ledger.close(len(lines))
+    else:
+        ledger._lines.close()  # as a killed process: without the line ``closed``
     return ledger.path
