@@ -86,7 +86,9 @@ class Scenario:
     @property
     def max_side_px(self) -> int:
         """The largest image side that its cameras send: of the source's width and height, where it has both,
-        else whatever is accepted at all."""
+        else whatever is accepted at all. A camera that cannot do the size asked for sends its own."""
+        if self.source.get("kind") == "camera":
+            return MAX_IMAGE_SIDE_PX
         sides = [self.source.get(name) for name in ("width", "height")]
         whole = [side for side in sides if type(side) is int and side > 0]
         return max(whole) if len(whole) == len(sides) else MAX_IMAGE_SIDE_PX

@@ -14,6 +14,8 @@ import yaml
 
 from freshfield.limits import MAX_YAML_CHARS
 
+LEAST_VALUES = 100_000  # of a YAML file, however short: anchors repeat cameras and lenses honestly
+
 
 class UntrustedError(ValueError):
     """A file that must not be read; the message says why."""
@@ -47,7 +49,7 @@ def read_yaml(text: str) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        refuse_expansion(node, len(text) + 1, _node_parts)
+        refuse_expansion(node, max(LEAST_VALUES, 20 * len(text)), _node_parts)
         return loader.construct_document(node)
     except UntrustedError:
         raise

@@ -142,4 +142,5 @@ def test_images_are_as_large_as_the_source_says_and_else_bounded():
         return parse({"cameras": {"count": 2}, "source": source}, FILE).max_side_px
 
     assert largest(width=128, height=96) == 128 and largest(width=96, height=128) == 128
+    assert largest(kind="camera", width=128, height=96) == MAX_IMAGE_SIDE_PX
     assert largest() == largest(width=128) == largest(width="128", height=0) == MAX_IMAGE_SIDE_PX

@@ -108,6 +108,8 @@ class LayeredField:
             self._give_up_layers()
         if not self.layered:
             return self.first.fit(_newest_of_each(views), budget)
+        if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
+            self._begin_again()
         arrivals, shed = self._take_in(views, budget)
         if self.tracker is None and not self._plates_are_known():
             report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
@@ -255,7 +257,8 @@ class LayeredField:
         return (
             len(self.observations) > 0
             and self.observations.newest_s >= PLATE_S
-            and all(camera.plate.count >= PLATE_FRAMES for camera in self.cameras.values())
+            # Of a camera that has gone silent nothing more will come.
+            and all(self.cameras[o.camera].plate.count >= PLATE_FRAMES for o in self.observations)
         )
 
     # --- the static field ---------------------------------------------------------------------
@@ -270,6 +273,16 @@ class LayeredField:
         self.tracker.anchors_s = self.plates_s
         self.part_s.add("static field", begun)
         return self.tracker
+
+    def _begin_again(self) -> None:
+        """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
+        measured. Plates stay."""
+        self.static.reset()
+        self.tracker = self._published = self._still = None
+        self.shown = False
+        self.observations = Observations()
+        for camera in self.cameras.values():
+            camera.row, camera.depth_m, camera.rendered_step = None, None, -1
 
     def make_tracker(self) -> None:
         """A tracker of nothing yet, in the static field's box."""
