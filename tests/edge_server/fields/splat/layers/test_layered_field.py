@@ -244,6 +244,25 @@ def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing(wrong
     assert resumed.fit(views, Budget(steps=5)).refused == ()
 
 
+def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    store, plates = field.static.field.view_store, {n: c.plate for n, c in field.cameras.items()}
+    store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
+    _run(field, range(42, 43), steps=5)
+    assert field.moving is not None and field.moving.box is field.static.field.view_store.box
+    assert field.static.field.step == 5 and not field.shown
+    assert {n: c.plate for n, c in field.cameras.items()} == plates
+    assert all(camera.row is not None for camera in field.cameras.values())
+
+
+def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        field.fit([_frame(k, frame, False) for k in range(len(CAMERAS) if frame < 3 else 6)], Budget(steps=1))
+    assert field.moving is not None
+
+
 def test_what_there_is_no_time_for_is_left_out_the_oldest_first() -> None:
     field, ticks = LayeredField(SMALL), itertools.count()
     views = [_frame(k, frame, True) for frame in range(3) for k in range(len(CAMERAS))]
