@@ -29,7 +29,7 @@ from freshfield.scenario import Scenario, load
 LEAST_FREE_GB = 2.0
 _EXCHANGES = 8
 _ANSWER_S = 2.0
-_LISTEN_S = 0.5
+_LISTEN_S = 1.0  # in half of it, one late frame changes the rate by a third
 _LISTEN_AT_MOST_S = 3.0  # to a slow camera
 _JUDGED_FRAMES = 5  # of the rate that was asked for; with fewer, chance decides
 _LEAST_RATE = 0.6

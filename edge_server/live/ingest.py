@@ -38,6 +38,11 @@ class _Session:
     generated_ns: int = -(2**63)
     began_ns: int = 0
     """Capture time of its first admitted frame, on the edge's clock."""
+    newest_ns: int = 0
+    """Of its last one, on the edge's clock."""
+
+
+_SILENT_NS = 3 * 10**9  # a node that has sent nothing for so long is no second node
 
 
 class FrameAdmission:
@@ -53,7 +58,7 @@ class FrameAdmission:
         self._roles = {c: False for c in training} | {c: True for c in held_out}
         self.cameras: Collection[str] = self._roles.keys()
         self.doubled: Counter[str] = Counter()
-        """Frames that came from a second node of the same name, by camera."""
+        """Frames admitted while another node sent as the same camera, by camera."""
         self._sessions: dict[str, OrderedDict[str, _Session]] = {c: OrderedDict() for c in self._roles}
 
     def admit(self, frame: Frame, now_ns: int) -> None:
@@ -92,6 +97,7 @@ class FrameAdmission:
         if frame.session not in sessions:
             session.began_ns = frame.generated_edge_ns
             sessions[frame.session] = session
+        session.newest_ns = frame.generated_edge_ns
         self._look_for_two_nodes(frame, sessions)
         sessions.move_to_end(frame.session)
         while len(sessions) > limits.MAX_SESSIONS_PER_CAMERA:
@@ -99,9 +105,10 @@ class FrameAdmission:
 
     def _look_for_two_nodes(self, frame: Frame, sessions: OrderedDict[str, _Session]) -> None:
         """A node that restarts captures nothing for its old session any more; two go on side by side."""
-        newest_began_ns = max(session.began_ns for session in sessions.values())
-        began_ns = sessions[frame.session].began_ns
-        if began_ns < newest_began_ns < frame.generated_edge_ns - limits.MAX_CLOCK_UNCERTAINTY_NS:
+        now_ns, mine = frame.generated_edge_ns, sessions[frame.session]
+        other = max(sessions.values(), key=lambda session: session.began_ns)
+        goes_on = now_ns - other.newest_ns < _SILENT_NS
+        if goes_on and mine.began_ns < other.began_ns < now_ns - limits.MAX_CLOCK_UNCERTAINTY_NS:
             if frame.camera not in self.doubled:
                 log.warning(
                     "%s: two nodes send as this camera, each in a session of its own: give one another id "

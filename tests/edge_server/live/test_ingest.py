@@ -157,6 +157,16 @@ def test_two_nodes_of_one_name_are_told_apart_and_said(caplog):
     assert said.startswith("cam01: two nodes send as this camera")
 
 
+def test_a_single_stray_frame_is_not_a_second_node_for_ever():
+    admission = FrameAdmission(["cam01"], [])
+    for k in range(1, 101):
+        now_ns = NOW + k * 10**8
+        admission.admit(frame(sequence=k, generated_ns=now_ns, session="first"), now_ns)
+        if k == 5:
+            admission.admit(frame(sequence=1, generated_ns=now_ns + 1, session="stray"), now_ns)
+    assert 0 < admission.doubled["cam01"] <= 20
+
+
 def test_a_node_that_restarts_is_one_node(caplog):
     """Frames of its old session may still be on their way."""
     admission = FrameAdmission(["cam01"], [])
