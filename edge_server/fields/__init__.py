@@ -7,8 +7,8 @@ tests of all representations find what they need in ``tests/edge_server/fields/N
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -26,6 +26,8 @@ class View:
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
     carried_to_ns: the instant that the image has been carried forward to since its capture
     (``treatments.flow_warp``); None: it shows the instant of its capture.
+    whole: decodes the same frame at its full resolution (None: it cannot be decoded), where ``image`` is
+    smaller, see ``Field.most_pixels``.
     """
 
     camera: str
@@ -35,6 +37,7 @@ class View:
     generated_ns: int = 0
     weight: NDArray[np.float32] | None = None
     carried_to_ns: int | None = None
+    whole: Callable[[], View | None] | None = field(default=None, compare=False, repr=False)
 
     @property
     def shows_ns(self) -> int:
@@ -112,9 +115,12 @@ class Field(Renderer, Protocol):
     """A radiance field. Every implementation is deterministic for one seed and one sequence of calls.
 
     every_frame: ``fit`` wants every frame since the last one, not only the newest of each camera.
+    most_pixels: of one image of every camera together, where larger images take more time than what moves
+    leaves; None: as many as there are.
     """
 
     every_frame: bool
+    most_pixels: int | None
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""

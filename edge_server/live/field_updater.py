@@ -87,7 +87,8 @@ class FieldUpdater:
         self._selected_of = 0  # arrivals at the last selection
         if field.every_frame:
             buffer.keep_every_frame()
-        self.decoder = ViewDecoder(foreground)
+        most = field.most_pixels
+        self.decoder = ViewDecoder(foreground, None if most is None else most // len(buffer.cameras))
         self.embedder = embedder
         self.embeddings: EmbeddingCache | None = None
         if embedder is not None:

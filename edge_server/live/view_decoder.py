@@ -7,12 +7,14 @@ keeps the last view of each camera.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from edge_server.fields import View
 from edge_server.live.buffer import BufferedFrame
 from freshfield import payload
 from freshfield.frame import Frame
+from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:
     from edge_server.foreground.foreground import Foreground
@@ -22,11 +24,14 @@ class ViewDecoder:
     """Decodes buffered frames.
 
     foreground: cuts the background out of every image; None leaves images whole.
+    most_pixels: of an image; a larger one is decoded at half its size, or a quarter, or an eighth. None: as
+    they are.
     undecodable: number of damaged payloads. A failure is remembered, so that a frame counts once.
     """
 
-    def __init__(self, foreground: Foreground | None = None) -> None:
+    def __init__(self, foreground: Foreground | None = None, most_pixels: int | None = None) -> None:
         self.foreground = foreground
+        self.most_pixels = most_pixels
         self._views: dict[str, tuple[Frame, View | None]] = {}
         self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
@@ -71,13 +76,26 @@ class ViewDecoder:
         self._earlier.clear()
 
     def _decode(self, item: BufferedFrame) -> View | None:
+        halvings = self._halvings(item.frame.intrinsics)
+        view = self._decode_at(item, halvings)
+        if view is None:
+            self.undecodable += 1
+        elif halvings:
+            view = replace(view, whole=lambda: self._decode_at(item, 0))
+        return view
+
+    def _decode_at(self, item: BufferedFrame, halvings: int) -> View | None:
         frame, k = item.frame, item.frame.intrinsics
         try:
-            image = payload.decode(frame.payload, frame.codec, k.width, k.height)
+            image = payload.decode(frame.payload, frame.codec, k.width, k.height, halvings)
         except payload.PayloadError:
-            self.undecodable += 1
             return None
         weight = None
         if self.foreground is not None:
             image, weight = self.foreground.apply(frame.camera, image)
-        return View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns, weight)
+        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), item.generated_ns, weight)
+
+    def _halvings(self, k: Pinhole) -> int:
+        if self.most_pixels is None:
+            return 0
+        return next((n for n in range(3) if (k.width * k.height) >> 2 * n <= self.most_pixels), 3)

@@ -233,6 +233,13 @@ class Pinhole:
         sx, sy = w / self.width, h / self.height
         return Pinhole(w, h, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion)
 
+    def halved(self, times: int) -> Pinhole:
+        """The same camera with images of half the size, ``times`` over; odd sizes are rounded up, as
+        ``payload.decode`` does."""
+        s = 0.5**times
+        size = -(-self.width >> times), -(-self.height >> times)
+        return Pinhole(*size, self.fx * s, self.fy * s, self.cx * s, self.cy * s, self.distortion)
+
     def rays(self, pixels: ArrayLike | None = None) -> Array:
         """Unit ray directions in camera axes, (H, W, 3), or (N, 3) for pixel coordinates (N, 2)."""
         if pixels is None:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
-from freshfield.payload import PayloadError, check, decode, encode
+from freshfield.payload import CODECS, PayloadError, check, decode, encode
 from tests.work import MOST_MS, work_ms
 
 # --- what is encoded comes back ----------------------------------------------------------------
@@ -285,3 +285,19 @@ print(peak_kb() - before)
     run = [sys.executable, "-c", program, str(tmp_path)]
     grown_kb = int(subprocess.check_output(run))
     assert grown_kb < 20_000
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (64, 48)])
+def test_halving_keeps_the_picture(codec, size):
+    width, height = size
+    x, y = np.meshgrid(np.linspace(0, 200, width), np.linspace(0, 200, height))
+    image = np.stack([x, y, x + y / 4], axis=-1).astype(np.uint8)
+    data = encode(image, codec, 95)
+    for halvings in range(4):
+        small = decode(data, codec, width, height, halvings)
+        n = 2**halvings
+        assert small.shape == (-(-height // n), -(-width // n), 3)
+        if width % n == height % n == 0:
+            mean = image.reshape(height // n, n, width // n, n, 3).mean(axis=(1, 3))
+            assert np.abs(small - mean).max() < 6

@@ -71,6 +71,7 @@ class TrainedField:
     """
 
     every_frame = False
+    most_pixels: int | None = None
 
     name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]

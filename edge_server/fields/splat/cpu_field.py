@@ -65,6 +65,7 @@ class SplatField:
     """
 
     every_frame = False
+    most_pixels: int | None = None
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()

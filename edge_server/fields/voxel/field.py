@@ -62,6 +62,7 @@ class VoxelField:
     """
 
     every_frame = False
+    most_pixels: int | None = None
 
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or VoxelSettings()

@@ -54,3 +54,17 @@ def test_a_damaged_frame_before_is_counted_once_and_is_missing():
     for _ in range(2):
         assert list(decoder.earlier([cut, whole])) == ["cam02"]
     assert decoder.undecodable == 1
+
+
+def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
+    item = BufferedFrame(frame(), 0, 0)  # 32 x 24
+    for most, size in ((768, (24, 32)), (767, (12, 16)), (1, (3, 4))):
+        view = ViewDecoder(most_pixels=most).view(item)
+        assert view.image.shape[:2] == size == (view.intrinsics.height, view.intrinsics.width)
+        if size == (24, 32):
+            assert view.whole is None
+            continue
+        whole = view.whole()
+        assert whole.image.shape[:2] == (24, 32) and whole.whole is None
+        np.testing.assert_allclose(view.intrinsics.rays([[1.0, 2.0]]), whole.intrinsics.rays(
+            [[32 / size[1], 2.0 * 24 / size[0]]]))  # fmt: skip

@@ -31,8 +31,9 @@ from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
-from edge_server.fields.splat.layers.plates import Plate
+from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
+from edge_server.fields.splat.layers.static_field import PlateImage
 from edge_server.fields.splat.layers.static_layer import StaticLayer, gaussians
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
@@ -45,7 +46,10 @@ EVIDENCE_S = 0.8  # age up to which frames tell of motion
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
+FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
+FINE_FRAMES = 6  # of each camera, before the static field learns from fine plates
 INTAKE_SHARE = 0.4  # of a budget in seconds: older frames are left out
+MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each taken in 15 times a second
 LEAST_TAKEN = 4  # frames, however short the budget is
 
 
@@ -59,6 +63,7 @@ class LayeredField:
     """
 
     every_frame = True
+    most_pixels = MOST_PIXELS
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()
@@ -85,6 +90,8 @@ class LayeredField:
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
+        self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
+        self.fine = False  # whether the static field learns from fine plates
         self._published: LayeredSnapshot | None = None
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
@@ -110,7 +117,7 @@ class LayeredField:
             return self.first.fit(_newest_of_each(views), budget)
         if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
             self._begin_again()
-        arrivals, shed = self._take_in(views, budget)
+        taken, shed = self._take_in(views, budget)
         if self.tracker is None and not self._plates_are_known():
             report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
             return replace(report, shed=shed)
@@ -132,7 +139,8 @@ class LayeredField:
             report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
             return replace(report, shed=shed)
         self._take_renderings(beside)
-        note = "" if steps or pace.steps else "nothing is left to learn" if arrivals else "no new views"
+        self._take_whole(taken)
+        note = "" if steps or pace.steps else "nothing is left to learn" if taken else "no new views"
         return FitReport(
             steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
@@ -206,14 +214,14 @@ class LayeredField:
         self.static.stop()
         if self.shown:
             self.first.load_state(self.static.field.state())
-        self.layered = self.shown = False
+        self.layered = self.shown = self.fine = False
         self._published, self.tracker, self.observations = None, None, Observations()
         self.cameras = {}
         self.static.reset()
 
-    def _take_in(self, views: Sequence[View], budget: Budget) -> tuple[int, int]:
-        """Plates and foregrounds of the views not seen before. Returns how many were taken in, and how many
-        left out because they would take too much of the budget: the newest of each camera come first."""
+    def _take_in(self, views: Sequence[View], budget: Budget) -> tuple[list[View], int]:
+        """Plates and foregrounds of the views not seen before. Returns those that were taken in, and how many
+        were left out because they would take too much of the budget: the newest of each camera come first."""
         begun = self.now()
         if self.origin_ns is None:
             self.origin_ns = min(view.shows_ns for view in views)
@@ -229,7 +237,7 @@ class LayeredField:
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
         self.part_s.add("plates", begun)
-        return len(chosen), len(news) - len(chosen)
+        return chosen, len(news) - len(chosen)
 
     def _has_seen(self, view: View) -> bool:
         return view.camera in self.cameras and view.generated_ns in self.cameras[view.camera].taken
@@ -238,7 +246,9 @@ class LayeredField:
         assert self.origin_ns is not None
         if view.camera not in self.cameras:
             plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
-            self.cameras[view.camera] = FixedCamera(view, plate)
+            whole = None if view.whole is None else view.whole()
+            fine = None if whole is None else FinePlate(whole)
+            self.cameras[view.camera] = FixedCamera(replace(view, whole=None), plate, fine=fine)
         camera = self.cameras[view.camera]
         camera.taken.append(view.generated_ns)
         refused = self.refused | {view.camera}
@@ -253,6 +263,24 @@ class LayeredField:
             replace(view, camera_to_world=camera.view.camera_to_world), foreground,
         ))  # fmt: skip
 
+    def _take_whole(self, taken: Sequence[View]) -> None:
+        """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
+        begun, now_s = self.now(), self.observations.newest_s
+        views = {v.camera: v for v in taken if v.whole is not None}
+        seen = [
+            o
+            for o in self.observations
+            if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
+        ]
+        if not seen or now_s - self.fine_s < FINE_EVERY_S:
+            return
+        self.fine_s = now_s
+        o = min(seen, key=lambda o: self.cameras[o.camera].fine_count)
+        camera, decode = self.cameras[o.camera], views[o.camera].whole
+        if camera.fine is not None and decode is not None and (whole := decode()) is not None:
+            camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
+        self.part_s.add("fine plates", begun)
+
     def _plates_are_known(self) -> bool:
         return (
             len(self.observations) > 0
@@ -266,7 +294,7 @@ class LayeredField:
     def _begin_layers(self) -> MotionTracker:
         """Give the static field its first plates, and the moving set the scene's box."""
         begun = self.now()
-        self.static.field.learn([camera.plate_image() for camera in self.cameras.values()])
+        self.static.field.learn(self._plates())
         self.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
@@ -292,19 +320,33 @@ class LayeredField:
     def _compare_plates(self, beside: bool) -> None:
         """Have the static field learn plates that have changed. beside: in a thread, until it has learned
         them; or else only note that there is something to learn."""
+        begun, now_s = self.now(), self.observations.newest_s
+        if not self.fine and self._fine_plates_are_known():
+            self.static.stop()
+            self.fine = True
+            self.static.field.refine(self._plates())
+            self.plates_s = now_s
         if beside and self.static.training:
             return
-        begun, now_s, finished = self.now(), self.observations.newest_s, self.static.field.finished
+        finished = self.static.field.finished
         if finished and now_s - self.plates_s < PLATES_EVERY_S:
             return
         if finished or beside:
-            plates = [camera.plate_image() for camera in self.cameras.values()]
+            plates = self._plates()
             self.plates_s = now_s
             if beside:
-                self.static.train_beside(plates)
+                self.static.train_beside(plates, [camera.view for camera in self.cameras.values()])
             else:
                 self.static.field.learn_again(plates)
         self.part_s.add("static field", begun)
+
+    def _plates(self) -> list[PlateImage]:
+        return [camera.plate_image(self.fine) for camera in self.cameras.values()]
+
+    def _fine_plates_are_known(self) -> bool:
+        seen = [self.cameras[camera].fine for camera in {o.camera for o in self.observations}]
+        fine = [f for f in seen if f is not None]
+        return bool(fine) and all(f.count >= FINE_FRAMES for f in fine)
 
     def _find_rows(self) -> None:
         for camera in self.cameras.values():

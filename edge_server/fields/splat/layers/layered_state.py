@@ -16,14 +16,14 @@ from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
-from edge_server.fields.splat.layers.plates import Plate
+from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-COUNTERS = ("layered", "shown", "origin_ns", "plates_s")  # attributes of the field
+COUNTERS = ("layered", "shown", "origin_ns", "plates_s", "fine_s", "fine")  # attributes of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 
@@ -40,6 +40,8 @@ def pack(field: Any) -> Arrays:
         })  # fmt: skip
         state |= {f"camera_{k}.image": view.image, f"camera_{k}.pose": view.camera_to_world}
         state |= _prefixed(f"camera_{k}.plate.", camera.plate.state())
+        if camera.fine is not None:
+            state |= _prefixed(f"camera_{k}.fine.", camera.fine.state())
         if camera.depth_m is not None:
             state[f"camera_{k}.depth_m"] = camera.depth_m
     for k, o in enumerate(field.observations):
@@ -80,11 +82,12 @@ def unpack(field: Any, state: Arrays) -> None:
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
+        fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
         depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
         newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
         taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
         field.cameras[view.camera] = FixedCamera(
-            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken
+            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken, fine
         )
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.splat.layers.motion import KNOTS_PER_S, ViewRow
-from edge_server.fields.splat.layers.plates import Plate
+from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_field import PlateImage
 
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
@@ -31,6 +31,7 @@ class FixedCamera:
     rendered_step: step of the static field at which that was.
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
+    fine: the plate at the full resolution; None where the frames taken in have it.
     """
 
     view: View
@@ -40,9 +41,17 @@ class FixedCamera:
     rendered_step: int = -1
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
+    fine: FinePlate | None = None
 
-    def plate_image(self) -> PlateImage:
-        """The plate as it is now, copied."""
+    @property
+    def fine_count(self) -> int:
+        """How many frames the fine plate was made of."""
+        return 0 if self.fine is None else self.fine.count
+
+    def plate_image(self, fine: bool) -> PlateImage:
+        """The plate as it is now, copied. fine: at the full resolution, where there is such a plate."""
+        if fine and self.fine is not None:
+            return PlateImage(self.fine.view, self.fine.color.copy(), self.fine.known)
         return PlateImage(self.view, self.plate.at_first_exposure(), self.plate.known.copy())
 
     def take_rendering(self, step: int, rendering: Rendering) -> None:

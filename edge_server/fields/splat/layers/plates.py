@@ -6,12 +6,14 @@ most votes is the plate, once it has enough of them. Colors are in steps of 255.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.kernels.plates import (
     BRIGHT,
@@ -25,6 +27,7 @@ from edge_server.fields.splat.layers.kernels.plates import (
     count_exposure,
     vote,
 )
+from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
 
@@ -33,6 +36,7 @@ GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
+FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
 HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
 
 
@@ -165,6 +169,63 @@ class Plate:
             np.clip(array * gain, 0.0, 255.0, out=array)
         for array in (self._recent, self._static, self._static_blurred):
             array *= gain
+
+
+class FinePlate:
+    """A plate at the full resolution of frames that are taken in at a lower one: the mean of some of them,
+    outside their foregrounds.
+
+    view: a frame at full resolution.
+    color: float32 (H, W, 3), at the exposure of the camera's first frame, steps of 255.
+    frames: uint8 (H, W), in how many each pixel was seen, up to FINE_MEMORY.
+    count: number of frames taken in.
+    """
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+        self.color = np.zeros(view.image.shape, np.float32)
+        self.frames, self.count = np.zeros(view.image.shape[:2], np.uint8), 0
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """bool (H, W), where there is a plate."""
+        return self.frames >= FINE_KNOWN
+
+    def take(self, image: NDArray[np.uint8], away: NDArray[np.bool_], gain: NDArray[np.float32]) -> None:
+        """Take in a frame.
+
+        image: uint8 (H, W, 3).
+        away: bool, at the lower resolution, where it does not show the plate.
+        gain: float32 (3,), its exposure over that of the first frame.
+        """
+        grown = cv2.dilate(away.astype(np.uint8), np.ones((3, 3), np.uint8))
+        use = cv2.resize(grown, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0
+        self.frames += use & (self.frames < FINE_MEMORY)
+        rate = use / np.maximum(self.frames, 1).astype(np.float32)
+        self.color += (image / gain - self.color) * rate[..., None]
+        self.count += 1
+
+    def state(self) -> Arrays:
+        """Everything needed to continue bit for bit."""
+        lens = self.view.intrinsics
+        numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
+        return {
+            "color": self.color,
+            "frames": self.frames,
+            "count": np.array(self.count),
+            "lens": np.array(numbers),
+        }
+
+    @staticmethod
+    def from_state(view: View, state: Arrays) -> FinePlate:
+        """What ``state`` gave. view: the camera's, at the lower resolution. KeyError: it lacks something."""
+        height, width = state["frames"].shape
+        fx, fy, cx, cy, *distortion = (float(n) for n in state["lens"])
+        lens = Pinhole(width, height, fx, fy, cx, cy, tuple(distortion))
+        fine = FinePlate(replace(view, image=np.zeros((height, width, 3), np.uint8), intrinsics=lens))
+        fine.color, fine.frames = np.array(state["color"]), np.array(state["frames"])
+        fine.count = int(state["count"])
+        return fine
 
 
 def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -58,6 +58,7 @@ class StaticField(SplatField):
         super().reset()
         self.rounds, self._rounds_wanted, self._rate = 0, ROUNDS_FIRST, RATE_FIRST
         self._round_step = 0  # steps of this round
+        self._grows_until = SCHEDULE  # step
         self._mean: NDArray[np.float32] | None = None
         self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
 
@@ -85,10 +86,20 @@ class StaticField(SplatField):
         self._round_step, self._mean = 0, None
         return True
 
+    def refine(self, plates: Sequence[PlateImage]) -> None:
+        """``learn`` the same plates at a higher resolution, in what is left of the schedule, or in its second
+        half again."""
+        self.learn(plates)
+        self._grows_until = max(SCHEDULE, self.step + SCHEDULE // 2)
+        self.rounds, self._rounds_wanted, self._rate = 0, ROUNDS_FIRST, RATE_FIRST
+        self._round_step, self._mean = 0, None
+
     def _changed_pixels(self, plate: PlateImage) -> int:
         if plate.view.camera not in self._learned:
             return int(plate.known.sum())
         before, was_known = self._learned[plate.view.camera]
+        if was_known.shape != plate.known.shape:
+            return int(plate.known.sum())
         both = plate.known & was_known
         differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > CHANGED
         return int((plate.known & (differs | ~was_known)).sum())
@@ -100,8 +111,9 @@ class StaticField(SplatField):
         rays = samples = 0
         while not self.finished and pace.begin_step(self._step_time) is not None:
             with self._lock:
-                growing = self.step < SCHEDULE
-                progress = self.step / SCHEDULE if growing else self._round_step / ROUND
+                left = self._grows_until - self.step
+                growing = left > 0
+                progress = 1.0 - left / SCHEDULE if growing else self._round_step / ROUND
                 loss, seen, pairs, lost = self._one_step(progress)
                 self.dropped += lost
                 if not growing:
@@ -139,7 +151,13 @@ class StaticField(SplatField):
 
     def state(self) -> Arrays:
         """Everything needed to resume bit for bit."""
-        counters = [self.rounds, self._rounds_wanted, self._round_step, int(self._rate == RATE_AGAIN)]
+        counters = [
+            self.rounds,
+            self._rounds_wanted,
+            self._round_step,
+            int(self._rate == RATE_AGAIN),
+            self._grows_until,
+        ]
         mine: Arrays = {"rounds": np.array(counters, np.int64)}
         if self._mean is not None:
             mine["mean"] = self._mean.copy()
@@ -151,7 +169,9 @@ class StaticField(SplatField):
     def load_state(self, state: Arrays) -> None:
         """Resume from ``state``."""
         super().load_state(state)
-        self.rounds, self._rounds_wanted, self._round_step, again = (int(n) for n in state["rounds"])
+        self.rounds, self._rounds_wanted, self._round_step, again, self._grows_until = (
+            int(n) for n in state["rounds"]
+        )
         self._rate = RATE_AGAIN if again else RATE_FIRST
         self._mean = np.array(state["mean"]) if "mean" in state else None
         self._learned = {}
@@ -174,7 +194,7 @@ class StaticField(SplatField):
         return None
 
     def _finish_step(self) -> None:
-        if self.step < SCHEDULE:
+        if self.step < self._grows_until:
             super()._finish_step()
         else:
             self.step += 1

@@ -49,11 +49,13 @@ class StaticLayer:
             raise failure
         return self._thread is not None and self._thread.is_alive()
 
-    def train_beside(self, plates: Sequence[PlateImage]) -> None:
-        """Learn plates that have changed, in a thread, until nothing is left to learn. The thread must not be
-        at work."""
+    def train_beside(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
+        """Learn plates that have changed, in a thread, until nothing is left to learn, and render ``views``
+        meanwhile. The thread must not be at work."""
         self._stopping = False
-        self._thread = threading.Thread(target=self._main, args=(plates,), name="static-field", daemon=True)
+        self._thread = threading.Thread(
+            target=self._main, args=(plates, views), name="static-field", daemon=True
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -84,11 +86,11 @@ class StaticLayer:
         for view in views:
             self.rendered[view.camera] = (shown.step, shown.render(view.camera_to_world, view.intrinsics))
 
-    def _main(self, plates: Sequence[PlateImage]) -> None:
+    def _main(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
         try:
             if self.field.finished:
                 self.field.learn_again(plates)
-            views, rendered_step = [plate.view for plate in plates], self.field.step
+            rendered_step = self.field.step
             while not self.field.finished and not self._stopping:
                 self.field.train(StepBudget(Budget(steps=ROUND)))
                 self.publish()

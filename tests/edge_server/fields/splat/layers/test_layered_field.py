@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -321,3 +322,32 @@ def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
     assert not field.layered
     shown = field.render(HELD.camera_to_world, HELD.intrinsics).color
     assert psnr(shown[~body], still.image[~body] / 255.0) > before_db - 1.0
+
+
+def _small(camera: int, frame: int) -> View:
+    """A frame at half its size, as the decoder gives it; its whole is there when asked for."""
+    whole = _frame(camera, frame, True)
+    size = whole.image.shape[1] // 2, whole.image.shape[0] // 2
+    image = np.asarray(cv2.resize(whole.image, size, interpolation=cv2.INTER_AREA))
+    return replace(whole, image=image, intrinsics=whole.intrinsics.halved(1), whole=lambda: whole)
+
+
+def test_frames_taken_in_at_half_their_size_still_give_plates_at_full_resolution() -> None:
+    def run(field: Any, frames: range, fine: bool) -> None:
+        for frame in frames:
+            views = [_small(k, frame) for k in range(len(CAMERAS))]
+            field.fit(views if fine else [replace(v, whole=None) for v in views], Budget(steps=30))
+
+    instant_s = 110 * FRAME_S
+    scores = []
+    for fine in (False, True):
+        field = LayeredField(SMALL)
+        run(field, range(60), fine)
+        again = LayeredField(SMALL)
+        again.load_state(field.state())  # between the coarse and the fine plates
+        for one in (field, again):
+            run(one, range(60, 110), fine)
+        _same_state(field, again)
+        assert field.fine is fine
+        scores.append(_score(field.snapshot(round(instant_s * 1e9)), instant_s))
+    assert scores[1] > scores[0] + 1.0, scores
