@@ -329,6 +329,7 @@ class EdgeServer:
                 "first_ms": self._first_ms,
                 "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
+                "shed": self.buffer.shed,
             },
             "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),

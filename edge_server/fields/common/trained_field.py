@@ -70,7 +70,7 @@ class TrainedField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
-    every_frame = False
+    frame_s = None
 
     name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]

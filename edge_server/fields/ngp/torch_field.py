@@ -184,7 +184,7 @@ class TorchSnapshot:
 class NgpTorchField:
     """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
-    every_frame = False
+    frame_s = None
 
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
         self.settings = settings or NgpSettings()

@@ -64,7 +64,7 @@ class SplatField:
     meanwhile: these wait for the end of the current step, a few milliseconds.
     """
 
-    every_frame = False
+    frame_s = None
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()

@@ -61,7 +61,7 @@ class VoxelField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
-    every_frame = False
+    frame_s = None
 
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or VoxelSettings()

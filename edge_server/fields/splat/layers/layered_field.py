@@ -45,8 +45,6 @@ EVIDENCE_S = 0.8  # age up to which frames tell of motion
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
-INTAKE_SHARE = 0.4  # of a budget in seconds: older frames are left out
-LEAST_TAKEN = 4  # frames, however short the budget is
 
 
 class LayeredField:
@@ -58,8 +56,6 @@ class LayeredField:
     part_s: seconds spent by part, in all fits.
     """
 
-    every_frame = True
-
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
@@ -68,7 +64,7 @@ class LayeredField:
         self.first = SplatField(self.settings, self.pool)
         self.static = StaticLayer(self.settings, self.pool)
         self.part_s = PartTimes(self.now)
-        self._take_time = StepTimer()  # of taking in a frame
+        self._frame_time = StepTimer()
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -87,6 +83,11 @@ class LayeredField:
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
         self._published: LayeredSnapshot | None = None
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
+
+    @property
+    def frame_s(self) -> float | None:
+        """Seconds to take in a frame; None where layers were given up."""
+        return self._frame_time.seconds if self.layered else None
 
     @property
     def moving(self) -> MovingSet | None:
@@ -110,10 +111,9 @@ class LayeredField:
             return self.first.fit(_newest_of_each(views), budget)
         if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
             self._begin_again()
-        arrivals, shed = self._take_in(views, budget)
+        news = self._take_in(views)
         if self.tracker is None and not self._plates_are_known():
-            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
-            return replace(report, shed=shed)
+            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
         self._compare_plates(beside)
@@ -129,12 +129,11 @@ class LayeredField:
             self.part_s.add("static field", begun)
         self._publish()
         if beside and not self.shown:
-            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
-            return replace(report, shed=shed)
+            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
         self._take_renderings(beside)
-        note = "" if steps or pace.steps else "nothing is left to learn" if arrivals else "no new views"
+        note = "" if steps or pace.steps else "nothing is left to learn" if news else "no new views"
         return FitReport(
-            steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note,
+            steps, pace.elapsed_s(), loss, rays, samples, note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
         )  # fmt: skip
 
@@ -162,7 +161,7 @@ class LayeredField:
         pose[2, 3] = -3.0
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
-        field._take_in(views, Budget(steps=1))
+        field._take_in(views)
         moving = field._begin_layers().moving
         field._find_rows()
         moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
@@ -211,25 +210,20 @@ class LayeredField:
         self.cameras = {}
         self.static.reset()
 
-    def _take_in(self, views: Sequence[View], budget: Budget) -> tuple[int, int]:
-        """Plates and foregrounds of the views not seen before. Returns how many were taken in, and how many
-        left out because they would take too much of the budget: the newest of each camera come first."""
+    def _take_in(self, views: Sequence[View]) -> int:
+        """Plates and foregrounds of the views not seen before. Returns their number."""
         begun = self.now()
         if self.origin_ns is None:
             self.origin_ns = min(view.shows_ns for view in views)
         news = {(v.generated_ns, v.camera): v for v in views if not self._has_seen(v)}
-        chosen = _newest_first(list(news.values()))
-        if budget.seconds is not None and self._take_time.seconds:
-            room = int(INTAKE_SHARE * budget.seconds / self._take_time.seconds)
-            chosen = chosen[: max(room, LEAST_TAKEN)]
-        for view in sorted(chosen, key=lambda v: (v.generated_ns, v.camera)):
+        for _, view in sorted(news.items()):
             self._take(view)
-        if chosen:
-            self._take_time.add((self.now() - begun) / len(chosen))
+        if news:
+            self._frame_time.add((self.now() - begun) / len(news))
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
         self.part_s.add("plates", begun)
-        return len(chosen), len(news) - len(chosen)
+        return len(news)
 
     def _has_seen(self, view: View) -> bool:
         return view.camera in self.cameras and view.generated_ns in self.cameras[view.camera].taken
@@ -383,16 +377,6 @@ def _newest_of_each(views: Sequence[View]) -> list[View]:
         if view.camera not in newest or view.shows_ns > newest[view.camera].shows_ns:
             newest[view.camera] = view
     return list(newest.values())
-
-
-def _newest_first(views: Sequence[View]) -> list[View]:
-    """The newest of each camera, newest first; then the second newest of each, and so on."""
-    older = dict[str, int]()
-    ranked = []
-    for view in sorted(views, key=lambda v: (-v.generated_ns, v.camera)):
-        ranked.append((older.get(view.camera, 0), view))
-        older[view.camera] = older.get(view.camera, 0) + 1
-    return [view for _, view in sorted(ranked, key=lambda one: one[0])]
 
 
 def _remaining(budget: Budget, spent_s: float) -> Budget:

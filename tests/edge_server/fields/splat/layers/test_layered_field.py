@@ -263,19 +263,17 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     assert field.moving is not None
 
 
-def test_what_there_is_no_time_for_is_left_out_the_oldest_first() -> None:
+def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
     field, ticks = LayeredField(SMALL), itertools.count()
-    views = [_frame(k, frame, True) for frame in range(3) for k in range(len(CAMERAS))]
-    assert field.fit(views[: len(CAMERAS)], Budget(seconds=0.05)).shed == 0  # not known yet how long it takes
-    field.now = lambda: float(next(ticks))  # now it takes a second
-    field.fit(views[:1], Budget(seconds=0.05))
-    for _ in range(3):
-        field._take_time.add(1.0)
-    report = field.fit(views[::-1], Budget(seconds=17.5))
-    assert report.shed == 2 * len(CAMERAS) - 7
-    taken = {(o.camera, o.view.generated_ns) for o in field.observations}
-    newest = {(v.camera, v.generated_ns) for v in views[-7:]}
-    assert taken == newest | {(v.camera, v.generated_ns) for v in views[: len(CAMERAS)]}
+    views = [_frame(k, frame, True) for frame in range(2) for k in range(len(CAMERAS))]
+    assert field.frame_s == 0.0  # not known yet
+    field.now = lambda: float(next(ticks))
+    field.fit(views, Budget(seconds=0.05))
+    assert field.frame_s == 1.0 / len(views)
+    field.fit([replace(views[0], camera_to_world=HELD.camera_to_world)], Budget(steps=1))
+    assert field.frame_s is None
+    field.reset()
+    assert field.frame_s is not None
 
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(
