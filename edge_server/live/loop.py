@@ -190,6 +190,9 @@ class UpdateLoop:
             except OSError as error:  # a full disk must not end the updates; whoever asked gets the error
                 log.error("checkpoint %s not written: %s", path, error)
                 future.set_exception(error)
+            except BaseException as error:  # of the field itself: it ends the loop
+                future.set_exception(error)
+                raise
 
     def _select(self, budget: Budget) -> Selection | None:
         """SelectionWindow, wait as the plan says, and select; None if the controls changed meanwhile."""

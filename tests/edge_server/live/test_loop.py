@@ -226,6 +226,24 @@ def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
     assert any("1 of 2" in line for line in run.lines)
 
 
+def test_a_field_that_fails_at_a_checkpoint_ends_the_loop_and_tells_who_asked(tmp_path):
+    u = updates(cameras=("cam01",))
+    run = Running(u)
+
+    def broken(path):
+        raise RuntimeError("its thread has failed")
+
+    run.loop._on_checkpoint = broken
+    now = run.clock.now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    future = run.loop.request_checkpoint(tmp_path / "field.npz")
+    run.loop.start()
+    with pytest.raises(RuntimeError, match="thread has failed"):
+        future.result(30)
+    run.loop._thread.join(30)
+    assert isinstance(run.loop.failure, RuntimeError)
+
+
 def test_a_failing_field_ends_the_loop_and_is_not_hidden():
     u = updates()
 

@@ -11,6 +11,7 @@ can be repeated bit for bit.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,6 +38,8 @@ from edge_server.fields.splat.layers.static_layer import StaticLayer, gaussians
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole
+
+log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
 
@@ -105,15 +108,17 @@ class LayeredField:
         pace = StepBudget(budget, self.now)
         for view in views:
             check_view(view)
-        if self.layered and not all(self._stands_still(view) for view in views):
-            self._give_up_layers()
+        if self.layered and (reasons := [why for view in views if (why := self._unfit_for_layers(view))]):
+            self._give_up_layers(reasons[0])
         if not self.layered:
             return self.first.fit(_newest_of_each(views), budget)
         if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
             self._begin_again()
         news = self._take_in(views)
-        if self.tracker is None and not self._plates_are_known():
-            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+        if self.tracker is None:
+            if not self._plates_are_known():
+                return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
         self._compare_plates(beside)
@@ -131,11 +136,16 @@ class LayeredField:
         if beside and not self.shown:
             return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
         self._take_renderings(beside)
-        note = "" if steps or pace.steps else "nothing is left to learn" if news else "no new views"
+        note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if news else "no new views"
         return FitReport(
             steps, pace.elapsed_s(), loss, rays, samples, note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
         )  # fmt: skip
+
+    def _why_no_step(self, moving: MovingSet) -> str:
+        if moving.alive:
+            return "motion was followed, without time for a step"
+        return "nothing is left to learn" if self.static.field.finished else "only the static field learns"
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -190,18 +200,21 @@ class LayeredField:
 
     # --- intake -------------------------------------------------------------------------------
 
-    def _stands_still(self, view: View) -> bool:
-        """Whether layers can take the view in: its camera has not moved, and it has no transparency."""
+    def _unfit_for_layers(self, view: View) -> str:
+        """Why layers cannot take the view in; empty if they can."""
         known = self.cameras.get(view.camera)
-        return view.image.shape[2] == 3 and (
-            known is None
-            or (known.view.intrinsics == view.intrinsics
-                and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3))
-        )  # fmt: skip
+        if view.image.shape[2] != 3:
+            return f"images of {view.camera} are transparent"
+        if known is not None and known.view.intrinsics != view.intrinsics:
+            return f"the lens or the image size of {view.camera} has changed"
+        if known is not None and not np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3):
+            return f"{view.camera} has moved"
+        return ""
 
-    def _give_up_layers(self) -> None:
+    def _give_up_layers(self, reason: str) -> None:
         """Go on with the first field, until ``reset``, with what the static field has learned if that is
         shown."""
+        log.info("layers are given up until a reset: %s", reason)
         self.static.stop()
         if self.shown:
             self.first.load_state(self.static.field.state())
@@ -271,6 +284,7 @@ class LayeredField:
     def _begin_again(self) -> None:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
         measured. Plates stay."""
+        log.info("layers begin again: another camera has changed the box of the scene")
         self.static.reset()
         self.tracker = self._published = self._still = None
         self.shown = False
