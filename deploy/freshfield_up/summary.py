@@ -19,6 +19,7 @@ def summarize(out: Path) -> str:
     shown = fidelity.get("shown") or {}
     views = f" on {NOTHING_HELD_OUT}" if "selected" in fidelity.get("scored_on", ()) else ""
     rejected = sum(frames.get("rejected", {}).values())
+    shed = f", {n} of them left out for lack of time" if (n := updates.get("shed")) else ""
     lines = [
         "",
         f"shown      PSNR {fmt(shown.get('psnr_db'), '.2f')} dB over the last fifth of the run "
@@ -33,7 +34,7 @@ def summarize(out: Path) -> str:
         f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}",
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
-        f"{fmt(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
+        f"{fmt(frames.get('delivered'), 'd')} delivered{shed}, {rejected} rejected; "
         f"{_accounted(frames)}",
         *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",

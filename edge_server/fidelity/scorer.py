@@ -175,14 +175,17 @@ class Scorer:
             state.frames.popleft()
         return self._score_ready(camera)
 
-    def newest(self, camera: str, rendering: Callable[[int], NDArray]) -> Score | None:
+    def newest(
+        self, camera: str, rendering: Callable[[int], NDArray], psnr_only: bool = False
+    ) -> Score | None:
         """Score what was shown when the newest held-out frame of ``camera`` was taken; None where nothing is
         known of the camera's period yet, or its frame cannot be decoded. rendering: of its generation time.
         ImageError as ``score``."""
         state, period = self._camera(camera), self.period_ms(camera)
         if not state.frames or period is None:
             return None
-        return self._against_nearest(camera, state, period, state.frames[-1].generated_ns, rendering)
+        taken_ns = state.frames[-1].generated_ns
+        return self._against_nearest(camera, state, period, taken_ns, rendering, psnr_only)
 
     def score(
         self,
@@ -193,16 +196,18 @@ class Scorer:
         generated_ns: int,
         earlier: Sequence[NDArray] = (),
         bound: float = BOUND,
+        psnr_only: bool = False,
     ) -> Score:
         """Score one rendering against one truth; ``earlier`` truths show which pixels move. ImageError for
-        NaN, infinity or a wrong shape in either image."""
+        NaN, infinity or a wrong shape in either image. psnr_only: the other metrics, which cost more, are
+        None."""
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self._background)
         same_size(a, b)
         moving = moving_mask(b, earlier, bound)
         total = psnr(a, b)
         assert total is not None  # no mask was given
-        side = min(a.shape[:2])
+        side = 0 if psnr_only else min(a.shape[:2])
 
         def by(metric: PerceptualMetric | None) -> float | None:
             return metric(a, b) if metric is not None and side >= metric.minimum_side else None
@@ -261,8 +266,9 @@ class Scorer:
         return done
 
     def _against_nearest(
-        self, camera: str, state: _Camera, period_ms: float, published_ns: int, rendering: Render
-    ) -> Score | None:
+        self, camera: str, state: _Camera, period_ms: float, published_ns: int, rendering: Render,
+        psnr_only: bool = False,
+    ) -> Score | None:  # fmt: skip
         frames = list(state.frames)
         times = [f.generated_ns for f in frames]
         nearest = min(range(len(times)), key=lambda i: abs(times[i] - published_ns))
@@ -281,7 +287,7 @@ class Scorer:
         earlier = [image for image in found if image is not None]
         bound = state.noise.bound if self._noisy_truth else BOUND
         image = rendering(times[nearest]) if callable(rendering) else rendering
-        return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound)
+        return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound, psnr_only)
 
 
 def open_listed_perceptual(metrics: Sequence[str]) -> PerceptualMetric | None:

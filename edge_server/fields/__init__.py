@@ -66,7 +66,6 @@ class FitReport:
     dropped: rays and gradients that were not finite and were left out.
     refused: cameras whose view was left out as an outlier (``common.view_outliers``).
     note: why nothing was done, if so.
-    shed: views left out because the budget did not allow for them.
     """
 
     steps: int
@@ -77,7 +76,6 @@ class FitReport:
     dropped: int = 0
     refused: tuple[str, ...] = ()
     note: str = ""
-    shed: int = 0
 
 
 @dataclass(frozen=True)
@@ -114,13 +112,16 @@ class Snapshot(Renderer, Protocol):
 class Field(Renderer, Protocol):
     """A radiance field. Every implementation is deterministic for one seed and one sequence of calls.
 
-    every_frame: ``fit`` wants every frame since the last one, not only the newest of each camera.
+    frame_s: seconds that ``fit`` takes for each new frame, where it now wants every frame since the last one;
+    0.0 if that is not known yet. None: it wants only the newest of each camera.
     most_pixels: of one image of every camera together, where larger images take more time than what moves
     leaves; None: as many as there are.
     """
 
-    every_frame: bool
-    most_pixels: int | None
+    @property
+    def frame_s(self) -> float | None: ...
+    @property
+    def most_pixels(self) -> int | None: ...
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""

@@ -35,7 +35,7 @@ class FrameBuffer:
     Memory is one encoded frame a camera, whatever arrives; two with ``keep_earlier``, MOST_UNSELECTED more
     with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
-    shed: those that made room for newer ones before anything had selected them, with ``keep_every_frame``.
+    shed: those that were left out for lack of time since the first ``take``, with ``keep_every_frame``.
     """
 
     def __init__(self, cameras: Sequence[str]) -> None:
@@ -48,6 +48,8 @@ class FrameBuffer:
         self.stale_on_arrival = 0
         self.shed = 0
         self._unselected: dict[str, deque[BufferedFrame]] | None = None
+        self._takes = 0
+        self._last_take = dict.fromkeys(self.cameras, 0)  # that took a frame of a camera
 
     def put(self, frame: Frame, received_ns: int) -> None:
         """Keep ``frame`` unless a newer one of its camera is here.
@@ -70,7 +72,7 @@ class FrameBuffer:
                     self._put_earlier(item, known)
             if self._unselected is not None:
                 waiting = self._unselected[frame.camera]
-                self.shed += len(waiting) == MOST_UNSELECTED
+                self.shed += len(waiting) == MOST_UNSELECTED and self._takes > 0
                 waiting.append(item)
             self.arrivals += 1
             self._arrived.notify_all()
@@ -90,24 +92,55 @@ class FrameBuffer:
             if not wanted:
                 self._earlier.clear()
 
-    def keep_every_frame(self) -> None:
-        """Keep, from now on, every frame until it is taken by ``take_unselected``."""
+    def keep_every_frame(self, wanted: bool) -> None:
+        """Whether to keep, from now on, every frame until ``take``."""
         with self._arrived:
-            self._unselected = {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras}
+            if wanted != (self._unselected is not None):
+                self._unselected = (
+                    {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras} if wanted else None
+                )
 
-    def take_unselected(self, selected: Sequence[BufferedFrame]) -> list[BufferedFrame]:
-        """Drop what has arrived up to the newest of ``selected``; of that, return the other frames of their
-        cameras, in the order of their arrival. Nothing without ``keep_every_frame``."""
+    def take(
+        self, selected: Sequence[BufferedFrame], most: int | None = None
+    ) -> tuple[tuple[BufferedFrame, ...], tuple[BufferedFrame, ...]]:
+        """Which of the newest frames ``selected`` to use, and which others of their cameras that have arrived
+        up to then, in the order of their arrival. ``selected`` and none without ``keep_every_frame``.
+
+        most: number of frames that have not been taken before. The newest of each camera come first, of these
+        those of the cameras that have waited longest; then the second newest of each, and so on. What exceeds
+        it is dropped and counted in ``shed``, except for a camera's newest frame, which waits on. Frames of
+        other cameras are dropped.
+        """
         until_ns = max((item.received_ns for item in selected), default=0)
-        found: list[BufferedFrame] = []
+        own = {item.frame.camera: item for item in selected}
+        ranked: list[tuple[int, int, int, BufferedFrame]] = []
         with self._arrived:
-            for camera, waiting in (self._unselected or {}).items():
-                cameras_own = next((item for item in selected if item.frame.camera == camera), None)
+            if self._unselected is None:
+                return tuple(selected), ()
+            self._takes += 1
+            for camera, waiting in self._unselected.items():
+                arrived: list[BufferedFrame] = []
                 while waiting and waiting[0].received_ns <= until_ns:
-                    item = waiting.popleft()
-                    if cameras_own is not None and item is not cameras_own:
-                        found.append(item)
-        return sorted(found, key=lambda item: item.received_ns)
+                    arrived.append(waiting.popleft())
+                if camera in own:
+                    arrived.sort(key=lambda item: (-item.generated_ns, item is not own[item.frame.camera]))
+                    last = self._last_take[camera]
+                    ranked += [(k, last, -item.generated_ns, item) for k, item in enumerate(arrived)]
+            ordered = [item for *_, item in sorted(ranked, key=lambda one: one[:3])]
+            taken = ordered if most is None else ordered[:most]
+            for item in taken:
+                self._last_take[item.frame.camera] = self._takes
+            left = ordered[len(taken) :]
+            for item in left:
+                waiting = self._unselected[item.frame.camera]
+                if item is own[item.frame.camera] and len(waiting) < MOST_UNSELECTED:
+                    waiting.appendleft(item)
+                else:
+                    self.shed += 1
+        others = [item for item in taken if item is not own[item.frame.camera]]
+        left_out = {id(item) for item in left}
+        used = tuple(item for item in selected if id(item) not in left_out)
+        return used, tuple(sorted(others, key=lambda item: item.received_ns))
 
     def newest_and_earlier(self) -> tuple[dict[str, BufferedFrame], dict[str, BufferedFrame]]:
         """``newest`` and, at the same instant, the frames before them by camera (see ``keep_earlier``)."""

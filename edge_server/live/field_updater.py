@@ -28,15 +28,19 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
     from edge_server.scheduler.learned.state import State
 
 
+INTAKE_SHARE = 0.4  # of a budget in seconds, for new frames where the field wants every frame
+LEAST_TAKEN = 4  # new frames, however short the budget is
+
+
 @dataclass(frozen=True)
 class Selection:
     """A finished decision.
 
     now_ns: instant of the selection.
-    items: selected frames.
+    items: selected frames, without the new ones that the field has no time for.
     earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
-    others: all other frames that these cameras delivered since the last selection, where the field wants
-    every frame.
+    others: other frames that these cameras delivered since the last selection, where the field wants every
+    frame and has time for them.
     arrivals: number of frames of all cameras since the last selection.
     """
 
@@ -85,10 +89,7 @@ class FieldUpdater:
         self.buffer = buffer
         self.on_arrivals = on_arrivals
         self._selected_of = 0  # arrivals at the last selection
-        if field.every_frame:
-            buffer.keep_every_frame()
-        most = field.most_pixels
-        self.decoder = ViewDecoder(foreground, None if most is None else most // len(buffer.cameras))
+        self.decoder = ViewDecoder(foreground)
         self.embedder = embedder
         self.embeddings: EmbeddingCache | None = None
         if embedder is not None:
@@ -103,6 +104,13 @@ class FieldUpdater:
         self.treatment_cost = TreatmentCost()
         self.start_ns = start_ns
         self.number = 0
+        self._follow_field()
+
+    def _follow_field(self) -> None:
+        """Keep and decode what the field wants now."""
+        self.buffer.keep_every_frame(self.field.frame_s is not None)
+        most = self.field.most_pixels
+        self.decoder.most_pixels = None if most is None else most // len(self.buffer.cameras)
 
     @property
     def policy(self) -> Policy:
@@ -153,20 +161,30 @@ class FieldUpdater:
         """The first half of a decision: how long to wait for frames."""
         return self.policy.plan(self.epoch(now_ns))
 
-    def select(self, plan: SelectionWindow, now_ns: int) -> Selection | None:
-        """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on."""
+    def select(self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None) -> Selection | None:
+        """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on.
+
+        budget: of the fit that follows, which bounds the new frames where it is one of seconds.
+        """
         arrivals = self.buffer.arrivals - self._selected_of
         if now_ns < plan.wait_until_ns or (self.on_arrivals and not arrivals):
             return None
+        self._follow_field()
         newest, earlier = self.buffer.newest_and_earlier()
         cameras = self.policy.select(self._epoch(newest, now_ns), plan)
         if not cameras:
             return None
-        before = tuple(earlier[c] for c in cameras if c in earlier)
         self._selected_of += arrivals
-        items = tuple(newest[c] for c in cameras)
-        others = tuple(self.buffer.take_unselected(items))
+        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget))
+        before = tuple(earlier[c] for i in items if (c := i.frame.camera) in earlier)
         return Selection(plan, now_ns, items, before, others, arrivals)
+
+    def _most_new(self, budget: Budget | None) -> int | None:
+        """Number of new frames that the field has time for; None: all."""
+        frame_s = self.field.frame_s
+        if budget is None or budget.seconds is None or not frame_s:
+            return None
+        return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
 
     def fit(
         self, selection: Selection, budget: Budget, publishes_ns: int | None = None

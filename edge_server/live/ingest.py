@@ -137,7 +137,7 @@ class Ingest:
         max_side_px: int = MAX_IMAGE_SIDE_PX,
     ) -> None:
         self._clock = clock
-        self._buffer = buffer
+        self.buffer = buffer
         self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px)
         self._ledger = ledger
         self._on_held_out = on_held_out
@@ -188,7 +188,7 @@ class Ingest:
             self.newest_held_out[frame.camera] = frame
             self._on_held_out(frame)
         else:
-            self._buffer.put(frame, now_ns)
+            self.buffer.put(frame, now_ns)
         self.delivered[frame.camera] += 1
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
         if self._on_accepted is not None:

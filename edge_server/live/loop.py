@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from queue import Empty, Queue
 
-from edge_server.fields import FitReport, Snapshot, View
+from edge_server.fields import Budget, FitReport, Snapshot, View
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Publication
 from edge_server.live.update_budget import UpdateBudget
@@ -60,7 +60,7 @@ class UpdateLoop:
         self._reset = False
         self._last_update_ms = 0.0
         self._without_steps = 0  # updates in a row
-        self._shed, self._offered, self._shed_since_s = 0, 0, clock.now_ns() / 1e9
+        self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.paused = False
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -123,11 +123,11 @@ class UpdateLoop:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
-        selection = self._select()
+        budget = self._budget.next()
+        selection = self._select(budget)
         if selection is None:
             return
         self._on_status(f"fitting {len(selection.items)} views")
-        budget = self._budget.next()
         # An update takes about as long as the last one: so far ahead lies its present.
         publishes_ns = self._clock.now_ns() + round(self._last_update_ms * 1e6)
         fitted = self._updater.fit(selection, budget, publishes_ns)
@@ -136,7 +136,7 @@ class UpdateLoop:
             return
         views, report = fitted
         self._warn_without_steps(report)
-        self._warn_of_shed(report, len(selection.items) + len(selection.others))
+        self._warn_of_shed()
         renderer = self._updater.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updater.publication(selection, views, report, self._clock.now_ns())
         self._last_update_ms = publication.update_ms
@@ -164,20 +164,19 @@ class UpdateLoop:
                 report.seconds * 1e3,
             )
 
-    def _warn_of_shed(self, report: FitReport, offered: int) -> None:
+    def _warn_of_shed(self) -> None:
         """Log now and then what share of the frames was left out for lack of time."""
-        self._shed += report.shed
-        self._offered += offered
-        now_s = self._clock.now_ns() / 1e9
-        if now_s - self._shed_since_s < _SHED_EVERY_S:
+        buffer, now_s = self._updater.buffer, self._clock.now_ns() / 1e9
+        shed, arrived, since_s = self._warned_of
+        if now_s - since_s < _SHED_EVERY_S:
             return
-        if self._shed:
+        if buffer.shed > shed:
             log.warning(
                 "%d of %d frames were left out, the oldest first: the field has no time for them. Send fewer "
                 "or smaller ones, or give updates more (edge.update_ms)",
-                self._shed, self._offered,
+                buffer.shed - shed, buffer.arrivals - arrived,
             )  # fmt: skip
-        self._shed, self._offered, self._shed_since_s = 0, 0, now_s
+        self._warned_of = (buffer.shed, buffer.arrivals, now_s)
 
     def _write_checkpoints(self) -> None:
         while True:
@@ -191,14 +190,17 @@ class UpdateLoop:
             except OSError as error:  # a full disk must not end the updates; whoever asked gets the error
                 log.error("checkpoint %s not written: %s", path, error)
                 future.set_exception(error)
+            except BaseException as error:  # of the field itself: it ends the loop
+                future.set_exception(error)
+                raise
 
-    def _select(self) -> Selection | None:
+    def _select(self, budget: Budget) -> Selection | None:
         """SelectionWindow, wait as the plan says, and select; None if the controls changed meanwhile."""
         plan = self._updater.plan(self._clock.now_ns())
         arrivals = self._updater.buffer.arrivals
         while not self._stop.is_set():
             now_ns = self._clock.now_ns()
-            selection = self._updater.select(plan, now_ns)
+            selection = self._updater.select(plan, now_ns, budget)
             if selection is not None:
                 return selection
             asked = self._reset or self._next_policy is not None or not self._checkpoints.empty()

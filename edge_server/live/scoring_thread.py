@@ -44,9 +44,11 @@ _BASELINE_EVERY = 5
 _KEPT_RENDERINGS = 32
 # Publications that may be the newest one of a held-out capture that is still on its way.
 _KEPT_PUBLICATIONS = 32
-_SHOWN_EVERY_S = 0.4  # mean time between two scores of what is shown
-# Largest share of the cores' time that this thread takes, after a first allowance of CPU seconds.
-_SHARE, _ALLOWANCE_S = 0.03, 1.0
+_SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
+_FULL_EVERY = 4  # scores of what is shown: one of so many has more than PSNR
+# Largest share of the cores' time that this thread takes, beyond an allowance of CPU seconds. What is shown
+# has its part of the share first: publications are scored while this much of the allowance is left.
+_SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
 
 
 @dataclass
@@ -83,7 +85,8 @@ class ScoringThread:
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
         self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
-        self._started_s = time.monotonic()
+        self._shown_count, self._shown_cost_s = 0, np.inf  # of the last one, CPU seconds
+        self._allowance_s, self._asked_s, self._used_s = _ALLOWANCE_S, time.monotonic(), 0.0
         self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
         self._ending = False
@@ -134,30 +137,41 @@ class ScoringThread:
                     self._score_with(item)
                 elif self._held_out:
                     self._recent.append(item[:2])
-                    if self._affordable():
+                    if self._affordable(_RESERVE_S):
                         self._score_later(*item)
                 else:
                     self._score_selected(*item)
             except Exception:  # one bad image must not end all scoring; it is logged with its traceback
                 log.exception("a publication could not be scored")
 
-    def _affordable(self) -> bool:
-        """Whether this thread has used less than its share of the cores' time."""
-        elapsed_s = time.monotonic() - self._started_s
-        return time.thread_time() < _ALLOWANCE_S + _SHARE * usable_cores() * elapsed_s
+    def _affordable(self, reserve_s: float = 0.0) -> bool:
+        """Whether more than ``reserve_s`` is left of this thread's allowance, which its share of the cores'
+        time fills up."""
+        now_s, used_s = time.monotonic(), time.thread_time()
+        gained_s = _SHARE * usable_cores() * (now_s - self._asked_s) - (used_s - self._used_s)
+        self._allowance_s = min(self._allowance_s + gained_s, _ALLOWANCE_S)
+        self._asked_s, self._used_s = now_s, used_s
+        return self._allowance_s > reserve_s
 
     def _score_shown(self, frame: Frame) -> None:
-        """Score what was shown when a held-out frame was taken, if it is time for that."""
+        """Score what was shown when a held-out frame was taken, if it is time for that: as often as
+        _SHOWN_SHARE allows for."""
         taken_ns = frame.generated_edge_ns
         found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
         if found is None or taken_ns < self._next_shown_ns[frame.camera] or not self._affordable():
             return
-        self._next_shown_ns[frame.camera] = taken_ns + round(self._rng.exponential(_SHOWN_EVERY_S) * 1e9)
+        every_s = self._shown_cost_s * len(self._held_out) / (_SHOWN_SHARE * usable_cores())
+        gap_s = self._rng.exponential(min(every_s, _SHOWN_EVERY_S))
+        self._next_shown_ns[frame.camera] = taken_ns + round(gap_s * 1e9)
         publication, snapshot = found
+        begun_s, full = time.thread_time(), self._shown_count % _FULL_EVERY == 0
         score = self._scorer.newest(
             frame.camera,
             lambda at_ns: snapshot.at(at_ns).render(frame.pose.matrix(), frame.intrinsics).color,
+            psnr_only=not full,
         )
+        self._shown_cost_s = time.thread_time() - begun_s
+        self._shown_count += 1
         if score is not None:
             self._on_shown(score, publication)
 

@@ -329,6 +329,7 @@ class EdgeServer:
                 "first_ms": self._first_ms,
                 "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
+                "shed": self.buffer.shed,
             },
             "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
@@ -352,13 +353,13 @@ class EdgeServer:
             if (comparison := self.state.comparison) is not None:
                 for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+            if self.trainer is not None:
+                self.trainer.close()
             path = self.options.out / "field.npz"
             if self.loop.alive:
                 log.error("%s: not written: the last update did not end within %g s", path, STOP_S)
             elif self.state.started:
                 self._write_checkpoint(path)
-            if self.trainer is not None:
-                self.trainer.close()
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:

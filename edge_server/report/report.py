@@ -98,9 +98,10 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     """Number and duration of updates, from the rows of ``series``.
 
     edge: the same as counted by the edge, for rows that were not written any more. Returns {count, ms_p50,
-    ms_p95, first_ms: from the start of the edge to the first publication, undecodable, without_step: updates
-    without time for an optimizer step, refused: {camera: how often the field left its image out}}. Where the
-    scenario sets a deadline, also deadline_ms and met_share: the share of updates within it.
+    ms_p95, first_ms: from the start of the edge to the first publication, undecodable, shed: frames left out
+    for lack of time, without_step: updates without time for an optimizer step, refused: {camera: how often
+    the field left its image out}}. Where the scenario sets a deadline, also deadline_ms and met_share: the
+    share of updates within it.
     """
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
@@ -111,6 +112,7 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
         "first_ms": edge.get("first_ms", first),
         "undecodable": edge.get("undecodable"),
+        "shed": edge.get("shed"),
         "without_step": sum(row.get("steps") == 0 for row in series),
         "refused": dict(sorted(Counter(c for row in series for c in row.get("refused") or ()).items())),
     }

@@ -70,8 +70,8 @@ class TrainedField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
-    every_frame = False
-    most_pixels: int | None = None
+    frame_s = None
+    most_pixels = None
 
     name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]

@@ -184,8 +184,8 @@ class TorchSnapshot:
 class NgpTorchField:
     """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
-    every_frame = False
-    most_pixels: int | None = None
+    frame_s = None
+    most_pixels = None
 
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
         self.settings = settings or NgpSettings()

@@ -64,8 +64,8 @@ class SplatField:
     meanwhile: these wait for the end of the current step, a few milliseconds.
     """
 
-    every_frame = False
-    most_pixels: int | None = None
+    frame_s = None
+    most_pixels = None
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()

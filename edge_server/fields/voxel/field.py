@@ -61,8 +61,8 @@ class VoxelField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
-    every_frame = False
-    most_pixels: int | None = None
+    frame_s = None
+    most_pixels = None
 
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or VoxelSettings()

@@ -38,7 +38,9 @@ class EdgeCollector:
         rejected = CounterMetricFamily("freshfield_frames_rejected", "frames refused", labels=["reason"])
         for reason, count in self._ingest.rejected.items():
             rejected.add_metric([reason], count)
+        shed = self._ingest.buffer.shed
         yield from (age, delivered, rejected)
+        yield CounterMetricFamily("freshfield_frames_shed", "frames left out for lack of time", value=shed)
         check = GaugeMetricFamily(
             "freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"]
         )

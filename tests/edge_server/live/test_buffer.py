@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
 from edge_server.live.buffer import MOST_UNSELECTED, BufferedFrame, FrameBuffer
 from tests.edge_server.frames import frame
@@ -95,7 +96,7 @@ def test_wait_returns_on_arrival_and_on_timeout():
     assert buffer.wait(0, 5.0) == 1
 
 
-def _sequences(items: list[BufferedFrame]) -> list[tuple[str, int]]:
+def _sequences(items: Sequence[BufferedFrame]) -> list[tuple[str, int]]:
     return [(item.frame.camera, item.frame.sequence) for item in items]
 
 
@@ -103,23 +104,75 @@ def test_every_frame_is_taken_once_and_the_oldest_make_room():
     buffer = FrameBuffer(["cam01", "cam02"])
     for sequence in range(2):  # nobody has asked for every frame yet
         buffer.put(frame("cam01", sequence=sequence, generated_ns=sequence * MS), sequence * MS)
-    assert buffer.take_unselected(list(buffer.newest().values())) == []
-    buffer.keep_every_frame()
+    assert buffer.take(list(buffer.newest().values())) == (tuple(buffer.newest().values()), ())
+    buffer.keep_every_frame(True)
     for sequence in range(2, 5):
         for k, camera in enumerate(("cam02", "cam01")):
             at = sequence * MS + k
             buffer.put(frame(camera, sequence=sequence, generated_ns=at), at)
     selected = [buffer.newest()["cam01"]]
     buffer.put(frame("cam01", sequence=5, generated_ns=9 * MS), 9 * MS)  # after the selection
-    assert _sequences(buffer.take_unselected(selected)) == [("cam01", 2), ("cam01", 3)]
-    assert buffer.take_unselected(selected) == []
+    assert _sequences(buffer.take(selected)[1]) == [("cam01", 2), ("cam01", 3)]
+    assert buffer.take(selected) == (tuple(selected), ())
     late = frame("cam01", sequence=1, generated_ns=MS)
     buffer.put(late, 10 * MS)  # overtaken on its way: it is evidence all the same
     buffer.put(frame("cam02", sequence=6, generated_ns=11 * MS), 11 * MS)
     both = list(buffer.newest().values())
-    assert _sequences(buffer.take_unselected(both)) == [("cam01", 1)]
+    assert _sequences(buffer.take(both)[1]) == [("cam01", 1)]
     for sequence in range(20, 20 + MOST_UNSELECTED + 3):
         buffer.put(frame("cam01", sequence=sequence, generated_ns=sequence * MS), sequence * MS)
     assert buffer.shed == 3
-    taken = _sequences(buffer.take_unselected([buffer.newest()["cam01"]]))
+    taken = _sequences(buffer.take([buffer.newest()["cam01"]])[1])
     assert taken == [("cam01", k) for k in range(23, 20 + MOST_UNSELECTED + 2)]
+    buffer.keep_every_frame(True)  # as before
+    for sequence in range(40, 42):
+        buffer.put(frame("cam01", sequence=sequence, generated_ns=sequence * MS), sequence * MS)
+    buffer.keep_every_frame(False)
+    newest = tuple(buffer.newest().values())
+    assert buffer.take(newest) == (newest, ()) and buffer.shed == 3
+
+
+def test_frames_that_wait_for_the_first_take_are_not_shed():
+    buffer = FrameBuffer(["cam01"])
+    buffer.keep_every_frame(True)
+    for sequence in range(MOST_UNSELECTED + 5):
+        buffer.put(frame(sequence=sequence, generated_ns=sequence * MS), sequence * MS)
+    assert buffer.shed == 0
+
+
+def test_where_there_is_no_time_for_all_the_oldest_are_left_out_and_counted_once():
+    buffer = FrameBuffer([f"cam{k:02d}" for k in range(4)])
+    buffer.keep_every_frame(True)
+    for sequence in range(3):
+        for k, camera in enumerate(buffer.cameras):
+            at = (10 * sequence + k) * MS
+            buffer.put(frame(camera, sequence=sequence, generated_ns=at), at)
+    used, others = buffer.take(list(buffer.newest().values()), most=6)
+    assert _sequences(used) == [(camera, 2) for camera in buffer.cameras]
+    assert _sequences(others) == [("cam02", 1), ("cam03", 1)]
+    assert (buffer.shed, buffer.arrivals) == (6, 12)
+    buffer.put(frame("cam00", sequence=3, generated_ns=30 * MS), 30 * MS)
+    buffer.put(frame("cam01", sequence=3, generated_ns=31 * MS), 31 * MS)
+    used, others = buffer.take(list(buffer.newest().values()), most=1)
+    # What was taken before costs nothing; a camera's newest frame waits on.
+    assert _sequences(used) == [("cam01", 3), ("cam02", 2), ("cam03", 2)] and others == ()
+    assert buffer.shed == 6
+    used, _ = buffer.take(list(buffer.newest().values()), most=1)
+    assert len(used) == 4 and buffer.shed == 6
+
+
+def test_a_camera_whose_frames_are_always_older_than_others_has_its_turn():
+    buffer = FrameBuffer([f"cam{k:02d}" for k in range(6)])
+    buffer.keep_every_frame(True)
+    seen = {camera: 0 for camera in buffer.cameras}
+    for sequence in range(12):
+        for camera in buffer.cameras:
+            arrived = 100 * sequence * MS + 500 * MS
+            lag = 300 * MS if camera == "cam05" else 0
+            buffer.put(frame(camera, sequence=sequence, generated_ns=arrived - lag), arrived)
+        used, others = buffer.take(list(buffer.newest().values()), most=2)
+        assert len(used) == 2 and others == ()
+        for item in used:
+            seen[item.frame.camera] += 1
+    assert seen == {camera: 4 for camera in buffer.cameras}
+    assert buffer.shed == buffer.arrivals - 24 - 4  # four newest ones wait on

@@ -85,7 +85,7 @@ def test_an_empty_buffer_selects_nothing():
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
     made = make_policy("all", None, np.random.default_rng(0))
     field = tiny_field()
-    field.every_frame = True
+    field.frame_s = 0.0
     u = FieldUpdater(FrameBuffer(("cam01", "cam02")), made, field, start_ns=0, on_arrivals=True)
     fed = []
     field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
@@ -101,6 +101,34 @@ def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_ev
     u.buffer.put(frame("cam02", sequence=1, generated_ns=45 * MS), 60 * MS)
     again = u.select(u.plan(60 * MS), 60 * MS)
     assert again.arrivals == 1 and again.others == () and len(again.items) == 2
+
+
+def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
+    cameras = tuple(f"cam{k:02d}" for k in range(8))
+    u = updates(cameras=cameras)
+    u.field.frame_s = 0.01
+    u.buffer.keep_every_frame(True)
+    fed = []
+    u.field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
+    for at in (10, 20):
+        for camera in cameras:
+            u.buffer.put(frame(camera, sequence=at, generated_ns=at * MS), at * MS)
+    decode, decoded = u.decoder._decode, []
+    u.decoder._decode = lambda item: decoded.append(item) or decode(item)
+    budget = Budget(seconds=0.25)
+    selection = u.select(u.plan(40 * MS), 40 * MS, budget)
+    views, _ = u.fit(selection, budget)
+    assert len(fed[0]) == len(decoded) == 10  # .4 of the budget: the newest of all, and two others
+    assert [v.camera for v in views] == list(cameras)
+    assert (u.buffer.shed, u.buffer.arrivals) == (6, 16)
+    for camera in cameras:
+        u.buffer.put(frame(camera, sequence=50, generated_ns=50 * MS), 50 * MS)
+    views, _ = u.fit(u.select(u.plan(60 * MS), 60 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
+    assert len(views) == 4 and len(decoded) == 14 and u.buffer.shed == 6  # four newest ones wait
+    u.field.frame_s = None  # it wants the newest only, from now on
+    views, _ = u.fit(u.select(u.plan(70 * MS), 70 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
+    assert len(views) == 8
+    assert u.buffer._unselected is None
 
 
 class Running:
@@ -196,6 +224,24 @@ def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
     run.until(lambda: run.published)
     assert run.published[0][0].selected == ("cam02",)
     assert any("1 of 2" in line for line in run.lines)
+
+
+def test_a_field_that_fails_at_a_checkpoint_ends_the_loop_and_tells_who_asked(tmp_path):
+    u = updates(cameras=("cam01",))
+    run = Running(u)
+
+    def broken(path):
+        raise RuntimeError("its thread has failed")
+
+    run.loop._on_checkpoint = broken
+    now = run.clock.now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    future = run.loop.request_checkpoint(tmp_path / "field.npz")
+    run.loop.start()
+    with pytest.raises(RuntimeError, match="thread has failed"):
+        future.result(30)
+    run.loop._thread.join(30)
+    assert isinstance(run.loop.failure, RuntimeError)
 
 
 def test_a_failing_field_ends_the_loop_and_is_not_hidden():

@@ -48,10 +48,14 @@ def _publication(number: int, at_ns: int) -> Publication:
     return Publication(number, at_ns / 1e9, at_ns, None, ("cam01",), (1.0,), 1.0, 1.0)
 
 
-def _run(publications: list[int], frames: list[int]) -> list[tuple[Score, Publication]]:
-    """Scores of what was shown, of publications and held-out frames at given instants in ns."""
+def _run(
+    publications: list[int], frames: list[int], scored: list[Publication] | None = None
+) -> list[tuple[Score, Publication]]:
+    """Scores of what was shown, of publications and held-out frames at given instants in ns. scored: takes
+    publications with their scores."""
     shown: list[tuple[Score, Publication]] = []
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))
+    taken = [] if scored is None else scored
+    thread = ScoringThread(["cam00"], Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of))
     events = [(at, 0, n) for n, at in enumerate(publications)] + [(at, 1, n) for n, at in enumerate(frames)]
     thread.start()
     for at_ns, kind, number in sorted(events):
@@ -64,7 +68,8 @@ def _run(publications: list[int], frames: list[int]) -> list[tuple[Score, Public
     return shown
 
 
-def test_the_newest_publication_is_shown_carried_on_to_the_capture() -> None:
+def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: Any) -> None:
+    monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 1e-9)
     shown = _run([100 * MS, 350 * MS, 600 * MS], [k * 10 * MS for k in range(90)])
     assert len(shown) > 1
     for score, publication in shown:
@@ -78,6 +83,33 @@ def test_the_newest_publication_is_shown_carried_on_to_the_capture() -> None:
 
 def test_nothing_was_shown_before_the_first_publication() -> None:
     assert _run([500 * MS], [k * 10 * MS for k in range(50)]) == []
+
+
+def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(
+    monkeypatch: Any,
+) -> None:
+    monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 0.5)
+    scored: list[Publication] = []
+    frames = [k * 10 * MS for k in range(90)]
+    shown = _run([100 * MS, 350 * MS], frames, scored)
+    assert len(shown) > 10 and len(scored) == 2
+    assert all((score.ssim is not None) == (k % 4 == 0) for k, (score, _) in enumerate(shown))
+    monkeypatch.setattr(scoring_thread, "_RESERVE_S", scoring_thread._ALLOWANCE_S)
+    scored.clear()
+    assert len(_run([100 * MS, 350 * MS], frames, scored)) > 10 and not scored
+
+
+def test_time_that_was_not_used_is_no_credit_beyond_the_allowance(monkeypatch: Any) -> None:
+    now_s, used_s = [0.0], [0.0]
+    monkeypatch.setattr(scoring_thread.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(scoring_thread.time, "thread_time", lambda: used_s[0])
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    now_s[0] = 1000.0
+    assert thread._affordable()
+    used_s[0] = 1.1
+    assert not thread._affordable()
+    now_s[0] += 0.1 / (0.03 * scoring_thread.usable_cores()) + 1.0
+    assert thread._affordable() and not thread._affordable(0.1)
 
 
 def test_scoring_stays_within_its_share_of_the_machine(monkeypatch: Any) -> None:

@@ -188,12 +188,15 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
 def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
     server, _, _ = serve(metrics_port=(metrics := free_port()))
     until(lambda: server.loop.alive)
+    server.buffer.shed = 3
     half = []
     for _ in range(100):
         half.append(socket.create_connection(("127.0.0.1", metrics)))
         half[-1].sendall(b"GET /metrics HTTP/1.1\r\n")
     with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=10) as page:
-        assert b"freshfield_frames_rejected" in page.read()
+        text = page.read()
+    assert b"freshfield_frames_rejected" in text and b"freshfield_frames_shed_total 3.0" in text
+    assert server.status()["updates"]["shed"] == 3
     # At once, and not only when the silent ones time out.
     until(lambda: sum("process_request" in t.name for t in threading.enumerate()) <= MAX_SCRAPES, 2.0)
     for connection in half:

@@ -31,7 +31,8 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     }  # fmt: skip
     assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
     assert set(report["updates"]) == {
-        "count", "ms_p50", "ms_p95", "first_ms", "undecodable", "without_step", "refused",
+        "count", "ms_p50", "ms_p95", "first_ms", "undecodable", "shed", "without_step",
+        "refused",
     }  # fmt: skip
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
     assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
@@ -95,6 +96,15 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
 def test_updates_that_had_no_time_to_learn_are_counted():
     rows = [{"t_s": 0.1 * k, "update_ms": 60.0, "steps": steps} for k, steps in enumerate((0, 3, 0))]
     assert updates(rows, {})["without_step"] == 2
+
+
+def test_the_report_shows_frames_that_were_left_out(tmp_path):
+    write_run(tmp_path)
+    file = tmp_path / "edge.json"
+    edge = json.loads(file.read_text())
+    file.write_text(json.dumps(edge | {"updates": edge["updates"] | {"shed": 17}}))
+    assert build_report(tmp_path)["updates"]["shed"] == 17
+    assert "left out for lack of time: 17" in (tmp_path / "report.html").read_text()
 
 
 def test_the_report_shows_updates_that_made_no_step(tmp_path):

@@ -11,6 +11,7 @@ can be repeated bit for bit.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,6 +40,8 @@ from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole
 
+log = logging.getLogger(__name__)
+
 Arrays = dict[str, NDArray]
 
 PLATE_FRAMES, PLATE_S = 8, 3.2  # of each camera, and since the first frame, before plates are learned
@@ -48,9 +51,7 @@ PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
 FINE_FRAMES = 6  # of each camera, before the static field learns from fine plates
-INTAKE_SHARE = 0.4  # of a budget in seconds: older frames are left out
 MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each taken in 15 times a second
-LEAST_TAKEN = 4  # frames, however short the budget is
 
 
 class LayeredField:
@@ -62,9 +63,6 @@ class LayeredField:
     part_s: seconds spent by part, in all fits.
     """
 
-    every_frame = True
-    most_pixels = MOST_PIXELS
-
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
@@ -73,7 +71,7 @@ class LayeredField:
         self.first = SplatField(self.settings, self.pool)
         self.static = StaticLayer(self.settings, self.pool)
         self.part_s = PartTimes(self.now)
-        self._take_time = StepTimer()  # of taking in a frame
+        self._frame_time = StepTimer()
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -96,6 +94,16 @@ class LayeredField:
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
     @property
+    def frame_s(self) -> float | None:
+        """Seconds to take in a frame; None where layers were given up."""
+        return self._frame_time.seconds if self.layered else None
+
+    @property
+    def most_pixels(self) -> int | None:
+        """Of one image of every camera; None where layers were given up."""
+        return MOST_PIXELS if self.layered else None
+
+    @property
     def moving(self) -> MovingSet | None:
         """The moving set; None before plates are known."""
         return None if self.tracker is None else self.tracker.moving
@@ -111,16 +119,17 @@ class LayeredField:
         pace = StepBudget(budget, self.now)
         for view in views:
             check_view(view)
-        if self.layered and not all(self._stands_still(view) for view in views):
-            self._give_up_layers()
+        if self.layered and (reasons := [why for view in views if (why := self._unfit_for_layers(view))]):
+            self._give_up_layers(reasons[0])
         if not self.layered:
             return self.first.fit(_newest_of_each(views), budget)
         if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
             self._begin_again()
-        taken, shed = self._take_in(views, budget)
-        if self.tracker is None and not self._plates_are_known():
-            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
-            return replace(report, shed=shed)
+        taken = self._take_in(views)
+        if self.tracker is None:
+            if not self._plates_are_known():
+                return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
         self._compare_plates(beside)
@@ -136,15 +145,19 @@ class LayeredField:
             self.part_s.add("static field", begun)
         self._publish()
         if beside and not self.shown:
-            report = self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
-            return replace(report, shed=shed)
+            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
         self._take_renderings(beside)
         self._take_whole(taken)
-        note = "" if steps or pace.steps else "nothing is left to learn" if taken else "no new views"
+        note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
         return FitReport(
-            steps, pace.elapsed_s(), loss, rays, samples, shed=shed, note=note,
+            steps, pace.elapsed_s(), loss, rays, samples, note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
         )  # fmt: skip
+
+    def _why_no_step(self, moving: MovingSet) -> str:
+        if moving.alive:
+            return "motion was followed, without time for a step"
+        return "nothing is left to learn" if self.static.field.finished else "only the static field learns"
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -170,7 +183,7 @@ class LayeredField:
         pose[2, 3] = -3.0
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
-        field._take_in(views, Budget(steps=1))
+        field._take_in(views)
         moving = field._begin_layers().moving
         field._find_rows()
         moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
@@ -199,18 +212,21 @@ class LayeredField:
 
     # --- intake -------------------------------------------------------------------------------
 
-    def _stands_still(self, view: View) -> bool:
-        """Whether layers can take the view in: its camera has not moved, and it has no transparency."""
+    def _unfit_for_layers(self, view: View) -> str:
+        """Why layers cannot take the view in; empty if they can."""
         known = self.cameras.get(view.camera)
-        return view.image.shape[2] == 3 and (
-            known is None
-            or (known.view.intrinsics == view.intrinsics
-                and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3))
-        )  # fmt: skip
+        if view.image.shape[2] != 3:
+            return f"images of {view.camera} are transparent"
+        if known is not None and known.view.intrinsics != view.intrinsics:
+            return f"the lens or the image size of {view.camera} has changed"
+        if known is not None and not np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3):
+            return f"{view.camera} has moved"
+        return ""
 
-    def _give_up_layers(self) -> None:
+    def _give_up_layers(self, reason: str) -> None:
         """Go on with the first field, until ``reset``, with what the static field has learned if that is
         shown."""
+        log.info("layers are given up until a reset: %s", reason)
         self.static.stop()
         if self.shown:
             self.first.load_state(self.static.field.state())
@@ -219,25 +235,20 @@ class LayeredField:
         self.cameras = {}
         self.static.reset()
 
-    def _take_in(self, views: Sequence[View], budget: Budget) -> tuple[list[View], int]:
-        """Plates and foregrounds of the views not seen before. Returns those that were taken in, and how many
-        were left out because they would take too much of the budget: the newest of each camera come first."""
+    def _take_in(self, views: Sequence[View]) -> list[View]:
+        """Plates and foregrounds of the views not seen before. Returns these views."""
         begun = self.now()
         if self.origin_ns is None:
             self.origin_ns = min(view.shows_ns for view in views)
         news = {(v.generated_ns, v.camera): v for v in views if not self._has_seen(v)}
-        chosen = _newest_first(list(news.values()))
-        if budget.seconds is not None and self._take_time.seconds:
-            room = int(INTAKE_SHARE * budget.seconds / self._take_time.seconds)
-            chosen = chosen[: max(room, LEAST_TAKEN)]
-        for view in sorted(chosen, key=lambda v: (v.generated_ns, v.camera)):
+        for _, view in sorted(news.items()):
             self._take(view)
-        if chosen:
-            self._take_time.add((self.now() - begun) / len(chosen))
+        if news:
+            self._frame_time.add((self.now() - begun) / len(news))
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
         self.part_s.add("plates", begun)
-        return chosen, len(news) - len(chosen)
+        return list(news.values())
 
     def _has_seen(self, view: View) -> bool:
         return view.camera in self.cameras and view.generated_ns in self.cameras[view.camera].taken
@@ -305,6 +316,7 @@ class LayeredField:
     def _begin_again(self) -> None:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
         measured. Plates stay."""
+        log.info("layers begin again: another camera has changed the box of the scene")
         self.static.reset()
         self.tracker = self._published = self._still = None
         self.shown = False
@@ -425,16 +437,6 @@ def _newest_of_each(views: Sequence[View]) -> list[View]:
         if view.camera not in newest or view.shows_ns > newest[view.camera].shows_ns:
             newest[view.camera] = view
     return list(newest.values())
-
-
-def _newest_first(views: Sequence[View]) -> list[View]:
-    """The newest of each camera, newest first; then the second newest of each, and so on."""
-    older = dict[str, int]()
-    ranked = []
-    for view in sorted(views, key=lambda v: (-v.generated_ns, v.camera)):
-        ranked.append((older.get(view.camera, 0), view))
-        older[view.camera] = older.get(view.camera, 0) + 1
-    return [view for _, view in sorted(ranked, key=lambda one: one[0])]
 
 
 def _remaining(budget: Budget, spent_s: float) -> Budget:

@@ -44,9 +44,7 @@ class StaticLayer:
     @property
     def training(self) -> bool:
         """Whether the thread is at work. Raises what ended it early."""
-        if self._failure is not None:
-            failure, self._failure = self._failure, None
-            raise failure
+        self._raise_failure()
         return self._thread is not None and self._thread.is_alive()
 
     def train_beside(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
@@ -59,17 +57,24 @@ class StaticLayer:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread after a few steps, and wait for it."""
+        """End the thread after a few steps, and wait for it. Raises what ended it early."""
         self._stopping = True
         if self._thread is not None:
             self._thread.join()
         self._thread = None
+        self._raise_failure()
+
+    def _raise_failure(self) -> None:
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            failure.add_note("The static field was being trained beside the updates.")
+            raise failure
 
     def reset(self) -> None:
         """Forget the scene."""
         self.stop()
         self.field.reset()
-        self.shown, self._failure = None, None
+        self.shown = None
         self.rendered = {}
 
     def publish(self) -> None:

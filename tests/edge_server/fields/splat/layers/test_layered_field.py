@@ -264,19 +264,17 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     assert field.moving is not None
 
 
-def test_what_there_is_no_time_for_is_left_out_the_oldest_first() -> None:
+def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
     field, ticks = LayeredField(SMALL), itertools.count()
-    views = [_frame(k, frame, True) for frame in range(3) for k in range(len(CAMERAS))]
-    assert field.fit(views[: len(CAMERAS)], Budget(seconds=0.05)).shed == 0  # not known yet how long it takes
-    field.now = lambda: float(next(ticks))  # now it takes a second
-    field.fit(views[:1], Budget(seconds=0.05))
-    for _ in range(3):
-        field._take_time.add(1.0)
-    report = field.fit(views[::-1], Budget(seconds=17.5))
-    assert report.shed == 2 * len(CAMERAS) - 7
-    taken = {(o.camera, o.view.generated_ns) for o in field.observations}
-    newest = {(v.camera, v.generated_ns) for v in views[-7:]}
-    assert taken == newest | {(v.camera, v.generated_ns) for v in views[: len(CAMERAS)]}
+    views = [_frame(k, frame, True) for frame in range(2) for k in range(len(CAMERAS))]
+    assert field.frame_s == 0.0  # not known yet
+    field.now = lambda: float(next(ticks))
+    field.fit(views, Budget(seconds=0.05))
+    assert field.frame_s == 1.0 / len(views)
+    field.fit([replace(views[0], camera_to_world=HELD.camera_to_world)], Budget(steps=1))
+    assert field.frame_s is None
+    field.reset()
+    assert field.frame_s is not None
 
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(
@@ -302,6 +300,40 @@ def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(
         for frame in range(19, 40):
             field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
             time.sleep(0.01)
+    field.load_state(state)
+    monkeypatch.setattr(field.static.field, "train", fail)
+    field.fit([_frame(k, 19, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
+    with pytest.raises(FloatingPointError, match="of a test") as raised:
+        field.state()
+    assert "trained beside" in raised.value.__notes__[0]
+    assert not field.static.training  # it is told once
+
+
+def test_each_turn_of_the_layers_is_one_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", layered_field.__name__)
+    field = LayeredField(SMALL)
+    _run(field, range(18), moves=False, steps=1)
+    store = field.static.field.view_store
+    store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)
+    _run(field, range(18, 20), moves=False, steps=1)
+    lens = replace(CAMERAS[1].intrinsics, fx=CAMERAS[1].intrinsics.fx + 1.0)
+    field.fit([replace(_frame(1, 21, False), intrinsics=lens)], Budget(steps=1))
+    _run(field, range(22, 24), moves=False, steps=1)
+    assert [record.message.split(":")[0] for record in caplog.records] == [
+        "layers begin", "layers begin again", "layers begin", "layers are given up until a reset",
+    ]  # fmt: skip
+    assert f"lens or the image size of {CAMERAS[1].camera}" in caplog.records[-1].message
+
+
+def test_a_fit_without_a_step_says_why() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    views = [_frame(k, 42, True) for k in range(len(CAMERAS))]
+    assert field.fit(views, Budget(seconds=1e-6)).note == "motion was followed, without time for a step"
+    assert field.fit(views, Budget(seconds=1e-6)).note == "no new views"
+    still = LayeredField(SMALL)
+    _run(still, range(36), moves=False)
+    assert still.fit([_frame(0, 40, False)], Budget(seconds=1e-6)).note == "nothing is left to learn"
 
 
 def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
