@@ -7,27 +7,28 @@ options in ``KERNEL_OPTIONS`` are refused; ``smooth`` and an automatic depth gui
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.fields import Budget, FitReport, Rendering, View
-from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
+from edge_server.fields import Budget, View
+from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.rays import HORIZON, Views
 from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.occupancy_grid import EVERY, FADE, OccupancyGrid
-from edge_server.fields.common.ray_snapshot import surface_points
+from edge_server.fields.common.ray_snapshot import Pixels, PixelSnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
-from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.common.stepped_field import Step, SteppedField
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
     BETA2,
@@ -38,7 +39,7 @@ from edge_server.fields.common.training_schedule import (
     step_key,
     step_length,
 )
-from edge_server.fields.common.view_store import Arrays, ViewStore
+from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 from edge_server.fields.ngp.torch_model import (
     TorchGrid,
@@ -134,7 +135,7 @@ class TorchModel:
     @torch.no_grad()
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    ) -> Pixels:
         """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
         device, pose = self.net.device, np.asarray(camera_to_world, dtype=np.float64)
         rays = (intrinsics.rays(pixels) @ pose[:3, :3].T).astype(np.float32)
@@ -156,57 +157,44 @@ class TorchModel:
 
 
 @dataclass(frozen=True)
-class TorchSnapshot:
+class TorchSnapshot(PixelSnapshot):
     """``RaySnapshot`` of a torch field."""
 
     model: TorchModel
     cameras: tuple[View, ...]
+    step: int
 
-    def at(self, present_ns: int) -> TorchSnapshot:
-        """Itself: nothing in it is known to move."""
-        return self
+    def copied(self) -> TorchSnapshot:
+        """See ``stepped_field.StepSnapshot``."""
+        grid = replace(self.model.grid, table=self.model.grid.table.detach().clone())
+        return replace(self, model=replace(self.model, grid=grid, net=self.model.net.detach().clone()))
 
-    def render(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, max_samples: int | None = None
-    ) -> Rendering:
-        """Render a camera; max_samples is ignored."""
-        w, h = intrinsics.width, intrinsics.height
-        v, u = np.mgrid[0:h, 0:w]
-        pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
-        color, depth, opacity = self.model.render_pixels(camera_to_world, intrinsics, pixels)
-        return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """As ``RaySnapshot.points``."""
-        return surface_points(self.model, self.cameras, count)
+    def render_pixels(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> Pixels:
+        """See ``PixelSnapshot``."""
+        return self.model.render_pixels(camera_to_world, intrinsics, pixels)
 
 
-class NgpTorchField:
+class NgpTorchField(SteppedField[TorchSnapshot]):
     """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
-    every_frame = False
+    name = NgpSettings.name
+    shape = STATE_SHAPE
+    settings: NgpSettings
 
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
-        self.settings = settings or NgpSettings()
-        if missing := unsupported_options(self.settings):
+        settings = settings or NgpSettings()
+        if missing := unsupported_options(settings):
             raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
         self.device = device
         if self.device.startswith("cuda") and not cuda_present():
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use device cpu")
-        self.pool = shared_pool(self.settings.threads, self.settings.nice)
-        self._lock = threading.RLock()
-        self.now = time.perf_counter  # the clock of budgets in seconds
-        self.reset()
+        super().__init__(settings)
 
-    def reset(self) -> None:
-        with self._lock:
-            self.view_store, self.dropped = ViewStore(self.settings), 0
-            self._forget_parameters()
-
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        step_budget, losses, samples, dropped = StepBudget(budget, self.now), [0.0], 0, 0
+    def _begin_fit(
+        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
+    ) -> tuple[Step, int, int]:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
@@ -214,62 +202,27 @@ class NgpTorchField:
             if update.visibility_changed:
                 self._occupancy.recount_views(self.pool, self.view_store)
             data = self.view_store.without_outliers(views, update, self.step, self._model())
-        while (progress := step_budget.begin_step(self._step_timer)) is not None:
-            with self._lock:
-                loss, used, bad = self._one_step(data, progress)
-            losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
-            step_budget.end_step()
-        self.dropped += dropped
-        rays = step_budget.steps * self.settings.rays
-        refused = self.view_store.refused_among(views)
-        return FitReport(
-            step_budget.steps,
-            step_budget.elapsed_s(),
-            float(np.mean(losses)),
-            rays,
-            samples,
-            dropped,
-            refused,
-        )
+        return partial(self._one_step, data), 0, 0
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        return self.snapshot().render(camera_to_world, intrinsics)
+    def _live(self) -> TorchSnapshot:
+        return TorchSnapshot(self._model(), self.view_store.views, self.step)
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return self.snapshot().points(count)
+    def _run_kernels(self, pool: Pool) -> None:
+        """Nothing to compile."""
 
-    def snapshot(self, present_ns: int | None = None) -> TorchSnapshot:
-        with self._lock:
-            model = self._model()
-            grid = replace(model.grid, table=model.grid.table.detach().clone())
-            model = replace(model, grid=grid, net=model.net.detach().clone())
-            return TorchSnapshot(model, self.view_store.views)
+    def _counters(self) -> dict[str, Any]:
+        counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
+        return {**counters, "needed": self._occupancy.needed}
 
-    def warm_up(self) -> float:
-        """Nothing to compile: 0 seconds."""
-        return 0.0
-
-    def state(self) -> Arrays:
-        with self._lock:
-            counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
-            counters["needed"] = self._occupancy.needed
-            return pack_state(NgpSettings.name, self.settings, self.view_store, counters, self._arrays())
-
-    def load_state(self, state: Arrays) -> None:
-        with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, NgpSettings.name, STATE_SHAPE)
-            self.view_store = ViewStore(self.settings)
-            self.view_store.load(meta, state)
-            self._forget_parameters()
-            arrays = {name: array.copy() for name, array in self._arrays().items()}
-            load_arrays(arrays, state)
-            for name, tensor in self._tensors().items():
-                tensor.copy_(torch.as_tensor(arrays[name]))
-            for name in ("density", "seen", "occupied"):
-                getattr(self._occupancy, name)[...] = arrays[name]
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.update_occupied()
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        arrays = {name: array.copy() for name, array in self._arrays().items()}
+        load_arrays(arrays, state)
+        for name, tensor in self._tensors().items():
+            tensor.copy_(torch.as_tensor(arrays[name]))
+        for name in ("density", "seen", "occupied"):
+            getattr(self._occupancy, name)[...] = arrays[name]
+        self._updates, self._occupancy.needed = int(meta["updates"]), int(meta["needed"])
+        self._occupancy.update_occupied()
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -285,7 +238,8 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
-        self._step_timer = StepTimer()
+        self._snapshot = None
+        self._step_time = StepTimer()
         self._grid = to_torch(make_grid(self.settings, self.view_store.box, rng), self.device)
         net = init_net(FEATURES * self.settings.levels, self.settings, rng)
         self._widths = net.widths.tolist()
@@ -308,7 +262,7 @@ class NgpTorchField:
             step=step_length(s, self.step),
         )
 
-    def _one_step(self, data: Views, progress: float) -> tuple[float, int, int]:
+    def _one_step(self, data: Views, progress: float) -> tuple[float, int, int, int]:
         s, box, model = self.settings, self.view_store.box, self._model()
         assert box is not None
         rng = np.random.default_rng(int(step_key(s.seed, self.step)))
@@ -335,8 +289,8 @@ class NgpTorchField:
                 bad += self._adam(p, m, v, scale, rate, decay)
         self._grid.table.requires_grad_(False)
         self._net.requires_grad_(False)
-        used = int(inside.sum())
-        return error[good].mean().item() / 3.0 if bool(good.any()) else 0.0, used, bad
+        loss = error[good].mean().item() / 3.0 if bool(good.any()) else 0.0
+        return loss, s.rays, int(inside.sum()), bad
 
     def _adam(self, p: Tensor, m: Tensor, v: Tensor, scale: float, rate: float, decay: float) -> int:
         """``kernels.adam``: entries without gradient, or with one that is not finite, stay as they are."""
