@@ -236,7 +236,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box)
+        self._occupancy = OccupancyGrid.for_box(s.cells, s.min_views, self.view_store.box)
         self._cameras = CameraRefinement(s.exposure, s.refine_m, s.refine_deg)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())

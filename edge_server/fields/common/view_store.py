@@ -19,9 +19,9 @@ from edge_server.fields.common.supervision import (
     remember_views,
     without_views,
 )
+from edge_server.fields.common.trainer_settings import FieldSettings
 from edge_server.fields.common.view_outliers import (
     RenderPoints,
-    ViewWeightSettings,
     find_outliers,
     pixel_weights,
 )
@@ -31,23 +31,6 @@ Arrays = dict[str, NDArray[Any]]
 
 FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
 SETTLED_STEPS = 100  # steps after which a field may refuse views
-
-
-class ViewStoreSettings(ViewWeightSettings, Protocol):
-    """The options that are read here; ``TrainerSettings`` says what they mean."""
-
-    @property
-    def centre_m(self) -> tuple[float, float, float] | None: ...
-    @property
-    def radius_m(self) -> float | None: ...
-    @property
-    def near_m(self) -> float | None: ...
-    @property
-    def contracted(self) -> bool | None: ...
-    @property
-    def background(self) -> str: ...
-    @property
-    def refuse_beyond(self) -> float: ...
 
 
 class PixelRenderer(Protocol):
@@ -78,7 +61,7 @@ class PackedUpdate:
 class ViewStore:
     """The newest view of each camera of one field, and what follows from them."""
 
-    def __init__(self, settings: ViewStoreSettings) -> None:
+    def __init__(self, settings: FieldSettings) -> None:
         self.settings = settings
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}

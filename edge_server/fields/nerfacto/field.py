@@ -7,12 +7,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
@@ -27,7 +25,7 @@ from edge_server.fields.nerfacto.appearance import CameraAppearance
 from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling, scatter_proposal
 from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, render_with_proposal
 from edge_server.fields.nerfacto.kernels.train import ProposalGradients, ProposalScratch, train_with_proposal
-from edge_server.fields.nerfacto.settings import NerfactoSettings, make_settings
+from edge_server.fields.nerfacto.settings import NerfactoSettings
 from freshfield.geometry import Pinhole
 
 
@@ -141,9 +139,4 @@ class NerfactoField(TrainedField):
         return NerfactoSnapshot(**known, sampling=self._sampling())
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``nerfacto.settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("nerfacto: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return NerfactoField(settings)
+make = NerfactoField

@@ -245,7 +245,9 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         self._widths = net.widths.tolist()
         self._net = torch.as_tensor(net.params, device=self.device)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in (self._grid.table, self._net)]
-        self._occupancy: OccupancyGrid = OccupancyGrid.for_box(self.settings, self.view_store.box)
+        self._occupancy: OccupancyGrid = OccupancyGrid.for_box(
+            self.settings.cells, self.settings.min_views, self.view_store.box
+        )
 
     def _model(self) -> TorchModel:
         o, s = self._occupancy, self.settings
@@ -289,8 +291,8 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
                 bad += self._adam(p, m, v, scale, rate, decay)
         self._grid.table.requires_grad_(False)
         self._net.requires_grad_(False)
-        loss = error[good].mean().item() / 3.0 if bool(good.any()) else 0.0
-        return loss, s.rays, int(inside.sum()), bad
+        mean = error[good].mean().item() / 3.0 if bool(good.any()) else 0.0
+        return mean, s.rays, int(inside.sum()), bad
 
     def _adam(self, p: Tensor, m: Tensor, v: Tensor, scale: float, rate: float, decay: float) -> int:
         """``kernels.adam``: entries without gradient, or with one that is not finite, stay as they are."""

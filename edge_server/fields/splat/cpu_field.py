@@ -59,6 +59,10 @@ class SplatField(SteppedField[SplatSnapshot]):
     name = "splat"
     shape = ("harmonics",)
     settings: SplatSettings
+    _now_ns: int | None  # the instant of the Gaussians' parameters
+    _given: tuple[View, ...]  # views of the last fit; they survive ``load_state``
+    _refused: set[str]  # cameras whose newest view is refused
+    _unsure: set[str]  # cameras whose newest view follows a refused one
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         s = settings or SplatSettings()
@@ -140,12 +144,11 @@ class SplatField(SteppedField[SplatSnapshot]):
         self._raster, self._tracking_raster, self._render_raster = (
             RasterBuffers(self.pool) for _ in range(3)
         )
-        self._now_ns: int | None = None  # the instant of the Gaussians' parameters
+        self._now_ns = None
         self._snapshot = None
         self._views: tuple[View, ...] = ()
-        self._given: tuple[View, ...] = ()  # views of the last fit; they survive ``load_state``
-        self._refused: set[str] = set()  # cameras whose newest view is refused
-        self._unsure: set[str] = set()  # cameras whose newest view follows a refused one
+        self._given = ()
+        self._refused, self._unsure = set(), set()
         self._unjudged: set[str] = set()  # cameras whose newest view no step has judged yet
         self._errors: dict[str, float] = {}  # of each camera, when a step last saw it whole
         self._reseeded = 0  # step of the last reseeding

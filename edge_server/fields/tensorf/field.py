@@ -6,12 +6,9 @@ get finer during training (section 4.4 of the paper).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Field
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
@@ -25,7 +22,7 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     regularize,
     scatter_planes,
 )
-from edge_server.fields.tensorf.settings import TensorfSettings, make_settings
+from edge_server.fields.tensorf.settings import TensorfSettings
 
 assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"
 
@@ -120,9 +117,4 @@ def _rows(size: int) -> int:
     return -(-size * (size + 1) // ROWS) * ROWS
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``tensorf.settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("tensorf: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return TensorfField(settings)
+make = TensorfField

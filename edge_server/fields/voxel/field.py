@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, Field, View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.train import RaySampling
@@ -38,7 +38,7 @@ from edge_server.fields.voxel.kernels.update import (
     upsample_grid,
     voxel_adam,
 )
-from edge_server.fields.voxel.settings import VoxelSettings, make_settings, sizes_of
+from edge_server.fields.voxel.settings import VoxelSettings, sizes_of
 from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_ray_scratch
 from freshfield.geometry import Pinhole
 
@@ -156,7 +156,9 @@ class VoxelField(SteppedField[VoxelSnapshot]):
         table = _empty_grid(self._sizes[0])
         table[:] = (s.first, 0.5, 0.5, 0.5)
         self._set_grid(self._sizes[0], table)
-        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box, unknown=2.0 * EMPTY)
+        self._occupancy = OccupancyGrid.for_box(
+            s.cells, s.min_views, self.view_store.box, unknown=2.0 * EMPTY
+        )
         self._clearance = np.zeros(s.cells**3, np.uint8)
         self._ray_scratch = make_ray_scratch(self.pool.threads)
         self._samples, self._bad_rays = np.zeros(s.parts, np.int64), np.zeros(s.parts, np.int64)
@@ -301,9 +303,4 @@ def _empty_grid(size: int) -> NDArray[np.float32]:
     return np.zeros((-(-(size**3) // SEGMENT) * SEGMENT, 4), np.float32)
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``voxel_settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("voxel: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return VoxelField(settings)
+make = VoxelField
