@@ -293,8 +293,6 @@ class TrainedField(SteppedField[RaySnapshot]):
         )
         weights = Weights(
             distortion=np.float32(s.distortion),
-            sparsity=np.float32(s.sparsity),
-            near=np.float32(s.near_fade * box.distance_m / box.radius_m),
             guide=np.float32(self._present_guide_weight()),
         )
         self._train(data, recipe, space, weights)

@@ -104,8 +104,6 @@ class TrainerSettings(FieldSettings):
     cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
     distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
-    sparsity: float = option(0.0, "weight of the loss on optical depth: empties what no picture needs")
-    near_fade: float = option(0.0, "share of the cameras' distance over which gradients are held back")
     depth_guide: float | None = option(
         None,
         "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
@@ -129,8 +127,6 @@ class TrainerSettings(FieldSettings):
             ("cells", 8, 256),
             ("rate_net", 0.0, 10.0),
             ("distortion", 0.0, 1e3),
-            ("sparsity", 0.0, 1e3),
-            ("near_fade", 0.0, 10.0),
             ("depth_guide", 0.0, 1e3),
             ("guide_steps", 1, 1 << 30),
             ("refine_m", 0.0, 1.0),

@@ -53,7 +53,7 @@ from edge_server.fields.ngp.torch_model import (
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
-KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "near_fade", "depth_guide")  # not implemented here
+KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "depth_guide")  # not implemented here
 
 
 def unsupported_options(settings: NgpSettings) -> tuple[str, ...]:
@@ -277,7 +277,7 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         net = self._net.requires_grad_(True)
         t, delta, u, inside = model.march(o, d, jitter)
         sigma, color = model.query(d, u, inside)
-        error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
+        error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion)
         error, loss = error * weight, loss * weight
         good = torch.isfinite(error)
         with _deterministic():

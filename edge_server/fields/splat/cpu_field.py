@@ -289,17 +289,7 @@ class SplatField(SteppedField[SplatSnapshot]):
         if moving and int(key) * 2.0**-64 < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
             return some, [self._changed[k] for k in some]
-        if s.tile_share >= 1.0:
-            return picked, [None] * slots
-        rng = self._rng(3)
-        wanted: list[NDArray[np.uint8] | None] = []
-        for k in picked:
-            size = self._data.size[k]
-            total = int(-(-size[0] // TILE) * -(-size[1] // TILE))
-            mask = np.zeros(total, np.uint8)
-            mask[rng.permutation(total)[: max(int(s.tile_share * total), 1)]] = 1
-            wanted.append(mask)
-        return picked, wanted
+        return picked, [None] * slots
 
     def _one_step(self, progress: float) -> tuple[float | None, int, int, int]:
         """One optimizer step at ``progress`` of the fit, in [0, 1].

@@ -21,7 +21,6 @@ class SplatSettings(FieldSettings):
     start: int = option(4096, "number of Gaussians at the start, at most ``gaussians``")
     harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
     views_a_step: int = option(1, "views that a step trains on")
-    tile_share: float = option(1.0, "share of these views' tiles that a step trains on")
     loss: str = option("mse", "of colors: mse (squared errors) or l1 (absolute ones)")
     dssim: float = option(0.0, "weight of (1 - SSIM) / 2, tile by tile (Kerbl et al.: 0.2 beside l1)")
     seed_cells: int = option(64, "cells a side of the grid that finds first positions; 0: random positions")
@@ -64,7 +63,7 @@ class SplatSettings(FieldSettings):
             ("gaussians", 1, 1 << 20), ("start", 1, 1 << 20), ("views_a_step", 1, 64), ("seed_cells", 0, 256),
             ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
             ("follow", 0, 1000), ("settle_after", 1.0, 1e9), ("rate_settled", 0.0, 1.0),
-            ("tile_share", 0.01, 1.0), ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
+            ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
             ("seed_opacity", 0.001, 0.99), ("fade", 0.0, 1e3),
             ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
             ("aspect", 1.0, 1e4), ("reseed", 0.0, 1.0),

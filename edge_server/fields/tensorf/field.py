@@ -19,7 +19,6 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     MODES,
     ROWS,
     Planes,
-    regularize,
     scatter_planes,
 )
 from edge_server.fields.tensorf.settings import TensorfSettings
@@ -72,13 +71,10 @@ class TensorfField(TrainedField):
         self._table_m, self._table_v = tables[1:]
 
     def _gather(self, levels: int, scale: float) -> None:
-        s, batch, planes = self.settings, self._batch, self._encoding
+        batch, planes = self._batch, self._encoding
         self.pool.run(
             scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
         )
-        if s.smooth or s.sparse:
-            weights = np.float32(s.smooth / scale), np.float32(s.sparse / scale)
-            self.pool.run(regularize, planes, *weights, self._table_g, self._dirty)
 
 
 def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:

@@ -23,8 +23,6 @@ class TensorfSettings(TrainerSettings):
     rate_net: float = option(4e-2, "learning rate of the network at the start of a fit")
     epsilon: float = option(1e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     decay: float = option(0.0, "pull of planes and lines towards zero, per step and rate")
-    smooth: float = option(0.0, "weight of the planes' total variation")
-    sparse: float = option(0.0, "weight of the absolute values of the density's factors")
     first: float = option(0.1, "standard deviation of the factors' initial values")
 
     def __post_init__(self) -> None:
@@ -35,8 +33,6 @@ class TensorfSettings(TrainerSettings):
             ("first", 1e-4, 1.0),
             ("rate", 0.0, 10.0),
             ("decay", 0.0, 1e3),
-            ("smooth", 0.0, 1e3),
-            ("sparse", 0.0, 1e3),
             ("resolution", 4, 1024),
         )
         for rank in ("density_rank", "color_rank"):

@@ -48,8 +48,7 @@ REFUSED_ANYWHERE: list[tuple[str, Any, str]] = [
     ("rate_end", -0.1, "in 0.0001..1.0"),
     ("epsilon", 0.0, "in 1e-10..1000.0"), ("epsilon", -1.0, "in 1e-10..1000.0"),
     ("changed_share", 7.0, "in 0.0..1.0"), ("distortion", -5.0, "in 0.0..1000.0"),
-    ("sparsity", -1.0, "in 0.0..1000.0"), ("sparse", -1.0, "in 0.0..1000.0"),
-    ("near_fade", -1.0, "in 0.0..10.0"), ("depth_guide", -1.0, "in 0.0..1000.0"),
+    ("depth_guide", -1.0, "in 0.0..1000.0"),
     ("guide_steps", 0, "in 1..1073741824"),
     ("decay", -1.0, "in 0.0..1000.0"),
     ("smooth", -1.0, "in 0.0..1000.0"), ("levels_start", 0, "in 1..24"),
@@ -97,7 +96,6 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         ("splat", {"device": "tpu"}, "auto, cpu or cuda"),
         ("splat", {"background": "pink"}, "#80c0ff"),
         ("splat", {"radius_m": -1.0}, "positive"),
-        ("splat", {"tile_share": 0.0}, "tile_share"),
         ("splat", {"rate_scale": float("nan")}, "rate_scale"),
         ("voxel", {"sizes": [32, 16]}, "sizes must be rising"),
         ("voxel", {"sizes": [32, 48], "refine_at": [9, 12]}, "refine_at must be 1 rising"),
@@ -107,7 +105,6 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         # Only the kernels do these.
         ("ngp", {"device": "cuda", "exposure": True}, "exposure needs device cpu"),
         ("ngp", {"device": "cuda", "refine_m": 0.03}, "refine_m needs device cpu"),
-        ("ngp", {"device": "cuda", "near_fade": 0.3}, "near_fade needs device cpu"),
         ("ngp", {"device": "cuda", "depth_guide": 0.1}, "depth_guide needs device cpu"),
     ],
 )  # fmt: skip
