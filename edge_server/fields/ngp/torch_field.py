@@ -79,8 +79,9 @@ def cuda_present() -> bool:
 
 
 @dataclass(frozen=True)
-class TorchModel:
-    """Parameters of one instant and how to sample them; occupied: uint8 (cells, cells, cells), z first."""
+class TorchSnapshot(PixelSnapshot):
+    """``RaySnapshot`` of a torch field. occupied: uint8 (cells, cells, cells), z first. step_length: in scene
+    units."""
 
     settings: NgpSettings
     box: SceneBox
@@ -90,13 +91,20 @@ class TorchModel:
     net: Tensor
     occupied: Tensor
     background: Tensor
-    step: float  # scene units
+    step_length: float
+    cameras: tuple[View, ...]
+    step: int
+
+    def copied(self) -> TorchSnapshot:
+        """See ``stepped_field.StepSnapshot``."""
+        grid = replace(self.grid, table=self.grid.table.detach().clone())
+        return replace(self, grid=grid, net=self.net.detach().clone())
 
     def march(self, o: Tensor, d: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Origins and directions (R, 3), jitter (R,) -> t, delta (R, S), unit-cube points (R, S, 3) and
         which of them lie in occupied cells (R, S): ``kernels.rays.march`` without skipping."""
         box, s = self.box, self.settings
-        step = self.step
+        step = self.step_length
         half = HORIZON if box.contracted else 1.0
         safe = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
         a, b = (-half - o) / safe, (half - o) / safe
@@ -136,7 +144,7 @@ class TorchModel:
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
     ) -> Pixels:
-        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
+        """See ``PixelSnapshot``."""
         device, pose = self.net.device, np.asarray(camera_to_world, dtype=np.float64)
         rays = (intrinsics.rays(pixels) @ pose[:3, :3].T).astype(np.float32)
         origin = self.box.normalise(pose[:3, 3]).astype(np.float32)
@@ -154,26 +162,6 @@ class TorchModel:
             parts.append((rgb.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), opacity.cpu().numpy()))
         color_, depth_, opacity_ = (np.concatenate(p) for p in zip(*parts))
         return color_, depth_, opacity_
-
-
-@dataclass(frozen=True)
-class TorchSnapshot(PixelSnapshot):
-    """``RaySnapshot`` of a torch field."""
-
-    model: TorchModel
-    cameras: tuple[View, ...]
-    step: int
-
-    def copied(self) -> TorchSnapshot:
-        """See ``stepped_field.StepSnapshot``."""
-        grid = replace(self.model.grid, table=self.model.grid.table.detach().clone())
-        return replace(self, model=replace(self.model, grid=grid, net=self.model.net.detach().clone()))
-
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> Pixels:
-        """See ``PixelSnapshot``."""
-        return self.model.render_pixels(camera_to_world, intrinsics, pixels)
 
 
 class NgpTorchField(SteppedField[TorchSnapshot]):
@@ -201,11 +189,8 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
                 self._forget_parameters()
             if update.visibility_changed:
                 self._occupancy.recount_views(self.pool, self.view_store)
-            data = self.view_store.without_outliers(views, update, self.step, self._model())
+            data = self.view_store.without_outliers(views, update, self.step, self._live())
         return partial(self._one_step, data), 0, 0
-
-    def _live(self) -> TorchSnapshot:
-        return TorchSnapshot(self._model(), self.view_store.views, self.step)
 
     def _run_kernels(self, pool: Pool) -> None:
         """Nothing to compile."""
@@ -249,10 +234,10 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
             self.settings.cells, self.settings.min_views, self.view_store.box
         )
 
-    def _model(self) -> TorchModel:
+    def _live(self) -> TorchSnapshot:
         o, s = self._occupancy, self.settings
         occupied = torch.as_tensor(o.occupied, device=self.device).view(s.cells, s.cells, s.cells)
-        return TorchModel(
+        return TorchSnapshot(
             settings=s,
             box=self.view_store.box or UNIT_BOX,
             grid=self._grid,
@@ -261,16 +246,18 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
             net=self._net,
             occupied=occupied,
             background=torch.as_tensor(self.view_store.background(), device=self.device),
-            step=step_length(s, self.step),
+            step_length=step_length(s, self.step),
+            cameras=self.view_store.views,
+            step=self.step,
         )
 
     def _one_step(self, data: Views, progress: float) -> tuple[float, int, int, int]:
-        s, box, model = self.settings, self.view_store.box, self._model()
+        s, box, model = self.settings, self.view_store.box, self._live()
         assert box is not None
         rng = np.random.default_rng(int(step_key(s.seed, self.step)))
         if self.step % EVERY == 0:
             self._refresh(model, rng)
-            model = self._model()
+            model = self._live()
         o, d, target, background, weight = self._draw(data, rng)
         jitter = torch.as_tensor(rng.random(len(d), dtype=np.float32), device=self.device)
         table = self._grid.table.requires_grad_(True)
@@ -340,7 +327,7 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         return o, d, wanted, behind, counts
 
     @torch.no_grad()
-    def _refresh(self, model: TorchModel, rng: np.random.Generator) -> None:
+    def _refresh(self, model: TorchSnapshot, rng: np.random.Generator) -> None:
         o, cells = self._occupancy, self.settings.cells
         k, j, i = np.meshgrid(*[np.arange(cells)] * 3, indexing="ij")
         corner = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=-1)
