@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from edge_server.fields.common.threads.precompile import compile_ahead
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, ViewStore
+from freshfield.geometry import Pinhole
 
 # A step at a progress of the fit in [0, 1] -> loss (None: none is known), rays, samples, and how many values
 # were not finite and left out.
@@ -96,7 +98,7 @@ class SteppedField(ABC, Generic[S]):
         refused = self._refused_among(views)
         return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped, refused)
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Any) -> Rendering:
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render a camera from the present parameters."""
         return self.snapshot().render(camera_to_world, intrinsics)
 
@@ -152,9 +154,20 @@ class SteppedField(ABC, Generic[S]):
     def _live(self) -> S:
         """A snapshot of the arrays in use, not copied, for the holder of the lock."""
 
-    @abstractmethod
+    def _tiny(self) -> Any:
+        """Small settings, with which ``warm_up`` compiles the kernels."""
+        raise NotImplementedError
+
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel once."""
+        tiny, camera, pose = self._tiny(), Pinhole.from_fov(8, 8, 60.0), np.eye(4)
+        pose[2, 3] = -3.0
+        for channels in (3, 4):
+            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
+            image = np.full((8, 8, channels), 128, np.uint8)
+            views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
+            field.fit(views, Budget(steps=2))  # with a depth guide, if any is to be expected
+            field.render(pose, camera)
 
     @abstractmethod
     def _counters(self) -> dict[str, Any]:

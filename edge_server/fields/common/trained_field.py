@@ -36,7 +36,6 @@ from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trainer_settings import BATCH
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
@@ -48,7 +47,6 @@ from edge_server.fields.common.training_schedule import (
     step_length,
 )
 from edge_server.fields.common.view_store import Arrays, same_views
-from freshfield.geometry import Pinhole
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must agree on the size of a chunk"
@@ -115,18 +113,6 @@ class TrainedField(SteppedField[RaySnapshot]):
             step=self.step,
         )
 
-    def _run_kernels(self, pool: Pool) -> None:
-        tiny = self._tiny()
-        camera = Pinhole.from_fov(8, 8, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
-            image = np.full((8, 8, channels), 128, np.uint8)
-            views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
-            field.fit(views, Budget(steps=1))  # with a depth guide, if any is to be expected
-            field.render(pose, camera)
-
     # --- state --------------------------------------------------------------------------------
 
     def _counters(self) -> dict[str, Any]:
@@ -166,7 +152,6 @@ class TrainedField(SteppedField[RaySnapshot]):
         raise NotImplementedError
 
     def _tiny(self) -> Any:
-        """Small settings, with which ``warm_up`` compiles the kernels."""
         return replace(self.settings, **TINY)
 
     def _levels(self) -> int:

@@ -40,7 +40,6 @@ from edge_server.fields.voxel.kernels.update import (
 )
 from edge_server.fields.voxel.settings import VoxelSettings, sizes_of
 from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_ray_scratch
-from freshfield.geometry import Pinhole
 
 OCCUPANCY_PHASES = 4  # refreshes until every cell has been refreshed
 EVERY = 5  # steps between refreshes of the occupancy
@@ -104,18 +103,8 @@ class VoxelField(SteppedField[VoxelSnapshot]):
             step=self.step,
         )
 
-    def _run_kernels(self, pool: Pool) -> None:
-        tiny = replace(
-            self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0, min_views=1
-        )
-        camera = Pinhole.from_fov(8, 8, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = VoxelField(replace(tiny, contracted=channels == 3), pool)
-            image = np.full((8, 8, channels), 128, np.uint8)
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=2))
-            field.render(pose, camera)
+    def _tiny(self) -> VoxelSettings:
+        return replace(self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0)
 
     # --- state --------------------------------------------------------------------------------
 
