@@ -78,7 +78,6 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         ("voxel", {"levels": 3}, r"no option levels; it has: effort, sizes, .*nice"),
         ("voxel", {"hidden": 16}, "no option hidden; it has"),
         ("ngp", {"levels": 99}, r"levels must be in 1..24, not 99"),
-        ("ngp", {"background": "blu"}, "background"),
         ("nerfacto", {"bins": 4}, "bins must be in 8..1024, not 4"),
         ("nerfacto", {"proposal_cells": 30}, "proposal_cells must be a multiple of 4"),
         ("nerfacto", {"even": 1.5}, "even must be in 0.0..1.0"),
