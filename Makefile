@@ -37,7 +37,12 @@ WARM_UP := from edge_server.fields.registry import make_field; make_field("splat
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
 TORCH := $(call wanted,torch)
-PROTOC = -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1)
+# Into folder $(1), without the static methods that gRPC calls experimental and nobody here calls.
+define PROTOC
+cd proto && ../$(PY) -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1) \
+  freshfield/v1/*.proto && \
+  sed -i.all '/add_registered_method_handlers/,$${//!d;}' $(1)/freshfield/v1/*_grpc.py && rm $(1)/freshfield/v1/*.all
+endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
@@ -85,11 +90,11 @@ bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, run
 	$(PY) docs/tables.py  # the tables of docs/ are made from these files
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
-	cd proto && ../$(PY) $(call PROTOC,.) freshfield/v1/*.proto
+	$(call PROTOC,.)
 
 proto-check: .venv/.ok-test  ## fail where the generated code differs from its .proto files
 	@rm -rf .venv/proto-check && mkdir -p .venv/proto-check
-	@cd proto && ../$(PY) $(call PROTOC,../.venv/proto-check) freshfield/v1/*.proto
+	@$(call PROTOC,../.venv/proto-check)
 	@for file in .venv/proto-check/freshfield/v1/*; do \
 	  diff -u proto/freshfield/v1/$$(basename $$file) $$file || \
 	  { echo "proto/freshfield/v1 is not what its .proto files say: run 'make proto' and commit"; exit 1; }; \

@@ -283,9 +283,9 @@ class ZjuConfig(RecordedConfig):
 
 @dataclass(frozen=True)
 class EyefulConfig(RecordedConfig):
-    """Eyeful Tower. data: a scene's folder with ``cameras.json`` or ``cameras.xml``. images: folder of
-    images in it (default: the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``, ``images-jpeg``). Cameras
-    are called as their folders: name them in cameras.ids, or in assignment."""
+    """Eyeful Tower. data: a scene's folder with ``cameras.json``. images: folder of images in it (default:
+    the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``, ``images-jpeg``). Cameras are called as their
+    folders: name them in cameras.ids, or in assignment."""
 
     images: str | None = None
 

@@ -44,7 +44,6 @@ OPTIONS: tuple[tuple[str, tuple[tuple[str, str], ...], tuple[tuple[str, str], ..
     ("outlines", (("voxel", "tile"),), (("voxel", "room"),)),
     ("diffusion", (("voxel", "room"), ("voxel", "kitchen"), ("voxel", "tile")), (("voxel", "lego"),)),
     ("no density seen by few", (), (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room"))),
-    ("near fade", (), (("ngp", "tile"), ("ngp", "room"))),
     ("smoothness", (), (("ngp", "tile"), ("ngp", "room"))),
 )
 UPDATE_OPTIONS = (

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS, periodic_loop
 from channel_emu.virtual.simulate import SimulationError, simulate
+from freshfield.files import write_csv
 
 Rows = list[dict[str, Any]]
 
@@ -173,10 +173,7 @@ def write(tables: dict[str, Rows], out: Path) -> list[Path]:
     written = []
     for name, rows in tables.items():
         path = out / f"accuracy-{name}.csv"
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_csv(path, rows)
         written.append(path)
     return [*written, _draw(tables, out / "accuracy.png")]
 

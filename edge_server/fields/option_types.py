@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 def checked(name: str, kind: type, options: Mapping[str, Any]) -> dict[str, Any]:
     """``options`` with the types that the settings class ``kind`` of representation ``name`` wants.
 
-    ValueError: an option of another type. Unknown options and lists of any length are passed on unchecked.
+    ValueError: an option of another type. Unknown options are passed on unchecked.
     """
     hints = get_type_hints(kind)
     return {key: _typed(hints[key], f"{name}: {key}", v) if key in hints else v for key, v in options.items()}
@@ -29,13 +29,13 @@ def _typed(hint: Any, what: str, value: Any) -> Any:
         hint = next(one for one in get_args(hint) if one is not type(None))
     if get_origin(hint) is tuple:
         parts = get_args(hint)
-        if parts[-1] is Ellipsis:
-            return value
-        if not isinstance(value, (list, tuple)) or len(value) != len(parts):
-            raise ValueError(f"{what} must be a list of {len(parts)} numbers, not {value!r}")
-        return tuple(_typed(part, what, v) for part, v in zip(parts, value))
+        any_length = parts[-1] is Ellipsis
+        if not isinstance(value, (list, tuple)) or not (any_length or len(value) == len(parts)):
+            how_many = "" if any_length else f"{len(parts)} "
+            raise ValueError(f"{what} must be a list of {how_many}numbers, not {value!r}")
+        return tuple(_typed(parts[0], what, v) for v in value)
     if hint is float:
-        return _number(what, value)
+        return float(_number(what, value))
     right = {
         int: isinstance(value, Integral) and not isinstance(value, bool),
         bool: isinstance(value, bool),

@@ -108,11 +108,6 @@ class FrameCounts:
             self.sent + self.duplicated - ended,
         )
 
-    @property
-    def balanced(self) -> bool:
-        """Whether both sums hold."""
-        return self.without_end == (0, 0)
-
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, in the order in which a frame passes the states."""
         return {**vars(self), "rejected": dict(sorted(self.rejected.items()))}

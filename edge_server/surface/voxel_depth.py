@@ -41,14 +41,14 @@ def fit_voxels(
     """Fit voxels to ``views`` in ``steps`` steps; the result does not depend on the number of threads.
     background: color (3,) in [0, 1] behind the scene; None: estimated from the images."""
     from edge_server.fields.voxel.field import VoxelField
-    from edge_server.fields.voxel.settings import make_settings
+    from edge_server.fields.voxel.settings import VoxelSettings
 
     options: dict[str, Any] = {
         "centre_m": box.centre_m, "radius_m": box.radius_m, "near_m": box.near_m, "contracted": False,
     }  # fmt: skip
     if background is not None:
         options["background"] = "#" + "".join(f"{round(255 * float(c)):02x}" for c in background)
-    field = VoxelField(make_settings(options), pool)
+    field = VoxelField(VoxelSettings(**options), pool)
     field.fit(views, Budget(steps=steps))
     return field.snapshot()
 

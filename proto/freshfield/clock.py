@@ -33,6 +33,13 @@ class WallClock:
         return self._wall + elapsed + int(elapsed * self._drift)
 
 
+class SystemClock:
+    """UTC as the machine has it now, steps included: what drivers stamp by."""
+
+    def now_ns(self) -> int:
+        return time.time_ns()
+
+
 class VirtualClock:
     """A clock that ``advance_to`` moves, forward only (else ValueError)."""
 

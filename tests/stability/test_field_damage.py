@@ -35,7 +35,7 @@ THROUGH_ALL: dict[str, tuple[int, tuple[dict[str, Any], ...]]] = {
         {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6},
     )),
     "tensorf": (50, (
-        {}, {"harmonics": 4, "smooth": 1e-3, "sparse": 1e-4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW,
+        {}, {"harmonics": 4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW,
     )),
     "nerfacto": (50, (
         {"exposure": True, **_POSES}, {"harmonics": 4, **_PLAIN}, {"appearance": 3, **_POSES},

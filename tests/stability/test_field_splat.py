@@ -89,7 +89,7 @@ from edge_server.fields import Budget
 from tests.stability.test_field_splat import TINY, VIEWS, SplatField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
 for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True, "dssim": 0.1}, bent),
-                     ({"views_a_step": 3, "tile_share": 0.4, "loss": "l1"}, VIEWS),
+                     ({"views_a_step": 3, "loss": "l1"}, VIEWS),
                      ({"flatten": 0.1, "align": 0.05, "align_every": 1}, bent)):
     field = SplatField(replace(TINY, **extra))
     field.fit(views, Budget(steps=25))

@@ -84,17 +84,15 @@ POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
 
 
 def each_with(poisons: list[Poison], soon: list[Poison]) -> pytest.MarkDecorator:
-    """Every poison with splat, voxel and ngp. Networks take ten times as long as the others, and share what
-    refuses views: ngp's are slow tests but for a poison in ``soon``; the others meet one wrong picture and
-    one wrong pose."""
+    """Every poison with splat and voxel. Networks take ten times as long, and share with voxel what refuses
+    views: they meet one wrong picture and one wrong pose, in slow tests. ngp meets ``soon`` besides."""
     cases = []
     for name in NAMES:
         for poison in poisons:
-            if name in ("nerfacto", "tensorf") and poison not in (_noise, _in_millimetres):
-                continue
-            slow = name not in ("splat", "voxel") and not (name == "ngp" and poison in soon)
-            marks = [pytest.mark.slow] if slow else []
-            cases.append(pytest.param(name, poison, id=f"{name}-{poison.__name__}", marks=marks))
+            at_once = name in ("splat", "voxel") or (name == "ngp" and poison in soon)
+            if at_once or poison in (_noise, _in_millimetres):
+                marks = [] if at_once else [pytest.mark.slow]
+                cases.append(pytest.param(name, poison, id=f"{name}-{poison.__name__}", marks=marks))
     return pytest.mark.parametrize(("name", "poison"), cases)
 
 

@@ -24,12 +24,13 @@ from typing import Any
 import numpy as np
 
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot import tables
+from camera_node.robot import figures
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
 from camera_node.robot.arm.joint_states import ArmStream, HandPoses
 from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.simulated_controller.command import require_arm
 from freshfield.clock import WallClock
+from freshfield.files import write_csv
 from freshfield.geometry import so3_log
 from freshfield.scenario import load
 
@@ -169,9 +170,9 @@ def format_gaps(rows: Sequence[Row]) -> str:
 
 def write(rates: Sequence[Row], gaps: Sequence[Row], folder: Path) -> None:
     """Write both tables as CSV, and plot the second if matplotlib is installed. Raises OSError."""
-    tables.write_csv(folder / "rates.csv", rates)
-    tables.write_csv(folder / "gaps.csv", gaps)
-    plt = tables.pyplot()
+    write_csv(folder / "rates.csv", rates)
+    write_csv(folder / "gaps.csv", gaps)
+    plt = figures.pyplot()
     if not gaps or plt is None:
         return
     figure, panels = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharex=True, sharey=True)

@@ -28,7 +28,7 @@ from camera_node.pose.pairing import (
     interpolate_linear,
     interpolate_screw,
 )
-from camera_node.robot import tables
+from camera_node.robot import figures
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
@@ -231,7 +231,7 @@ def format_table(name: str, rows: Rows) -> str:
 
 def plot(pairing_rows: Rows, poses_rows: Rows, path: Path) -> None:
     """Plot the pairing and poses tables, if matplotlib is installed. Raises OSError."""
-    plt = tables.pyplot()
+    plt = figures.pyplot()
     if plt is None:
         return
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")

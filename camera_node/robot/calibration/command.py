@@ -281,7 +281,7 @@ def _target(args: argparse.Namespace) -> int:
 
 def _accuracy(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration import accuracy_study
-    from camera_node.robot.tables import write_csv
+    from freshfield.files import write_csv
 
     if args.seed < 0:
         raise CalibrationError("--seed: expected a whole number from 0")

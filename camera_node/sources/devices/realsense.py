@@ -8,7 +8,6 @@ metadata say when the middle of its exposure was, it is moved there.
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, cast
@@ -26,7 +25,7 @@ from camera_node.sources.devices.feed import (
     select_device,
 )
 from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
-from freshfield.clock import Clock
+from freshfield.clock import Clock, SystemClock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
 
@@ -99,7 +98,7 @@ class RealsenseFeed(Feed):
             self.close()
             raise as_camera_error(camera, error) from None
         self.intrinsics, self.no_intrinsics = intrinsics_or_reason(lambda: lens(camera, found))
-        self._stamps = FrameClock(clock)
+        self._stamps = FrameClock(clock, SystemClock())
 
     def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
         """Ask for the host's time and for the exposure; returns the library's intrinsics."""
@@ -127,10 +126,10 @@ class RealsenseFeed(Feed):
 
 
 class FrameClock:
-    """A frame's stamp as nanoseconds of our clock."""
+    """A frame's stamp as nanoseconds of ``clock``. system: the clock of the library's UTC stamps."""
 
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, clock: Clock, system: Clock) -> None:
+        self._clock, self._system = clock, system
         self._device = ArrivalClock()
 
     def captured_ns(self, frame: Any) -> int:
@@ -139,7 +138,7 @@ class FrameClock:
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return self._device.host_ns(stamp_ns, now_ns)
-        return now_ns - (time.time_ns() - stamp_ns)
+        return now_ns - (self._system.now_ns() - stamp_ns)
 
 
 def _since_exposed_ns(frame: Any) -> int:

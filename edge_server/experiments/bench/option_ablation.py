@@ -54,7 +54,6 @@ OPTIONS: tuple[Option, ...] = (
     Option("random background", {"background": "auto"}, {"background": "random"}, ("tile", "lego")),
     Option("distortion loss", {"distortion": 0.0}, {"distortion": 0.01}, ("tile", "room")),
     Option("no density seen by few", {"min_views": 0}, {"min_views": 2}, ("tile", "room")),
-    Option("near fade", {"near_fade": 0.0}, {"near_fade": 0.3}, ("tile", "room")),
     Option(
         "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
         ("room, moving", "kitchen, moving"),

@@ -1,14 +1,14 @@
-"""Tables of results: Markdown for people, CSV for programs. Figures have ``edge_server.report.style``."""
+"""Tables of results in Markdown. CSV has ``freshfield.files``, figures have ``edge_server.report.style``."""
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+
+from freshfield.files import write_csv as write_csv
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -19,15 +19,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join('' if c is None else str(c) for c in cells)} |" for cells in lines)
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A CSV file of mappings, one a row; what one of them lacks stays empty."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def number(value: float | None, digits: int = 2, sign: str = "") -> str:

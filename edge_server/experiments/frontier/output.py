@@ -8,9 +8,9 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.frontier.update_time import best
 from edge_server.report.style import CYCLE, INK, figure
+from freshfield.files import write_csv
 
 Row = dict[str, Any]
 _LINES = {"low": "--", "high": "-."}

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from edge_server.experiments.common.statistics import interval, negated, paired
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.drawing import draw_images
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
+from freshfield.files import write_csv
 
 # The thesis's table.
 THESIS = {

@@ -10,11 +10,11 @@ from typing import Any, Protocol
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.statistics import interval, paired
-from edge_server.experiments.common.tables import number, write_csv
+from edge_server.experiments.common.tables import number
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.trial import Row, Trial
 from edge_server.scheduler.learned.rewards import f_w
-from freshfield.files import write_text
+from freshfield.files import write_csv, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
 # metric -> (label of an axis, lower is better, digits)

@@ -14,7 +14,6 @@ from edge_server.fields.common.kernels.train import CHUNK
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.common.trainer_settings import TrainerSettings
 from edge_server.fields.common.view_store import ViewStore
 
 EVERY = 8  # steps between refreshes
@@ -43,11 +42,11 @@ class OccupancyGrid:
 
     @classmethod
     def for_box(
-        cls, settings: TrainerSettings, box: SceneBox | None, unknown: float = EMPTY
+        cls, cells: int, min_views: int, box: SceneBox | None, unknown: float = EMPTY
     ) -> OccupancyGrid:
         """A grid that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
-        return cls(settings.cells, box.contracted if box else False, near, settings.min_views, unknown)
+        return cls(cells, box.contracted if box else False, near, min_views, unknown)
 
     def space(self, step: float) -> Space:
         """The grid as kernels read it, without copies."""

@@ -9,19 +9,16 @@ A subclass makes, grows and differentiates its encoding, and has kernels for it 
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, FitReport, Rendering, View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_refinement import CameraRefinement
-from edge_server.fields.common.fair_lock import FairLock
-from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
+from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
@@ -37,9 +34,8 @@ from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
+from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.threads.precompile import compile_ahead
-from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.trainer_settings import BATCH
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
@@ -50,8 +46,7 @@ from edge_server.fields.common.training_schedule import (
     step_key,
     step_length,
 )
-from edge_server.fields.common.view_store import Arrays, ViewStore, same_views
-from freshfield.geometry import Pinhole
+from edge_server.fields.common.view_store import Arrays, same_views
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must agree on the size of a chunk"
@@ -61,20 +56,9 @@ SWEEP_SHARE = 0.5  # of a budget in seconds that a plane sweep may take
 DIRTY = 32  # parameters for one dirty flag: a segment of ``adam``, times its width
 
 
-class TrainedField:
-    """A radiance field that learns while it is used. See ``fields.Field`` for the protocol.
+class TrainedField(SteppedField[RaySnapshot]):
+    """A radiance field that learns while it is used. See ``SteppedField``."""
 
-    name: of the representation. shape: options in which a state and the field that loads it must agree.
-
-    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
-    meanwhile: they wait for the end of the present step, some milliseconds.
-    """
-
-    frame_s = None
-    most_pixels = None
-
-    name: ClassVar[str]
-    shape: ClassVar[tuple[str, ...]]
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, see ``kernels.radiance_model``
     _net: Net
     _batch: Batch
@@ -84,33 +68,11 @@ class TrainedField:
         tuple[tuple[View, ...], NDArray[np.float32]] | None
     )  # views, and what ``depth_guide`` returned for them
 
-    def __init__(self, settings: Any, pool: Pool | None = None) -> None:
-        self.settings = settings
-        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
-        self._lock = FairLock()
-        self.now = time.perf_counter  # the clock of budgets in seconds
-        self.reset()
-
     # --- the protocol -------------------------------------------------------------------------
 
-    def reset(self) -> None:
-        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._lock:
-            self.dropped = 0
-            self.view_store = ViewStore(self.settings)
-            self._snapshot: RaySnapshot | None = None
-            self._forget_parameters()
-
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train on ``views`` from the present parameters. ValueError for an impossible view.
-
-        New pictures are always taken in, however short the budget. With a budget in seconds, no step begins
-        that would probably end too late. The learning rate falls over the budget, so that every fit ends with
-        a settled field.
-        """
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        step_budget = StepBudget(budget, self.now)
+    def _begin_fit(
+        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
+    ) -> tuple[Step, int, int]:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
@@ -127,48 +89,17 @@ class TrainedField:
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
-        rays = samples = dropped = 0
-        losses: deque[float] = deque(maxlen=32)
-        while (progress := step_budget.begin_step(self._step_timer)) is not None:
-            with self._lock:
-                losses.append(self._one_step(data, progress))
-                data = cameras.learn(views, data, box, self.step, self.settings.seed, sums, self._live)
-                rays += int(self._batch.rays.sum())
-                samples += int(self._batch.samples.sum())
-                dropped += int(self._batch.dropped.sum() + self._dropped_by_task.sum())
-            step_budget.end_step()
-        self.dropped += dropped
-        loss = float(np.mean(losses)) if losses else 0.0
-        refused = self.view_store.refused_among(views)
-        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped, refused)
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """Render a camera from the present parameters."""
-        return self.snapshot().render(camera_to_world, intrinsics)
+        def one_step(progress: float) -> tuple[float, int, int, int]:
+            nonlocal data
+            loss, batch = self._one_step(data, progress), self._batch
+            data = cameras.learn(views, data, box, self.step, self.settings.seed, sums, self._live)
+            dropped = int(batch.dropped.sum() + self._dropped_by_task.sum())
+            return loss, int(batch.rays.sum()), int(batch.samples.sum()), dropped
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world metres and their colors; none before the first fit."""
-        return self.snapshot().points(count)
-
-    def snapshot(self, present_ns: int | None = None) -> RaySnapshot:
-        """A copy that renders from any thread and never changes."""
-        with self._lock:
-            if self._snapshot is None or self._snapshot.step != self.step:
-                live = self._live()
-                self._snapshot = replace(
-                    live,
-                    encoding=live.encoding._replace(table=live.encoding.table.copy()),
-                    net=Net(live.net.widths, live.net.params.copy()),
-                    space=live.space._replace(
-                        occupied=live.space.occupied.copy(),
-                        coarse=live.space.coarse.copy(),
-                        density=np.zeros(0, np.float32),
-                    ),
-                )
-            return self._snapshot
+        return one_step, 0, 0
 
     def _live(self) -> RaySnapshot:
-        """A renderer of the present arrays, without copies, for the holder of the lock."""
         return RaySnapshot(
             box=self.view_store.box or UNIT_BOX,
             encoding=self._encoding,
@@ -182,55 +113,24 @@ class TrainedField:
             step=self.step,
         )
 
-    def warm_up(self) -> float:
-        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds.
-
-        Trains small fields of its own, in the calling thread and at its priority: at the workers' low one,
-        compiling on a busy machine takes minutes. This field's state is not touched.
-        """
-        return compile_ahead(self._run_kernels)
-
-    def _run_kernels(self, pool: Pool) -> None:
-        """Run every kernel once."""
-        tiny = self._tiny()
-        camera = Pinhole.from_fov(8, 8, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
-            image = np.full((8, 8, channels), 128, np.uint8)
-            views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
-            field.fit(views, Budget(steps=1))  # with a depth guide, if any is to be expected
-            field.render(pose, camera)
-
     # --- state --------------------------------------------------------------------------------
 
-    def state(self) -> Arrays:
-        """Everything needed to go on bit for bit: parameters, moments, occupancy, cameras, counters."""
-        with self._lock:
-            counters = {
-                "step": self.step,
-                "updates": self._updates,
-                "dropped": self.dropped,
-                "needed": self._occupancy.needed,
-                "camera_errors": self._cameras.meta(),
-            }
-            return pack_state(self.name, self.settings, self.view_store, counters, self._arrays())
+    def _counters(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "updates": self._updates,
+            "dropped": self.dropped,
+            "needed": self._occupancy.needed,
+            "camera_errors": self._cameras.meta(),
+        }
 
-    def load_state(self, state: Arrays) -> None:
-        """Continue from ``state``. ValueError: it is not the state of a field of this shape."""
-        with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, self.name, self.shape)
-            self.view_store = ViewStore(self.settings)
-            self.view_store.load(meta, state)
-            self._forget_parameters()
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self._grow()
-            load_arrays(self._arrays(), state)
-            self._cameras.load(meta.get("camera_errors", {}))
-            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.update_occupied()
-            self._snapshot = None
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        self._updates = int(meta["updates"])
+        self._grow()
+        load_arrays(self._arrays(), state)
+        self._cameras.load(meta.get("camera_errors", {}))
+        self._occupancy.needed = int(meta["needed"])
+        self._occupancy.update_occupied()
 
     def _arrays(self) -> Arrays:
         return {
@@ -252,7 +152,6 @@ class TrainedField:
         raise NotImplementedError
 
     def _tiny(self) -> Any:
-        """Small settings, with which ``warm_up`` compiles the kernels."""
         return replace(self.settings, **TINY)
 
     def _levels(self) -> int:
@@ -294,7 +193,7 @@ class TrainedField:
         if self._present_guide_weight() == 0.0:
             return data
         if fresh or self._swept is None or not same_views(views, self._swept[0]):
-            if not step_budget.has_room(self._sweep_timer.seconds, SWEEP_SHARE, self._step_timer.seconds):
+            if not step_budget.has_room(self._sweep_timer.seconds, SWEEP_SHARE, self._step_time.seconds):
                 return data
             # Imported here: other scenes need neither load nor compile it.
             from edge_server.fields.common.plane_sweep import depth_guide
@@ -314,15 +213,15 @@ class TrainedField:
         s = self.settings
         rng = np.random.default_rng(np.random.SeedSequence(s.seed))
         self.step = 0
-        self._snapshot = None  # it is identified by its step alone
+        self._snapshot = None
         self._updates = 0  # optimizer steps that Adam's bias correction counts
-        self._step_timer, self._sweep_timer = StepTimer(), StepTimer()
+        self._step_time, self._sweep_timer = StepTimer(), StepTimer()
         self._guide_weight = 0.0
         self._swept = None
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box)
+        self._occupancy = OccupancyGrid.for_box(s.cells, s.min_views, self.view_store.box)
         self._cameras = CameraRefinement(s.exposure, s.refine_m, s.refine_deg)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())
@@ -379,8 +278,6 @@ class TrainedField:
         )
         weights = Weights(
             distortion=np.float32(s.distortion),
-            sparsity=np.float32(s.sparsity),
-            near=np.float32(s.near_fade * box.distance_m / box.radius_m),
             guide=np.float32(self._present_guide_weight()),
         )
         self._train(data, recipe, space, weights)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, TypeVar
 
@@ -13,60 +13,25 @@ def option(default: Any, text: str) -> Any:
     return field(default=default, metadata={"help": text})
 
 
-# Bounds that other families of settings share: (option, low, high) each.
-VIEW_WEIGHT_BOUNDS = (
-    ("age_tau_ms", 0.0, 1e9),
-    ("mask_stale_ms", 0.0, 1e9),
-    ("mask_grow_px_s", 0.0, 1e6),
-    ("refuse_beyond", 0.0, 1e6),
-)
-# Adam divides by epsilon where there is no gradient to speak of.
-COMMON_BOUNDS = (
-    ("min_views", 0, 1000),
-    ("rate_end", 1e-4, 1.0),
-    ("epsilon", 1e-10, 1e3),
-    ("changed_share", 0.0, 1.0),
-    ("seed", 0, (1 << 63) - 1),
-    ("nice", 0, 19),
-    *VIEW_WEIGHT_BOUNDS,
-)
 MOST_THREADS = 1024
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
 
 
 @dataclass(frozen=True)
-class TrainerSettings:
-    """Lengths in metres; None means: found from the cameras."""
+class FieldSettings:
+    """What all representations share. Lengths in metres; None means: found from the cameras."""
 
     name: ClassVar[str]
+    has_cuda: ClassVar[bool] = False  # whether the representation runs on a GPU, too
 
-    hidden: int = option(32, "units of each hidden layer, a multiple of 4")
-    hidden_layers: int = option(1, "hidden layers of the network")
-    harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
-    rays: int = option(4096, "rays of one step at most")
-    batch_samples: int = option(16384, "samples of one step at most, a multiple of 2048")
-    samples: int = option(192, "steps across the scene's box, corner to corner")
-    samples_start: int = option(64, "the same at first: fog is cheaper to see through in long steps")
-    samples_ramp: int = option(600, "steps after which ``samples`` is reached")
-    cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
     centre_m: tuple[float, float, float] | None = option(None, "centre of the scene's box")
     radius_m: float | None = option(None, "half the side of the scene's box")
     near_m: float | None = option(None, "no density is seen nearer to a camera than this")
     contracted: bool | None = option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
     background: str = option("auto", "auto (plain, or the mean color), white, black, random, or '#rrggbb'")
     min_views: int = option(2, "no density where fewer cameras than this look (never more than there are)")
-    rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
     rate_end: float = option(0.1, "share of the learning rate that is left at the end of a fit")
     epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
-    distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
-    sparsity: float = option(0.0, "weight of the loss on optical depth: empties what no picture needs")
-    near_fade: float = option(0.0, "share of the cameras' distance over which gradients are held back")
-    depth_guide: float | None = option(
-        None,
-        "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
-        "where the background is found to be plain, or of six views at most, else 0",
-    )
-    guide_steps: int = option(300, "steps over which ``depth_guide`` falls to nothing")
     changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")
     age_tau_ms: float = option(0.0, "age at which a view counts by 1/e beside the newest; 0: all alike")
     mask_stale_ms: float = option(
@@ -80,13 +45,74 @@ class TrainerSettings:
         "a view is refused whose typical error is so many times the usual one; 0, or while cameras' "
         "errors are learned: none is",
     )
-    exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
-    refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
-    refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
-    device: str = option("auto", "cpu (numba) or cuda (torch, only where asked for); auto: cpu")
+    device: str = option(
+        "auto", "cpu, or cuda (``ngp`` and ``splat`` alone, only where asked for); auto: cpu"
+    )
+
+    def __post_init__(self) -> None:
+        self._within(
+            ("min_views", 0, 1000),
+            ("rate_end", 1e-4, 1.0),
+            # Adam divides by epsilon where there is no gradient to speak of.
+            ("epsilon", 1e-10, 1e3),
+            ("changed_share", 0.0, 1.0),
+            ("age_tau_ms", 0.0, 1e9),
+            ("mask_stale_ms", 0.0, 1e9),
+            ("mask_grow_px_s", 0.0, 1e6),
+            ("refuse_beyond", 0.0, 1e6),
+            ("seed", 0, (1 << 63) - 1),
+            ("threads", 1, MOST_THREADS),
+            ("nice", 0, 19),
+        )
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"{self.name}: device must be auto, cpu or cuda, not {self.device!r}")
+        if self.device == "cuda" and not self.has_cuda:
+            raise ValueError(f"{self.name}: runs on CPUs only; use device cpu or auto, or the field ngp")
+        named = self.background in ("auto", "white", "black", "random")
+        if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
+            raise ValueError(
+                f"{self.name}: background must be auto, white, black, random or a color like '#80c0ff', "
+                f"not {self.background!r}"
+            )
+        for length in ("radius_m", "near_m"):
+            if getattr(self, length) is not None and not 0 < getattr(self, length) < float("inf"):
+                raise ValueError(f"{self.name}: {length} must be positive, not {getattr(self, length)}")
+
+    def _within(self, *bounds: tuple[str, float, float]) -> None:
+        """ValueError where an option is neither None nor in low..high: (option, low, high) each."""
+        for key, low, high in bounds:
+            value = getattr(self, key)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{self.name}: {key} must be in {low}..{high}, not {value}")
+
+
+@dataclass(frozen=True)
+class TrainerSettings(FieldSettings):
+    """What representations with a network add."""
+
+    hidden: int = option(32, "units of each hidden layer, a multiple of 4")
+    hidden_layers: int = option(1, "hidden layers of the network")
+    harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
+    rays: int = option(4096, "rays of one step at most")
+    batch_samples: int = option(16384, "samples of one step at most, a multiple of 2048")
+    samples: int = option(192, "steps across the scene's box, corner to corner")
+    samples_start: int = option(64, "the same at first: fog is cheaper to see through in long steps")
+    samples_ramp: int = option(600, "steps after which ``samples`` is reached")
+    cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
+    rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
+    distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
+    depth_guide: float | None = option(
+        None,
+        "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
+        "where the background is found to be plain, or of six views at most, else 0",
+    )
+    guide_steps: int = option(300, "steps over which ``depth_guide`` falls to nothing")
+    exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
+    refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
+    refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
 
     def __post_init__(self) -> None:
         name = self.name
@@ -101,17 +127,11 @@ class TrainerSettings:
             ("cells", 8, 256),
             ("rate_net", 0.0, 10.0),
             ("distortion", 0.0, 1e3),
-            ("sparsity", 0.0, 1e3),
-            ("near_fade", 0.0, 10.0),
+            ("depth_guide", 0.0, 1e3),
             ("guide_steps", 1, 1 << 30),
-            *COMMON_BOUNDS,
             ("refine_m", 0.0, 1.0),
             ("refine_deg", 0.0, 20.0),
         )
-        if self.threads is not None:
-            self._within(("threads", 1, MOST_THREADS))
-        if self.depth_guide is not None:
-            self._within(("depth_guide", 0.0, 1e3))
         if self.batch_samples % BATCH:
             raise ValueError(f"{name}: batch_samples must be a multiple of {BATCH}, not {self.batch_samples}")
         if self.hidden % 4 or self.cells % 4:
@@ -120,23 +140,7 @@ class TrainerSettings:
             )
         if self.harmonics not in (1, 4, 9):
             raise ValueError(f"{name}: harmonics must be 1, 4 or 9, not {self.harmonics}")
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise ValueError(f"{name}: device must be auto, cpu or cuda, not {self.device!r}")
-        named = self.background in ("auto", "white", "black", "random")
-        if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
-            raise ValueError(
-                f"{name}: background must be auto, white, black, random or a color like '#80c0ff', "
-                f"not {self.background!r}"
-            )
-        for length in ("radius_m", "near_m"):
-            if getattr(self, length) is not None and not 0 < getattr(self, length) < float("inf"):
-                raise ValueError(f"{name}: {length} must be positive, not {getattr(self, length)}")
-
-    def _within(self, *bounds: tuple[str, float, float]) -> None:
-        """ValueError where an option is not in low..high: (option, low, high) each."""
-        for key, low, high in bounds:
-            if not low <= getattr(self, key) <= high:
-                raise ValueError(f"{self.name}: {key} must be in {low}..{high}, not {getattr(self, key)}")
+        super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -165,25 +169,19 @@ class HashGridSettings(TrainerSettings):
             ("rate", 0.0, 10.0),
             ("decay", 0.0, 1e3),
             ("smooth", 0.0, 1e3),
+            ("finest_resolution", 2, 4096),
         )
-        if self.finest_resolution is not None:
-            self._within(("finest_resolution", 2, 4096))
         super().__post_init__()
 
 
-Settings = TypeVar("Settings", bound=TrainerSettings)
+Settings = TypeVar("Settings", bound=FieldSettings)
 
 
-def copy_option(name: str) -> Any:
-    """The option ``name`` of ``TrainerSettings``, for settings of another family."""
-    known = TrainerSettings.__dataclass_fields__[name]
-    return option(known.default, known.metadata["help"])
-
-
-def option_names(kind: type[TrainerSettings]) -> list[str]:
-    """The options of a settings class, its own before those of ``TrainerSettings``."""
-    common = [f.name for f in fields(TrainerSettings)]
-    return [f.name for f in fields(kind) if f.name not in common] + common
+def option_help(kind: type[FieldSettings]) -> dict[str, str]:
+    """Option -> what it means, for command lines and documentation: its own before those it inherits."""
+    own = {f.name: f.metadata["help"] for f in fields(kind)}
+    declared = [name for part in kind.__mro__ for name in vars(part).get("__annotations__", ())]
+    return {name: own[name] for name in declared if name in own}
 
 
 def settings_from(
@@ -199,17 +197,9 @@ def settings_from(
     effort = given.pop("effort", "medium")
     if effort not in efforts:
         raise ValueError(f"{kind.name}: effort must be one of {', '.join(efforts)}, not {effort!r}")
-    valid = option_names(kind)
+    valid = option_help(kind)
     if unknown := sorted(set(given) - set(valid)):
         raise ValueError(
             f"{kind.name} has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}"
         )
-    if given.get("centre_m") is not None:
-        given["centre_m"] = tuple(float(c) for c in given["centre_m"])
     return replace(kind(), **{"seed": seed, **efforts[effort], **given})
-
-
-def help_of(kind: type[TrainerSettings], names: Iterable[str] | None = None) -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
-    texts = {f.name: f.metadata["help"] for f in fields(kind)}
-    return {name: texts[name] for name in names or option_names(kind)}

@@ -9,7 +9,6 @@ default. ``find_outliers`` is for pictures that cannot be of this scene at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.supervision import CameraMemory
+from edge_server.fields.common.trainer_settings import FieldSettings
 
 LEAST_VIEWS = 4  # views a set needs before the others can outvote one
 GRID = 8  # pixels a side of the grid that a view is judged by
@@ -28,19 +28,8 @@ MOST_REFUSALS = 20  # in a row
 RenderPoints = Callable[[Sequence[View], Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float32]]]
 
 
-class ViewWeightSettings(Protocol):
-    """The options that are read here; ``TrainerSettings`` says what they mean."""
-
-    @property
-    def age_tau_ms(self) -> float: ...
-    @property
-    def mask_stale_ms(self) -> float: ...
-    @property
-    def mask_grow_px_s(self) -> float: ...
-
-
 def pixel_weights(
-    views: Sequence[View], memory: Mapping[str, CameraMemory], settings: ViewWeightSettings
+    views: Sequence[View], memory: Mapping[str, CameraMemory], settings: FieldSettings
 ) -> list[NDArray[np.float32]] | None:
     """A weight in [0, 1] for each pixel of each view, float32 (H, W); None: all pixels count in full.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,44 +19,21 @@ from edge_server.fields.common.supervision import (
     remember_views,
     without_views,
 )
+from edge_server.fields.common.trainer_settings import FieldSettings
 from edge_server.fields.common.view_outliers import (
     RenderPoints,
-    ViewWeightSettings,
     find_outliers,
     pixel_weights,
 )
 from freshfield.geometry import Pinhole
 
+if TYPE_CHECKING:
+    from edge_server.fields.common.ray_snapshot import PixelSnapshot
+
 Arrays = dict[str, NDArray[Any]]
 
 FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
 SETTLED_STEPS = 100  # steps after which a field may refuse views
-
-
-class ViewStoreSettings(ViewWeightSettings, Protocol):
-    """The options that are read here; ``TrainerSettings`` says what they mean."""
-
-    @property
-    def centre_m(self) -> tuple[float, float, float] | None: ...
-    @property
-    def radius_m(self) -> float | None: ...
-    @property
-    def near_m(self) -> float | None: ...
-    @property
-    def contracted(self) -> bool | None: ...
-    @property
-    def background(self) -> str: ...
-    @property
-    def refuse_beyond(self) -> float: ...
-
-
-class PixelRenderer(Protocol):
-    """Renders single pixels, as ``RaySnapshot`` does: color (N, 3), depth (N,) in metres and opacity (N,) at
-    image points (N, 2)."""
-
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +55,7 @@ class PackedUpdate:
 class ViewStore:
     """The newest view of each camera of one field, and what follows from them."""
 
-    def __init__(self, settings: ViewStoreSettings) -> None:
+    def __init__(self, settings: FieldSettings) -> None:
         self.settings = settings
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}
@@ -123,7 +100,7 @@ class ViewStore:
         )
 
     def without_outliers(
-        self, views: Sequence[View], update: PackedUpdate, step: int, field: PixelRenderer
+        self, views: Sequence[View], update: PackedUpdate, step: int, field: PixelSnapshot
     ) -> Views:
         """``update.data`` without the views that contradict ``field``, which has learned for ``step`` steps.
         Pictures that were known already are not judged again."""

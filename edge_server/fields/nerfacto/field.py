@@ -7,20 +7,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, RaySampling
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.model_layout import init_net, make_grid
-from edge_server.fields.common.ray_snapshot import RaySnapshot
-from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.ray_snapshot import Pixels, RaySnapshot, run_by_pixel
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
@@ -28,7 +25,7 @@ from edge_server.fields.nerfacto.appearance import CameraAppearance
 from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling, scatter_proposal
 from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, render_with_proposal
 from edge_server.fields.nerfacto.kernels.train import ProposalGradients, ProposalScratch, train_with_proposal
-from edge_server.fields.nerfacto.settings import NerfactoSettings, make_settings
+from edge_server.fields.nerfacto.settings import NerfactoSettings
 from freshfield.geometry import Pinhole
 
 
@@ -39,40 +36,17 @@ class NerfactoSnapshot(RaySnapshot):
     sampling: ProposalSampling
 
     def render_pixels(
-        self,
-        camera_to_world: NDArray[np.float64],
-        intrinsics: Pinhole,
-        pixels: NDArray[np.float64],
-        max_samples: int | None = None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
-        pose = np.asarray(camera_to_world, dtype=np.float64)
-        n, workers = len(pixels), self.pool.threads
-        color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-        opacity = np.empty(n, np.float32)
-        samples = min(self.sampling.samples, max_samples or self.sampling.samples)
-        self.pool.run(
-            render_with_proposal,
-            np.array(lens_row(intrinsics), dtype=np.float64),
-            np.ascontiguousarray(pose[:3, :3]),
-            self.box.normalise(pose[:3, 3]),
-            np.ascontiguousarray(pixels, dtype=np.float64),
-            self.sampling._replace(samples=samples),
-            self.space,
-            self.encoding,
-            self.levels,
-            self.net,
-            self.harmonics,
-            self.background,
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> Pixels:
+        """See ``PixelSnapshot``."""
+        workers = self.pool.threads
+        return run_by_pixel(
+            self.pool, render_with_proposal, self.box, camera_to_world, intrinsics, pixels,
+            self.sampling, self.space, self.encoding, self.levels, self.net, self.harmonics, self.background,
             np.empty((workers, int(self.net.widths.sum()), SAMPLE_BATCH), np.float32),
             np.empty((workers, 3, SAMPLE_BATCH), np.float32),
             np.empty((workers, 3, SAMPLE_BATCH), np.float32),
-            color,
-            depth,
-            opacity,
-        )
-        depth *= np.float32(self.box.radius_m)
-        return color, depth, opacity
+        )  # fmt: skip
 
 
 class NerfactoField(TrainedField):
@@ -165,9 +139,4 @@ class NerfactoField(TrainedField):
         return NerfactoSnapshot(**known, sampling=self._sampling())
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``nerfacto.settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("nerfacto: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return NerfactoField(settings)
+make = NerfactoField

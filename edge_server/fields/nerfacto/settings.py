@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from edge_server.fields.common.trainer_settings import HashGridSettings, help_of, option, settings_from
+from edge_server.fields.common.trainer_settings import HashGridSettings, option
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,6 @@ class NerfactoSettings(HashGridSettings):
     even: float = option(0.4, "share of a ray's samples that is allocated uniformly")
     anneal: int = option(40, "steps over which that share falls from 1, while the proposal is untrained")
     smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
-    device: str = option("auto", "cpu or auto: it runs on CPUs only")
     appearance: int = option(0, "numbers learned for each camera's appearance (exposure, tint); 0: none")
 
     def __post_init__(self) -> None:
@@ -50,6 +49,7 @@ class NerfactoSettings(HashGridSettings):
         super().__post_init__()
 
 
+SETTINGS = NerfactoSettings
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 16,
             "samples_start": 16},
@@ -57,13 +57,3 @@ EFFORTS: dict[str, dict[str, Any]] = {
     "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 32,
              "samples_start": 32, "bins": 128},
 }  # fmt: skip
-
-
-def make_settings(options: dict[str, Any], seed: int = 0) -> NerfactoSettings:
-    """Settings from plain options: see ``trainer_settings.settings_from``."""
-    return settings_from(NerfactoSettings, EFFORTS, options, seed)
-
-
-def help_text() -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
-    return help_of(NerfactoSettings)

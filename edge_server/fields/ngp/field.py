@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
-from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings, make_settings
+from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 
 assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments"
 
@@ -59,13 +58,9 @@ class NgpField(TrainedField):
             )
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``ngp.settings``). Only ``device: cuda`` takes a GPU.
-
-    Raises ValueError for a wrong option, and for ``cuda`` where torch finds no such device or where another
-    option exists in the kernels alone.
-    """
-    settings = make_settings(options, seed)
+def make(settings: NgpSettings) -> Field:
+    """A field. Only ``device: cuda`` takes a GPU. ValueError for ``cuda`` where torch finds no such device or
+    where another option exists in the kernels alone."""
     if settings.device == "cuda":
         from edge_server.fields.ngp.torch_field import NgpTorchField  # torch is imported only here
 

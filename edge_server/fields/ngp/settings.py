@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from edge_server.fields.common.trainer_settings import HashGridSettings, help_of, settings_from
+from edge_server.fields.common.trainer_settings import HashGridSettings
 
 STATE_SHAPE = (
     "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
@@ -19,20 +19,12 @@ class NgpSettings(HashGridSettings):
     """What can be chosen about an ``NgpField``. Lengths in meters; None means: found from the cameras."""
 
     name = "ngp"
+    has_cuda = True
 
 
+SETTINGS = NgpSettings
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 96},
     "medium": {},
     "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
 }
-
-
-def make_settings(options: dict[str, Any], seed: int = 0) -> NgpSettings:
-    """Settings from plain options: see ``trainer_settings.settings_from``."""
-    return settings_from(NgpSettings, EFFORTS, options, seed)
-
-
-def help_text() -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
-    return help_of(NgpSettings)

@@ -7,27 +7,28 @@ options in ``KERNEL_OPTIONS`` are refused; ``smooth`` and an automatic depth gui
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.fields import Budget, FitReport, Rendering, View
-from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
+from edge_server.fields import Budget, View
+from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.rays import HORIZON, Views
 from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.occupancy_grid import EVERY, FADE, OccupancyGrid
-from edge_server.fields.common.ray_snapshot import surface_points
+from edge_server.fields.common.ray_snapshot import Pixels, PixelSnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
-from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.common.stepped_field import Step, SteppedField
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
     BETA2,
@@ -38,7 +39,7 @@ from edge_server.fields.common.training_schedule import (
     step_key,
     step_length,
 )
-from edge_server.fields.common.view_store import Arrays, ViewStore
+from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 from edge_server.fields.ngp.torch_model import (
     TorchGrid,
@@ -52,7 +53,7 @@ from edge_server.fields.ngp.torch_model import (
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
-KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "near_fade", "depth_guide")  # not implemented here
+KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "depth_guide")  # not implemented here
 
 
 def unsupported_options(settings: NgpSettings) -> tuple[str, ...]:
@@ -78,8 +79,9 @@ def cuda_present() -> bool:
 
 
 @dataclass(frozen=True)
-class TorchModel:
-    """Parameters of one instant and how to sample them; occupied: uint8 (cells, cells, cells), z first."""
+class TorchSnapshot(PixelSnapshot):
+    """``RaySnapshot`` of a torch field. occupied: uint8 (cells, cells, cells), z first. step_length: in scene
+    units."""
 
     settings: NgpSettings
     box: SceneBox
@@ -89,13 +91,20 @@ class TorchModel:
     net: Tensor
     occupied: Tensor
     background: Tensor
-    step: float  # scene units
+    step_length: float
+    cameras: tuple[View, ...]
+    step: int
+
+    def copied(self) -> TorchSnapshot:
+        """See ``stepped_field.StepSnapshot``."""
+        grid = replace(self.grid, table=self.grid.table.detach().clone())
+        return replace(self, grid=grid, net=self.net.detach().clone())
 
     def march(self, o: Tensor, d: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Origins and directions (R, 3), jitter (R,) -> t, delta (R, S), unit-cube points (R, S, 3) and
         which of them lie in occupied cells (R, S): ``kernels.rays.march`` without skipping."""
         box, s = self.box, self.settings
-        step = self.step
+        step = self.step_length
         half = HORIZON if box.contracted else 1.0
         safe = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
         a, b = (-half - o) / safe, (half - o) / safe
@@ -134,8 +143,8 @@ class TorchModel:
     @torch.no_grad()
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
+    ) -> Pixels:
+        """See ``PixelSnapshot``."""
         device, pose = self.net.device, np.asarray(camera_to_world, dtype=np.float64)
         rays = (intrinsics.rays(pixels) @ pose[:3, :3].T).astype(np.float32)
         origin = self.box.normalise(pose[:3, 3]).astype(np.float32)
@@ -155,122 +164,50 @@ class TorchModel:
         return color_, depth_, opacity_
 
 
-@dataclass(frozen=True)
-class TorchSnapshot:
-    """``RaySnapshot`` of a torch field."""
-
-    model: TorchModel
-    cameras: tuple[View, ...]
-
-    def at(self, present_ns: int) -> TorchSnapshot:
-        """Itself: nothing in it is known to move."""
-        return self
-
-    def render(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, max_samples: int | None = None
-    ) -> Rendering:
-        """Render a camera; max_samples is ignored."""
-        w, h = intrinsics.width, intrinsics.height
-        v, u = np.mgrid[0:h, 0:w]
-        pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
-        color, depth, opacity = self.model.render_pixels(camera_to_world, intrinsics, pixels)
-        return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """As ``RaySnapshot.points``."""
-        return surface_points(self.model, self.cameras, count)
-
-
-class NgpTorchField:
+class NgpTorchField(SteppedField[TorchSnapshot]):
     """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
-    frame_s = None
-    most_pixels = None
+    name = NgpSettings.name
+    shape = STATE_SHAPE
+    settings: NgpSettings
 
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
-        self.settings = settings or NgpSettings()
-        if missing := unsupported_options(self.settings):
+        settings = settings or NgpSettings()
+        if missing := unsupported_options(settings):
             raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
         self.device = device
         if self.device.startswith("cuda") and not cuda_present():
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use device cpu")
-        self.pool = shared_pool(self.settings.threads, self.settings.nice)
-        self._lock = threading.RLock()
-        self.now = time.perf_counter  # the clock of budgets in seconds
-        self.reset()
+        super().__init__(settings)
 
-    def reset(self) -> None:
-        with self._lock:
-            self.view_store, self.dropped = ViewStore(self.settings), 0
-            self._forget_parameters()
-
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        step_budget, losses, samples, dropped = StepBudget(budget, self.now), [0.0], 0, 0
+    def _begin_fit(
+        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
+    ) -> tuple[Step, int, int]:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
                 self._forget_parameters()
             if update.visibility_changed:
                 self._occupancy.recount_views(self.pool, self.view_store)
-            data = self.view_store.without_outliers(views, update, self.step, self._model())
-        while (progress := step_budget.begin_step(self._step_timer)) is not None:
-            with self._lock:
-                loss, used, bad = self._one_step(data, progress)
-            losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
-            step_budget.end_step()
-        self.dropped += dropped
-        rays = step_budget.steps * self.settings.rays
-        refused = self.view_store.refused_among(views)
-        return FitReport(
-            step_budget.steps,
-            step_budget.elapsed_s(),
-            float(np.mean(losses)),
-            rays,
-            samples,
-            dropped,
-            refused,
-        )
+            data = self.view_store.without_outliers(views, update, self.step, self._live())
+        return partial(self._one_step, data), 0, 0
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        return self.snapshot().render(camera_to_world, intrinsics)
+    def _run_kernels(self, pool: Pool) -> None:
+        """Nothing to compile."""
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return self.snapshot().points(count)
+    def _counters(self) -> dict[str, Any]:
+        counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
+        return {**counters, "needed": self._occupancy.needed}
 
-    def snapshot(self, present_ns: int | None = None) -> TorchSnapshot:
-        with self._lock:
-            model = self._model()
-            grid = replace(model.grid, table=model.grid.table.detach().clone())
-            model = replace(model, grid=grid, net=model.net.detach().clone())
-            return TorchSnapshot(model, self.view_store.views)
-
-    def warm_up(self) -> float:
-        """Nothing to compile: 0 seconds."""
-        return 0.0
-
-    def state(self) -> Arrays:
-        with self._lock:
-            counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
-            counters["needed"] = self._occupancy.needed
-            return pack_state(NgpSettings.name, self.settings, self.view_store, counters, self._arrays())
-
-    def load_state(self, state: Arrays) -> None:
-        with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, NgpSettings.name, STATE_SHAPE)
-            self.view_store = ViewStore(self.settings)
-            self.view_store.load(meta, state)
-            self._forget_parameters()
-            arrays = {name: array.copy() for name, array in self._arrays().items()}
-            load_arrays(arrays, state)
-            for name, tensor in self._tensors().items():
-                tensor.copy_(torch.as_tensor(arrays[name]))
-            for name in ("density", "seen", "occupied"):
-                getattr(self._occupancy, name)[...] = arrays[name]
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.update_occupied()
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        arrays = {name: array.copy() for name, array in self._arrays().items()}
+        load_arrays(arrays, state)
+        for name, tensor in self._tensors().items():
+            tensor.copy_(torch.as_tensor(arrays[name]))
+        for name in ("density", "seen", "occupied"):
+            getattr(self._occupancy, name)[...] = arrays[name]
+        self._updates, self._occupancy.needed = int(meta["updates"]), int(meta["needed"])
+        self._occupancy.update_occupied()
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -286,18 +223,21 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
-        self._step_timer = StepTimer()
+        self._snapshot = None
+        self._step_time = StepTimer()
         self._grid = to_torch(make_grid(self.settings, self.view_store.box, rng), self.device)
         net = init_net(FEATURES * self.settings.levels, self.settings, rng)
         self._widths = net.widths.tolist()
         self._net = torch.as_tensor(net.params, device=self.device)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in (self._grid.table, self._net)]
-        self._occupancy: OccupancyGrid = OccupancyGrid.for_box(self.settings, self.view_store.box)
+        self._occupancy: OccupancyGrid = OccupancyGrid.for_box(
+            self.settings.cells, self.settings.min_views, self.view_store.box
+        )
 
-    def _model(self) -> TorchModel:
+    def _live(self) -> TorchSnapshot:
         o, s = self._occupancy, self.settings
         occupied = torch.as_tensor(o.occupied, device=self.device).view(s.cells, s.cells, s.cells)
-        return TorchModel(
+        return TorchSnapshot(
             settings=s,
             box=self.view_store.box or UNIT_BOX,
             grid=self._grid,
@@ -306,23 +246,25 @@ class NgpTorchField:
             net=self._net,
             occupied=occupied,
             background=torch.as_tensor(self.view_store.background(), device=self.device),
-            step=step_length(s, self.step),
+            step_length=step_length(s, self.step),
+            cameras=self.view_store.views,
+            step=self.step,
         )
 
-    def _one_step(self, data: Views, progress: float) -> tuple[float, int, int]:
-        s, box, model = self.settings, self.view_store.box, self._model()
+    def _one_step(self, data: Views, progress: float) -> tuple[float, int, int, int]:
+        s, box, model = self.settings, self.view_store.box, self._live()
         assert box is not None
         rng = np.random.default_rng(int(step_key(s.seed, self.step)))
         if self.step % EVERY == 0:
             self._refresh(model, rng)
-            model = self._model()
+            model = self._live()
         o, d, target, background, weight = self._draw(data, rng)
         jitter = torch.as_tensor(rng.random(len(d), dtype=np.float32), device=self.device)
         table = self._grid.table.requires_grad_(True)
         net = self._net.requires_grad_(True)
         t, delta, u, inside = model.march(o, d, jitter)
         sigma, color = model.query(d, u, inside)
-        error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
+        error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion)
         error, loss = error * weight, loss * weight
         good = torch.isfinite(error)
         with _deterministic():
@@ -336,8 +278,8 @@ class NgpTorchField:
                 bad += self._adam(p, m, v, scale, rate, decay)
         self._grid.table.requires_grad_(False)
         self._net.requires_grad_(False)
-        used = int(inside.sum())
-        return error[good].mean().item() / 3.0 if bool(good.any()) else 0.0, used, bad
+        mean = error[good].mean().item() / 3.0 if bool(good.any()) else 0.0
+        return mean, s.rays, int(inside.sum()), bad
 
     def _adam(self, p: Tensor, m: Tensor, v: Tensor, scale: float, rate: float, decay: float) -> int:
         """``kernels.adam``: entries without gradient, or with one that is not finite, stay as they are."""
@@ -385,7 +327,7 @@ class NgpTorchField:
         return o, d, wanted, behind, counts
 
     @torch.no_grad()
-    def _refresh(self, model: TorchModel, rng: np.random.Generator) -> None:
+    def _refresh(self, model: TorchSnapshot, rng: np.random.Generator) -> None:
         o, cells = self._occupancy, self.settings.cells
         k, j, i = np.meshgrid(*[np.arange(cells)] * 3, indexing="ij")
         corner = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=-1)

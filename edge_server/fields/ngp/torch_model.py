@@ -100,17 +100,14 @@ def ray_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
 
 def ray_losses(
     sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor,
-    distortion: float, sparsity: float,
+    distortion: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Color errors (R,) and losses (R,) of rays with samples (R, S): 3.22, mip-NeRF 360's distortion
-    loss, and optical depth of what is seen."""
+    """Color errors (R,) and losses (R,) of rays with samples (R, S): 3.22 and mip-NeRF 360's distortion
+    loss."""
     weight, left = ray_weights(sigma, delta)
     rendered = (weight[..., None] * color).sum(dim=1) + left[:, None] * background
     error = (rendered - target).square().sum(dim=-1)
     apart = (t[:, :, None] - t[:, None, :]).abs()
     spread = (weight[:, :, None] * weight[:, None, :] * apart).sum(dim=(1, 2))
     spread = spread + (weight.square() * delta).sum(dim=-1) / 3.0
-    depth = (sigma * delta).cumsum(dim=-1)
-    seen = torch.nn.functional.pad(depth, (1, 0))[:, :-1] <= OPAQUE_DEPTH
-    optical = torch.where(seen, sigma * delta, torch.zeros_like(sigma)).sum(dim=-1)
-    return error, error + distortion * spread + sparsity * optical
+    return error, error + distortion * spread

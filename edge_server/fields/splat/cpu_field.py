@@ -9,8 +9,6 @@ Adam step (``kernels.optimizer_step``). From time to time Gaussians are split an
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -18,18 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, FitReport, Rendering, View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.fair_lock import FairLock
-from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import UNIT_BOX
+from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views, without_views
-from edge_server.fields.common.threads.precompile import compile_ahead
-from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import BETA1, BETA2, StepBudget, StepTimer, step_key
 from edge_server.fields.common.view_outliers import LEAST_VIEWS, refuse, usual_error
-from edge_server.fields.common.view_store import SETTLED_STEPS, Arrays, ViewStore, same_views
+from edge_server.fields.common.view_store import SETTLED_STEPS, Arrays, same_views
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, adam_step, clamp_gaussians
@@ -57,92 +53,40 @@ TRACKING_SHARE = 0.35  # largest share of an update that tracks what moved
 CHANGED_SLOTS = 4  # largest number of views whose changed tiles one step trains on
 
 
-class SplatField:
-    """Gaussians that learn while they are in use. See ``fields.Field`` for the protocol.
+class SplatField(SteppedField[SplatSnapshot]):
+    """Gaussians that learn while they are in use. See ``SteppedField``."""
 
-    Call ``fit`` from one thread only. Other threads may call ``render``, ``snapshot`` and ``points``
-    meanwhile: these wait for the end of the current step, a few milliseconds.
-    """
-
-    frame_s = None
-    most_pixels = None
+    name = "splat"
+    shape = ("harmonics",)
+    settings: SplatSettings
+    _now_ns: int | None  # the instant of the Gaussians' parameters
+    _given: tuple[View, ...]  # views of the last fit; they survive ``load_state``
+    _refused: set[str]  # cameras whose newest view is refused
+    _unsure: set[str]  # cameras whose newest view follows a refused one
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
-        self.settings = settings or SplatSettings()
-        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
+        s = settings or SplatSettings()
         age = np.maximum(np.arange(_AGES), 1)
-        decay = np.maximum(np.minimum(self.settings.settle_after / age, 1.0), self.settings.rate_settled)
+        decay = np.maximum(np.minimum(s.settle_after / age, 1.0), s.rate_settled)
         corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), decay], axis=-1)
         self._corrections = corrections.astype(np.float32)
-        self._lock = FairLock()
-        self.now = time.perf_counter  # the clock of budgets in seconds
-        self._now_ns: int | None = None  # the instant of the Gaussians' parameters
-        self._snapshot: SplatSnapshot | None = None
-        self._given: tuple[View, ...] = ()  # views of the last fit; they survive ``load_state``
-        self._refused: set[str] = set()  # cameras whose newest view is refused
-        self._unsure: set[str] = set()  # cameras whose newest view follows a refused one
-        self.reset()
+        super().__init__(s, pool)
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def reset(self) -> None:
-        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._lock:
-            self.dropped = 0
-            self.view_store = ViewStore(self.settings)
-            self._clear_gaussians()
-
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train the current Gaussians on ``views``. ValueError: a view is invalid.
-
-        New views are ingested first, however short the budget is, and Gaussians are seeded where something
-        moved. With a budget in seconds, no step begins that would end too late if it took the usual time.
-        Learning rates decay over the budget, so that every fit ends with a settled field.
-        """
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = StepBudget(budget, self.now)
-        rays = samples = dropped = 0
-        losses: deque[float] = deque(maxlen=32)
+    def _begin_fit(
+        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
+    ) -> tuple[Step, int, int]:
         with self._lock:
             change = self._ingest(views)
-        if change is not None:
-            rays, samples = self._follow_motion(change, pace, self._tracking_steps(budget))
-        while (progress := pace.begin_step(self._step_time)) is not None:
-            with self._lock:
-                loss, seen, pairs, lost = self._one_step(progress)
-            if loss is not None:
-                losses.append(loss)
-            rays, samples, dropped = rays + seen, samples + pairs, dropped + lost
-            pace.end_step()
-        self.dropped += dropped
-        refused = tuple(v.camera for v in views if v.camera in self._refused)
-        loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.elapsed_s(), loss, rays, samples, dropped=dropped, refused=refused)
+        if change is None:
+            return self._one_step, 0, 0
+        return self._one_step, *self._follow_motion(change, step_budget, self._tracking_steps(budget))
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """Render the current Gaussians from a camera."""
-        return self.snapshot().render(camera_to_world, intrinsics)
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world meters and their colors; none before the first fit."""
-        return self.snapshot().points(count)
-
-    def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
-        """An immutable copy that renders from any thread. present_ns: the instant to which moving Gaussians
-        are extrapolated."""
-        with self._lock:
-            if self._snapshot is None or self._snapshot.step != self.step:
-                live = self._live()
-                copies = live.gaussians._replace(
-                    params=live.gaussians.params.copy(), velocity=live.gaussians.velocity.copy()
-                )
-                self._snapshot = replace(live, gaussians=copies)
-            known = self._snapshot
-        return known if present_ns is None else known.at(present_ns)
+    def _refused_among(self, views: Sequence[View]) -> tuple[str, ...]:
+        return tuple(v.camera for v in views if v.camera in self._refused)
 
     def _live(self) -> SplatSnapshot:
-        """A snapshot of the arrays in use, not copied, for a thread that holds the lock."""
         return SplatSnapshot(
             box=self.view_store.box or UNIT_BOX,
             gaussians=self.cloud.gaussians(),
@@ -154,16 +98,7 @@ class SplatField:
             planar=self.settings.planar,
         )
 
-    def warm_up(self) -> float:
-        """Compile every kernel, or load it from numba's cache, ahead of its use; returns the seconds taken.
-
-        Works on small fields of its own, without touching this one, in the calling thread and at its
-        priority: at the workers' low priority, compiling on a busy machine would take minutes.
-        """
-        return compile_ahead(self._run_kernels)
-
     def _run_kernels(self, pool: Pool) -> None:
-        """Run every kernel once."""
         tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
         camera = Pinhole.from_fov(32, 32, 60.0)
         pose = np.eye(4)
@@ -178,37 +113,30 @@ class SplatField:
 
     # --- state --------------------------------------------------------------------------------
 
-    def state(self) -> Arrays:
-        """Everything needed to resume bit for bit: Gaussians, moments, cameras, counters."""
-        with self._lock:
-            counters = {
-                "step": self.step, "grown": self._grown, "dropped": self.dropped,
-                "now_ns": self._now_ns, "given": [v.camera for v in self._given],
-                "refused": sorted(self._refused), "unsure": sorted(self._unsure),
-                "reseeded": self._reseeded, "unjudged": sorted(self._unjudged), "errors": self._errors,
-            }  # fmt: skip
-            cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
-            return pack_state("splat", self.settings, self.view_store, counters, cloud)
+    def _counters(self) -> dict[str, Any]:
+        return {
+            "step": self.step, "grown": self._grown, "dropped": self.dropped,
+            "now_ns": self._now_ns, "given": [v.camera for v in self._given],
+            "refused": sorted(self._refused), "unsure": sorted(self._unsure),
+            "reseeded": self._reseeded, "unjudged": sorted(self._unjudged), "errors": self._errors,
+        }  # fmt: skip
 
-    def load_state(self, state: Arrays) -> None:
-        """Resume from ``state``. ValueError: it is not a state of a field of this shape."""
-        with self._lock, all_or_nothing(self):
-            meta, cloud = _unpack(self.settings, state)
-            self.view_store = ViewStore(self.settings)
-            self.view_store.load(meta, state)
-            self._clear_gaussians()
-            self.cloud = cloud
-            self.step, self._grown, self.dropped = (int(meta[k]) for k in ("step", "grown", "dropped"))
-            self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
-            self._given = tuple(self.view_store.memory[camera].view for camera in meta.get("given", ()))
-            self._refused, self._unsure = (set(meta.get(key, ())) for key in ("refused", "unsure"))
-            self._unjudged.update(meta.get("unjudged", ()))
-            self._errors.update(meta.get("errors", {}))
-            self._reseeded = int(meta.get("reseeded", 0))
+    def _arrays(self) -> Arrays:
+        return {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
+
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        self.cloud = _gaussians_of(self.settings, state)
+        self._grown = int(meta["grown"])
+        self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
+        self._given = tuple(self.view_store.memory[camera].view for camera in meta.get("given", ()))
+        self._refused, self._unsure = (set(meta.get(key, ())) for key in ("refused", "unsure"))
+        self._unjudged.update(meta.get("unjudged", ()))
+        self._errors.update(meta.get("errors", {}))
+        self._reseeded = int(meta.get("reseeded", 0))
 
     # --- inside -------------------------------------------------------------------------------
 
-    def _clear_gaussians(self) -> None:
+    def _forget_parameters(self) -> None:
         self.step = 0
         self._grown = 0  # step of the last splitting and pruning
         self._step_time, self._tracking_time, self._reseed_time = StepTimer(), StepTimer(), StepTimer()
@@ -238,7 +166,7 @@ class SplatField:
             known = _equal(views, self._given)  # decoded again, or the first views after ``load_state``
             intake = self.view_store.add(views)
             if intake.box_changed:
-                self._clear_gaussians()
+                self._forget_parameters()
             assert self.view_store.box is not None
             now_ns = max(v.shows_ns for v in views)
             elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
@@ -361,17 +289,7 @@ class SplatField:
         if moving and int(key) * 2.0**-64 < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
             return some, [self._changed[k] for k in some]
-        if s.tile_share >= 1.0:
-            return picked, [None] * slots
-        rng = self._rng(3)
-        wanted: list[NDArray[np.uint8] | None] = []
-        for k in picked:
-            size = self._data.size[k]
-            total = int(-(-size[0] // TILE) * -(-size[1] // TILE))
-            mask = np.zeros(total, np.uint8)
-            mask[rng.permutation(total)[: max(int(s.tile_share * total), 1)]] = 1
-            wanted.append(mask)
-        return picked, wanted
+        return picked, [None] * slots
 
     def _one_step(self, progress: float) -> tuple[float | None, int, int, int]:
         """One optimizer step at ``progress`` of the fit, in [0, 1].
@@ -506,9 +424,8 @@ class SplatField:
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], GaussianCloud]:
-    """The metadata and the Gaussians in ``state``. ValueError: they do not fit ``settings``."""
-    meta = unpack_meta(settings, state, "splat", ("harmonics",))
+def _gaussians_of(settings: SplatSettings, state: Arrays) -> GaussianCloud:
+    """The Gaussians in ``state``. ValueError: they do not fit ``settings``."""
     empty = GaussianCloud.empty(settings)
     count = len(state["params"]) if "params" in state else 0
     arrays = {}
@@ -520,7 +437,7 @@ def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Gau
         arrays[f.name] = np.array(state[f.name])
     if count > settings.gaussians:
         raise ValueError(f"the state has {count} Gaussians, this field holds {settings.gaussians} at most")
-    return meta, GaussianCloud(**arrays)
+    return GaussianCloud(**arrays)
 
 
 def _equal(a: Sequence[View], b: Sequence[View]) -> bool:

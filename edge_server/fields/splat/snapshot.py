@@ -47,6 +47,11 @@ class SplatSnapshot:
         ahead_s = min(max(ahead_s, 0.0), MAX_AHEAD_S)
         return self if ahead_s == self.ahead_s else replace(self, ahead_s=ahead_s)
 
+    def copied(self) -> SplatSnapshot:
+        """See ``stepped_field.StepSnapshot``."""
+        params, velocity = self.gaussians.params.copy(), self.gaussians.velocity.copy()
+        return replace(self, gaussians=self.gaussians._replace(params=params, velocity=velocity))
+
     @cached_property
     def shown(self) -> Gaussians:
         """The Gaussians at the instant that is rendered."""

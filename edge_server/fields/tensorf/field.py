@@ -6,12 +6,9 @@ get finer during training (section 4.4 of the paper).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Field
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
@@ -22,10 +19,9 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     MODES,
     ROWS,
     Planes,
-    regularize,
     scatter_planes,
 )
-from edge_server.fields.tensorf.settings import TensorfSettings, make_settings
+from edge_server.fields.tensorf.settings import TensorfSettings
 
 assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"
 
@@ -75,13 +71,10 @@ class TensorfField(TrainedField):
         self._table_m, self._table_v = tables[1:]
 
     def _gather(self, levels: int, scale: float) -> None:
-        s, batch, planes = self.settings, self._batch, self._encoding
+        batch, planes = self._batch, self._encoding
         self.pool.run(
             scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
         )
-        if s.smooth or s.sparse:
-            weights = np.float32(s.smooth / scale), np.float32(s.sparse / scale)
-            self.pool.run(regularize, planes, *weights, self._table_g, self._dirty)
 
 
 def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:
@@ -120,9 +113,4 @@ def _rows(size: int) -> int:
     return -(-size * (size + 1) // ROWS) * ROWS
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``tensorf.settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("tensorf: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return TensorfField(settings)
+make = TensorfField

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from edge_server.fields.common.trainer_settings import TrainerSettings, help_of, option, settings_from
+from edge_server.fields.common.trainer_settings import TrainerSettings, option
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,6 @@ class TensorfSettings(TrainerSettings):
     rate_net: float = option(4e-2, "learning rate of the network at the start of a fit")
     epsilon: float = option(1e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     decay: float = option(0.0, "pull of planes and lines towards zero, per step and rate")
-    smooth: float = option(0.0, "weight of the planes' total variation")
-    sparse: float = option(0.0, "weight of the absolute values of the density's factors")
     first: float = option(0.1, "standard deviation of the factors' initial values")
 
     def __post_init__(self) -> None:
@@ -35,34 +33,20 @@ class TensorfSettings(TrainerSettings):
             ("first", 1e-4, 1.0),
             ("rate", 0.0, 10.0),
             ("decay", 0.0, 1e3),
-            ("smooth", 0.0, 1e3),
-            ("sparse", 0.0, 1e3),
+            ("resolution", 4, 1024),
         )
         for rank in ("density_rank", "color_rank"):
             if getattr(self, rank) % 8:
                 raise ValueError(f"tensorf: {rank} must be a multiple of 8, not {getattr(self, rank)}")
-        if self.resolution is not None:
-            self._within(("resolution", 4, 1024))
         if list(self.upsample) != sorted(set(self.upsample)) or any(step < 1 for step in self.upsample):
             raise ValueError(f"tensorf: upsample must be rising step numbers, not {list(self.upsample)}")
         super().__post_init__()
 
 
+SETTINGS = TensorfSettings
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"color_rank": 8, "resolution": 96, "hidden": 16, "batch_samples": 8192, "samples": 96},
     "medium": {},
     "high": {"density_rank": 16, "color_rank": 24, "hidden": 64, "batch_samples": 32768, "rays": 8192,
              "samples": 256},
 }  # fmt: skip
-
-
-def make_settings(options: dict[str, Any], seed: int = 0) -> TensorfSettings:
-    """Settings from plain options: see ``trainer_settings.settings_from``."""
-    if options.get("upsample") is not None:
-        options = {**options, "upsample": tuple(int(step) for step in options["upsample"])}
-    return settings_from(TensorfSettings, EFFORTS, options, seed)
-
-
-def help_text() -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
-    return help_of(TensorfSettings)

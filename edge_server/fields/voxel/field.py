@@ -8,8 +8,6 @@ grid gets finer during training; rays skip empty cells.
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,17 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.common.fair_lock import FairLock
-from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
+from edge_server.fields import Budget, View
+from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.occupancy_grid import EMPTY, OccupancyGrid
 from edge_server.fields.common.scene_box import PLAIN, UNIT_BOX
-from edge_server.fields.common.threads.precompile import compile_ahead
-from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
+from edge_server.fields.common.stepped_field import Step, SteppedField
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key
-from edge_server.fields.common.view_store import Arrays, ViewStore
+from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.voxel.kernels.rays import SEGMENT, SkipGrid, Voxels, train_rays
 from edge_server.fields.voxel.kernels.update import (
     MAX_DENSITY,
@@ -41,9 +38,8 @@ from edge_server.fields.voxel.kernels.update import (
     upsample_grid,
     voxel_adam,
 )
-from edge_server.fields.voxel.settings import VoxelSettings, make_settings, sizes_of
+from edge_server.fields.voxel.settings import VoxelSettings, sizes_of
 from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_ray_scratch
-from freshfield.geometry import Pinhole
 
 OCCUPANCY_PHASES = 4  # refreshes until every cell has been refreshed
 EVERY = 5  # steps between refreshes of the occupancy
@@ -51,45 +47,24 @@ DIFFUSE_PHASES = 4  # steps in which all layers diffuse once, so that each step 
 FADE = 0.75  # of a cell's density at each refresh
 BETA2 = 0.95  # Adam's memory in steps that touch a vertex: a fit has a hundred of them, not thousands
 WARM_START_SHARE = 1.5  # of the steps until the last grid size: later fits are warm starts
-SHAPE = ("sizes", "refine_at", "cells")  # options in which a state and the field that loads it agree
 
 
-class VoxelField:
-    """A grid that learns while it is used. See ``fields.Field`` for the protocol.
+class VoxelField(SteppedField[VoxelSnapshot]):
+    """A grid that learns while it is used. See ``SteppedField``."""
 
-    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
-    meanwhile: they wait for the end of the present step, some milliseconds.
-    """
-
-    frame_s = None
-    most_pixels = None
+    name = "voxel"
+    shape = ("sizes", "refine_at", "cells")
+    settings: VoxelSettings
 
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
-        self.settings = settings or VoxelSettings()
-        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
-        self._lock = FairLock()
-        self.now = time.perf_counter  # the clock of budgets in seconds
-        self.reset()
+        super().__init__(settings or VoxelSettings(), pool)
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def reset(self) -> None:
-        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._lock:
-            self.dropped = 0
-            self.view_store = ViewStore(self.settings)
-            self._snapshot: VoxelSnapshot | None = None
-            self._forget_parameters()
-
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train on ``views`` from the present grid. Raises ValueError for a view that cannot be one.
-
-        New images are always taken in, however short the budget. With a budget in seconds, no step begins
-        that would probably end too late. The learning rate falls over the budget.
-        """
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        step_budget, s = StepBudget(budget, self.now), self.settings
+    def _begin_fit(
+        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
+    ) -> tuple[Step, int, int]:
+        s = self.settings
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
@@ -108,43 +83,16 @@ class VoxelField:
             # The prior weakens with the number of viewpoints; a camera that stands still adds none.
             places = len(np.unique(data.origin, axis=0))
             diffuse_by = s.diffuse * min(s.diffuse_views / max(places, 1), 1.0)
-        rays = samples = dropped = 0
-        losses: deque[float] = deque(maxlen=32)
-        while (progress := step_budget.begin_step(self._step_timer)) is not None:
-            with self._lock:
-                decay = s.rate_end**progress * min(full / max(step_budget.steps, 1), 1.0)
-                losses.append(self._one_step(data, share * decay, diffuse_by))
-                rays += self.settings.rays
-                samples += int(self._samples.sum())
-                dropped += int(self._bad_rays.sum() + self._bad_gradients.sum())
-            step_budget.end_step()
-        self.dropped += dropped
-        loss = float(np.mean(losses)) if losses else 0.0
-        refused = self.view_store.refused_among(views)
-        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped, refused)
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """Render the current grid from a camera."""
-        return self.snapshot().render(camera_to_world, intrinsics)
+        def one_step(progress: float) -> tuple[float, int, int, int]:
+            decay = s.rate_end**progress * min(full / max(step_budget.steps, 1), 1.0)
+            loss = self._one_step(data, share * decay, diffuse_by)
+            dropped = int(self._bad_rays.sum() + self._bad_gradients.sum())
+            return loss, s.rays, int(self._samples.sum()), dropped
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world meters and their colors; none before the first fit."""
-        return self.snapshot().points(count)
-
-    def snapshot(self, present_ns: int | None = None) -> VoxelSnapshot:
-        """An immutable copy, which renders from any thread."""
-        with self._lock:
-            if self._snapshot is None or self._snapshot.step != self.step:
-                live = self._live()
-                self._snapshot = replace(
-                    live,
-                    voxels=live.voxels._replace(table=live.voxels.table.copy()),
-                    space=live.space._replace(clearance=live.space.clearance.copy()),
-                )
-            return self._snapshot
+        return one_step, 0, 0
 
     def _live(self) -> VoxelSnapshot:
-        """A snapshot that shares the field's arrays: valid until the next step."""
         return VoxelSnapshot(
             box=self.view_store.box or UNIT_BOX,
             voxels=self._voxels,
@@ -155,54 +103,25 @@ class VoxelField:
             step=self.step,
         )
 
-    def warm_up(self) -> float:
-        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
-
-        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
-        would make compiling on a busy machine take minutes. This field's state is not touched.
-        """
-        return compile_ahead(self._run_kernels)
-
-    def _run_kernels(self, pool: Pool) -> None:
-        """Run every kernel once."""
-        tiny = replace(
-            self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0, min_views=1
-        )
-        camera = Pinhole.from_fov(8, 8, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = VoxelField(replace(tiny, contracted=channels == 3), pool)
-            image = np.full((8, 8, channels), 128, np.uint8)
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=2))
-            field.render(pose, camera)
+    def _tiny(self) -> VoxelSettings:
+        return replace(self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0)
 
     # --- state --------------------------------------------------------------------------------
 
-    def state(self) -> Arrays:
-        """Everything needed to continue bit for bit: grid, moments, occupancy, cameras, counters."""
-        with self._lock:
-            counters = {
-                "step": self.step,
-                "updates": self._updates,
-                "dropped": self.dropped,
-                "needed": self._occupancy.needed,
-            }
-            return pack_state("voxel", self.settings, self.view_store, counters, self._arrays())
+    def _counters(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "updates": self._updates,
+            "dropped": self.dropped,
+            "needed": self._occupancy.needed,
+        }
 
-    def load_state(self, state: Arrays) -> None:
-        """Continue from ``state``. Raises ValueError if it is not a state of a field of this shape."""
-        with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, "voxel", SHAPE)
-            self.view_store = ViewStore(self.settings)
-            self.view_store.load(meta, state)
-            self._forget_parameters()
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self._grow(max(self.step - 1, 0))
-            load_arrays(self._arrays(), state)
-            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._update_clearance()
-            self._snapshot = None
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        self._updates = int(meta["updates"])
+        self._grow(max(self.step - 1, 0))
+        load_arrays(self._arrays(), state)
+        self._occupancy.needed = int(meta["needed"])
+        self._update_clearance()
 
     def _arrays(self) -> Arrays:
         return {
@@ -217,16 +136,18 @@ class VoxelField:
 
     def _forget_parameters(self) -> None:
         self.step = 0
-        self._snapshot = None  # only its step tells whether it is current
+        self._snapshot = None
         self._outline_views: tuple[Views, Views] | None = None  # of the last views: without and with alpha
         self._updates = 0  # optimizer steps that Adam's bias correction counts
-        self._step_timer = StepTimer()
+        self._step_time = StepTimer()
         s = self.settings
         self._sizes = sizes_of(s, self.view_store.box)
         table = _empty_grid(self._sizes[0])
         table[:] = (s.first, 0.5, 0.5, 0.5)
         self._set_grid(self._sizes[0], table)
-        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box, unknown=2.0 * EMPTY)
+        self._occupancy = OccupancyGrid.for_box(
+            s.cells, s.min_views, self.view_store.box, unknown=2.0 * EMPTY
+        )
         self._clearance = np.zeros(s.cells**3, np.uint8)
         self._ray_scratch = make_ray_scratch(self.pool.threads)
         self._samples, self._bad_rays = np.zeros(s.parts, np.int64), np.zeros(s.parts, np.int64)
@@ -371,9 +292,4 @@ def _empty_grid(size: int) -> NDArray[np.float32]:
     return np.zeros((-(-(size**3) // SEGMENT) * SEGMENT, 4), np.float32)
 
 
-def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``voxel_settings``). ValueError where CUDA is asked for."""
-    settings = make_settings(options, seed)
-    if settings.device == "cuda":
-        raise ValueError("voxel: runs on CPUs only; use device cpu or auto, or the field ngp")
-    return VoxelField(settings)
+make = VoxelField

@@ -8,24 +8,11 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.trainer_settings import (
-    TrainerSettings,
-    help_of,
-    option,
-    option_names,
-    settings_from,
-)
-
-# Inherited options of fields with a network, which this field lacks.
-_NOT_HERE = (
-    "hidden", "hidden_layers", "harmonics", "batch_samples", "samples", "samples_start", "samples_ramp",
-    "rate_net", "distortion", "sparsity", "near_fade", "exposure", "refine_m", "refine_deg",
-    "depth_guide", "guide_steps",
-)  # fmt: skip
+from edge_server.fields.common.trainer_settings import FieldSettings, option
 
 
 @dataclass(frozen=True)
-class VoxelSettings(TrainerSettings):
+class VoxelSettings(FieldSettings):
     """What can be chosen about a ``VoxelField``. Lengths in meters; None: found from the cameras."""
 
     name = "voxel"
@@ -41,7 +28,6 @@ class VoxelSettings(TrainerSettings):
     warm: float = option(0.3, "share of the rates in a fit that starts from a grid of its last size")
     soften: float = option(0.2, "largest optical depth of one step left where something moved")
     growth: float = option(20.0, "growth of density's rate with density x: times 1 + growth x")
-    epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     l1: float = option(0.003, "pull of density towards zero, in rates: empties what no image needs")
     outline: float = option(
         0.25, "weight of the error of opacity, where alpha or a plain background gives it"
@@ -59,12 +45,13 @@ class VoxelSettings(TrainerSettings):
     prune: float = option(0.2, "optical depth of one step below which a cell counts as empty")
     prune_from: int = option(15, "step from which empty cells are skipped and others diffuse")
     cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
-    device: str = option("auto", "cpu or auto: it runs on CPUs only")
     parts: int = option(2, "gradient buffers, the number of cores that train at once; results depend on it")
 
     def __post_init__(self) -> None:
         self._within(
             ("parts", 1, 64),
+            ("rays", 1, 1 << 20),
+            ("cells", 8, 256),
             ("first", 0.0, 4.0),
             ("rate", 0.0, 10.0),
             ("rate_color", 0.0, 10.0),
@@ -80,6 +67,8 @@ class VoxelSettings(TrainerSettings):
             ("prune_from", 0, 1 << 30),
             ("soften", 0.0, 4.0),
         )
+        if self.cells % 4:
+            raise ValueError(f"voxel: cells must be a multiple of 4, not {self.cells}")
         at = list(self.refine_at)
         if len(at) > 8:
             raise ValueError(f"voxel: refine_at has at most 8 step numbers, not {len(at)}")
@@ -94,6 +83,7 @@ class VoxelSettings(TrainerSettings):
         super().__post_init__()
 
 
+SETTINGS = VoxelSettings
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"sizes": (32, 64, 96), "refine_at": (15, 40)},
     "medium": {},
@@ -111,28 +101,3 @@ def sizes_of(settings: VoxelSettings, box: SceneBox | None) -> tuple[int, ...]:
     stages = len(settings.refine_at) + 1
     last = -(-int(np.clip(pixels, COARSEST, FINEST)) // 32) * 32
     return tuple(last * (k + 1) // stages for k in range(stages))
-
-
-def make_settings(options: dict[str, Any], seed: int = 0) -> VoxelSettings:
-    """Settings from plain options: see ``trainer_settings.settings_from``."""
-    valid = voxel_options()
-    if unknown := sorted(set(options) - {"effort", *valid}):
-        raise ValueError(f"voxel has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
-    given = dict(options)
-    for name in ("sizes", "refine_at"):
-        if given.get(name) is not None:
-            try:
-                given[name] = tuple(int(v) for v in given[name])
-            except (TypeError, ValueError):
-                raise ValueError(f"voxel: {name} must be a list like [32, 64], not {given[name]!r}") from None
-    return settings_from(VoxelSettings, EFFORTS, given, seed)
-
-
-def voxel_options() -> list[str]:
-    """The options that this field uses."""
-    return [name for name in option_names(VoxelSettings) if name not in _NOT_HERE]
-
-
-def help_text() -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
-    return help_of(VoxelSettings, voxel_options())

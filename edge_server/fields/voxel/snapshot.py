@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering, View
-from edge_server.fields.common.ray_snapshot import surface_points
+from edge_server.fields import View
+from edge_server.fields.common.ray_snapshot import Pixels, PixelSnapshot, run_by_pixel
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.voxel.kernels.rays import MAX_SAMPLES, RayScratch, SkipGrid, Voxels, render_rays
 from freshfield.geometry import Pinhole
@@ -26,7 +25,7 @@ def make_ray_scratch(workers: int) -> RayScratch:
 
 
 @dataclass(frozen=True)
-class VoxelSnapshot:
+class VoxelSnapshot(PixelSnapshot):
     """Grid, occupancy and cameras of one instant, never written after construction."""
 
     box: SceneBox
@@ -37,44 +36,16 @@ class VoxelSnapshot:
     pool: Pool
     step: int
 
-    def at(self, present_ns: int) -> VoxelSnapshot:
-        """Itself: nothing in it is known to move."""
-        return self
-
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture a camera at this pose would take."""
-        w, h = intrinsics.width, intrinsics.height
-        v, u = np.mgrid[0:h, 0:w]
-        pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
-        color, depth, opacity = self.render_pixels(camera_to_world, intrinsics, pixels)
-        return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
+    def copied(self) -> VoxelSnapshot:
+        """See ``stepped_field.StepSnapshot``."""
+        voxels = self.voxels._replace(table=self.voxels.table.copy())
+        return replace(self, voxels=voxels, space=self.space._replace(clearance=self.space.clearance.copy()))
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
-        pose = np.asarray(camera_to_world, dtype=np.float64)
-        n = len(pixels)
-        color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-        opacity = np.empty(n, np.float32)
-        self.pool.run(
-            render_rays,
-            np.array(lens_row(intrinsics), dtype=np.float64),
-            np.ascontiguousarray(pose[:3, :3]),
-            self.box.normalise(pose[:3, 3]),
-            np.ascontiguousarray(pixels, dtype=np.float64),
-            self.space,
-            self.voxels,
-            self.background,
-            make_ray_scratch(self.pool.threads),
-            color,
-            depth,
-            opacity,
-        )
-        depth *= np.float32(self.box.radius_m)
-        return color, depth, opacity
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` points (N, 3) in world meters, with colors (N, 3), where the known cameras' rays
-        meet a surface."""
-        return surface_points(self, self.cameras, count)
+    ) -> Pixels:
+        """See ``PixelSnapshot``."""
+        return run_by_pixel(
+            self.pool, render_rays, self.box, camera_to_world, intrinsics, pixels,
+            self.space, self.voxels, self.background, make_ray_scratch(self.pool.threads),
+        )  # fmt: skip

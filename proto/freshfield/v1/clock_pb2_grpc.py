@@ -63,35 +63,3 @@ def add_ClockServiceServicer_to_server(servicer, server):
             'freshfield.v1.ClockService', rpc_method_handlers)
     server.add_generic_rpc_handlers((generic_handler,))
     server.add_registered_method_handlers('freshfield.v1.ClockService', rpc_method_handlers)
-
-
- # This class is part of an EXPERIMENTAL API.
-class ClockService:
-    """Missing associated documentation comment in .proto file."""
-
-    @staticmethod
-    def Exchange(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/freshfield.v1.ClockService/Exchange',
-            freshfield_dot_v1_dot_clock__pb2.ExchangeRequest.SerializeToString,
-            freshfield_dot_v1_dot_clock__pb2.ExchangeResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)

@@ -64,35 +64,3 @@ def add_FrameStreamServiceServicer_to_server(servicer, server):
             'freshfield.v1.FrameStreamService', rpc_method_handlers)
     server.add_generic_rpc_handlers((generic_handler,))
     server.add_registered_method_handlers('freshfield.v1.FrameStreamService', rpc_method_handlers)
-
-
- # This class is part of an EXPERIMENTAL API.
-class FrameStreamService:
-    """Missing associated documentation comment in .proto file."""
-
-    @staticmethod
-    def Push(request_iterator,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.stream_stream(
-            request_iterator,
-            target,
-            '/freshfield.v1.FrameStreamService/Push',
-            freshfield_dot_v1_dot_frames__pb2.PushRequest.SerializeToString,
-            freshfield_dot_v1_dot_frames__pb2.PushResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)

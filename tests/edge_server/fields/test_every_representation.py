@@ -89,7 +89,7 @@ def test_a_budget_in_seconds_is_kept(name: str) -> None:
         ("nerfacto", {"exposure": True}),
         ("nerfacto", {"appearance": 3, "harmonics": 4}),
         ("tensorf", {}),
-        ("tensorf", {"smooth": 1e-3, "sparse": 1e-4, "harmonics": 4}),
+        ("tensorf", {"harmonics": 4}),
         ("splat", {}),
         ("voxel", {}),
         ("voxel", {"background": "random", "contracted": True}),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from camera_node.robot import tables
+from camera_node.robot import figures
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
@@ -81,7 +81,7 @@ def write_yaml(found: Calibration, path: Path) -> None:
 
 def plot(found: Calibration, path: Path) -> None:
     """Plot residuals, rotation axes and each pose's target position. Raises CalibrationError."""
-    plt = tables.pyplot()
+    plt = figures.pyplot()
     if plt is None:
         raise CalibrationError("--plot needs matplotlib (pip install 'freshfield[calibrate]')")
     figure, (bars, ball, places) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")

@@ -19,7 +19,6 @@ import numpy as np
 from camera_node.config import WorldConfig, source_config
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import Interval, crossed, interval
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.scheduler.evaluation import (
@@ -38,7 +37,7 @@ from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.scheduler import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
-from freshfield.files import write_json
+from freshfield.files import write_csv, write_json
 
 FIELD = "splat"
 FIELD_OPTIONS = {"effort": "low"}

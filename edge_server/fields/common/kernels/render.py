@@ -18,11 +18,11 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 @kernel
 def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics,
-                 max_samples, background, acts, x, line, color, depth, opacity):  # fmt: skip
+                 background, acts, x, line, color, depth, opacity):  # fmt: skip
     """Render image points; tasks are runs of TILE of them.
 
     lens: float64 (8,). rotation: float64 (3, 3), camera to world. origin: float64 (3,), scene units.
-    pixels: float64 (N, 2), image points. max_samples: of a ray. background: float32 (3,).
+    pixels: float64 (N, 2), image points. background: float32 (3,).
     acts: float32 (W, units, TILE ROUND), x: (W, 3, same), line: (W, 2, same), scratch.
     color: float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
     """
@@ -34,7 +34,6 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
     )  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)
     active = np.empty(TILE, np.int64)
-    taken = np.empty(TILE, np.int64)
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     while True:
         base = fetch_add(counter, 1) * TILE
@@ -47,7 +46,6 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
             enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
             travel[r, 0], travel[r, 1], travel[r, 2] = dx, dy, dz
             travel[r, 3], travel[r, 4], travel[r, 5] = enter + np.float32(0.5) * space.step, leave, _F0
-            taken[r] = 0
             color[base + r] = _F0
             depth[base + r] = opacity[base + r] = _F0
             if leave > enter:
@@ -58,14 +56,11 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
             first[0] = 0
             for k in range(count):
                 r = active[k]
-                limit = n + min(ROUND, max_samples - taken[r])
-                before = n
                 n, t, _ = march(
                     space, ox, oy, oz, travel[r, 0], travel[r, 1], travel[r, 2], travel[r, 3],
-                    travel[r, 4], x[worker], ts, dts, n, limit, NEVER,
+                    travel[r, 4], x[worker], ts, dts, n, n + ROUND, NEVER,
                 )  # fmt: skip
                 travel[r, 3] = t
-                taken[r] += n - before
                 first[k + 1] = n
             query_density(encoding, levels, net, x[worker], start, n, acts[worker])
             query_color(encoding, levels, net, x[worker], start, n, acts[worker])
@@ -91,11 +86,7 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
                     depth[pixel] += w * ts[s]
                     opacity[pixel] += w
                     through = after
-                if (
-                    travel[r, 5] <= np.float32(OPAQUE_DEPTH)
-                    and travel[r, 3] < travel[r, 4]
-                    and taken[r] < max_samples
-                ):
+                if travel[r, 5] <= np.float32(OPAQUE_DEPTH) and travel[r, 3] < travel[r, 4]:
                     active[left] = r
                     left += 1
             count = left

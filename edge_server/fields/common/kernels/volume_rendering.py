@@ -32,16 +32,11 @@ class Weights(NamedTuple):
     """Strengths of the regularizers, float32.
 
     distortion: mip-NeRF 360's loss, gathers a ray's weight in one place.
-    sparsity: on optical depth itself, empties what no picture needs.
-    near: distance in scene units below which gradients fall with the square of distance, against haze before
-        the lens; 0: off.
     guide: on weight away from a ray's guide, or nowhere (Geman and McClure's robust estimator, so that a
         wrong guide pulls no harder than a doubtful one).
     """
 
     distortion: np.float32
-    sparsity: np.float32
-    near: np.float32
     guide: np.float32 = np.float32(0.0)
 
 
@@ -177,16 +172,13 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, guide, weig
         if guided > _F0:
             off = (t - guide) * across
             d_w += guided * off * off / (_F1 + off * off)
-        d_depth = d_w * after - behind + weights.sparsity
+        d_depth = d_w * after - behind
         behind += w[s] * d_w
         after += w[s]
-        scale = _F1
-        if t < weights.near:
-            scale = t * t / (weights.near * weights.near)
         sigma = out[0, s]
         free = sigma > _CLAMPED_LOW and sigma < _CLAMPED_HIGH
-        d_out[0, s] = d_depth * delta * sigma * scale if free else _F0
-        d_out[1, s] = w[s] * d_r * r * (_F1 - r) * scale
-        d_out[2, s] = w[s] * d_g * g * (_F1 - g) * scale
-        d_out[3, s] = w[s] * d_b * b * (_F1 - b) * scale
+        d_out[0, s] = d_depth * delta * sigma if free else _F0
+        d_out[1, s] = w[s] * d_r * r * (_F1 - r)
+        d_out[2, s] = w[s] * d_g * g * (_F1 - g)
+        d_out[3, s] = w[s] * d_b * b * (_F1 - b)
     return loss

@@ -261,38 +261,6 @@ def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dir
                     _flag_segments(flags, rows[4], rows[5])
 
 
-@kernel
-def regularize(counter, worker, planes, smooth, sparse, gradient, dirty):
-    """Add the gradients of two regularizers (section 4.4) in dirty segments only; a task is a group.
-
-    smooth: float32, weight of half the squared differences between neighboring vertices of the planes (total
-    variation). sparse: float32, weight of the absolute values of the density's factors (L1).
-    """
-    size = planes.size
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= planes.groups:
-            return
-        first = np.int64(task) * planes.rows
-        table, to = planes.table[first : first + planes.rows], gradient[first : first + planes.rows]
-        l1 = sparse if task < planes.density_groups else _F0
-        for row in range(size * size + size):
-            if not dirty[(first + row) // ROWS]:
-                continue
-            if row < size * size and smooth > _F0:
-                i, j = row % size, row // size
-                left, right = row - 1 if i > 0 else row, row + 1 if i < size - 1 else row
-                below, above = row - size if j > 0 else row, row + size if j < size - 1 else row
-                for c in range(CHANNELS):
-                    p = table[row, c]
-                    apart = (p - table[left, c]) + (p - table[right, c])
-                    apart += (p - table[below, c]) + (p - table[above, c])
-                    to[row, c] += smooth * apart
-            if l1 > _F0:
-                for c in range(CHANNELS):
-                    to[row, c] += np.float32(np.sign(table[row, c])) * l1
-
-
 @overload(query_density)
 def _query_density(encoding, levels, net, x, start, end, acts):
     if not is_a(encoding, Planes):

@@ -201,7 +201,7 @@ def test_visps_poses_are_rotation_vectors(tmp_path):
 
 def test_the_study_prints_its_tables(tmp_path, capsys):
     from camera_node.robot.calibration import accuracy_study
-    from camera_node.robot.tables import write_csv
+    from freshfield.files import write_csv
 
     tables = {
         "pairing": accuracy_study.pairing(1.0, (8.0, 100.0), (0.25,)),

@@ -146,44 +146,6 @@ def write_eyeful(
     return folder
 
 
-def write_metashape(folder: Path, cameras: list[Taken]) -> Path:
-    """The same scene as Metashape's cameras.xml, in a chunk of half the size that is turned and moved."""
-    folder.mkdir(parents=True, exist_ok=True)
-    rotation, moved, scale = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0], np.array([1.0, 2.0, -0.5]), 2.0
-    sensors, placed = [], []
-    for number, camera in enumerate(cameras):
-        write_image(folder / f"images-jpeg-2k/{10 + number}/{10 + number}_DSC0000.jpg", camera.shows(0))
-        lens = camera.lens
-        k1, k2, p1, p2 = lens.distortion
-        sensors.append(
-            f'<sensor id="{number}" type="frame"><calibration type="frame" class="adjusted">'
-            f'<resolution width="{WIDTH}" height="{HEIGHT}"/><f>{lens.fy}</f><b1>{lens.fx - lens.fy}</b1>'
-            f"<cx>{lens.cx - WIDTH / 2}</cx><cy>{lens.cy - HEIGHT / 2}</cy><k1>{k1}</k1><k2>{k2}</k2>"
-            f"<p1>{p2}</p1><p2>{p1}</p2></calibration></sensor>"
-        )
-        pose = _eyeful_pose(camera)
-        inner = np.eye(4)
-        inner[:3, :3] = rotation.T @ pose[:3, :3]
-        inner[:3, 3] = rotation.T @ (pose[:3, 3] - moved) / scale
-        label = f"{10 + number}_DSC0000"
-        values = " ".join(map(repr, inner.ravel().tolist()))
-        placed.append(
-            f'<camera id="{number}" sensor_id="{number}" component_id="0" label="{label}">'
-            f"<transform>{values}</transform></camera>"
-        )
-    # One that could not be placed.
-    placed.append('<camera id="99" sensor_id="0" component_id="0" label="10_DSC0009"/>')
-    turn, move = " ".join(map(repr, rotation.ravel().tolist())), " ".join(map(repr, moved.tolist()))
-    (folder / "cameras.xml").write_text(
-        f'<?xml version="1.0"?><document version="2.0.0"><chunk><sensors>{"".join(sensors)}</sensors>'
-        f'<components><component id="0"><transform><rotation>{turn}</rotation>'
-        f"<translation>{move}</translation>"
-        f"<scale>{scale}</scale></transform></component></components>"
-        f"<cameras>{''.join(placed)}</cameras></chunk></document>"
-    )
-    return folder
-
-
 # COLMAP's number of a model and its parameters of a camera; each bends as much as the model can.
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": (0, lambda l: [l.fx, l.cx, l.cy]),

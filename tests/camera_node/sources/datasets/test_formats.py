@@ -277,13 +277,6 @@ def as_lens(model, d):
     return (d[0], d[1], d[4]), (d[2], d[3]), False
 
 
-def test_eyeful_as_metashape_wrote_it(tmp_path):
-    cameras = sets.rig(3, BENT)
-    dataset = eyeful.load_dataset(sets.write_metashape(tmp_path, cameras))
-    agree(list(dataset), cameras)
-    shows_the_world(dataset[2])
-
-
 def test_eyeful_damage_is_named(tmp_path):
     folder = sets.write_eyeful(tmp_path, sets.rig(2))
     (folder / "images-jpeg-2k/11/11_DSC0001.jpg").unlink()
@@ -308,12 +301,6 @@ def test_eyeful_damage_is_named(tmp_path):
         fails(message, eyeful.load_dataset, folder)
     file.write_text(whole[:-30])
     fails("cameras.json: cannot be read as JSON", eyeful.load_dataset, folder)
-    xml = sets.write_metashape(tmp_path / "xml", sets.rig(2)) / "cameras.xml"
-    text = xml.read_text()
-    xml.write_text(text.replace('label="10_DSC0009"/>', 'master_id="0" label="10_DSC0009"/>'))
-    fails("placed by its rig's master; use cameras.json", eyeful.load_dataset, xml)
-    xml.write_text(text[:-40])
-    fails("cameras.xml: cannot be read as XML", eyeful.load_dataset, xml)
 
 
 # --- COLMAP -------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ import pytest
 
 from edge_server.experiments.common import result_store
 from edge_server.experiments.common.result_store import Interrupted, ResultStore, content_key
-from edge_server.experiments.common.tables import markdown_table, number, write_csv
+from edge_server.experiments.common.tables import markdown_table, number
+from freshfield.files import write_csv
 
 
 def never():

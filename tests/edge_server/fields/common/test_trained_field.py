@@ -24,7 +24,6 @@ def test_shipped_settings_regularize(name: str, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(field, "_train", noted)
     field.fit(SEEN, Budget(steps=1))
     assert given[0].distortion == np.float32(0.01) and given[0].guide == np.float32(0.1)
-    assert given[0].sparsity == given[0].near == 0.0
 
 
 def test_the_distortion_loss_lowers_the_spread_of_weight_along_rays() -> None:

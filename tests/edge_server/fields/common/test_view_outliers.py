@@ -127,14 +127,6 @@ def test_options_are_checked(name: str, value: float) -> None:
             replace(settings, **{name: value})
 
 
-def test_every_representation_has_the_same_options() -> None:
-    for name in ("age_tau_ms", "mask_stale_ms", "mask_grow_px_s", "refuse_beyond"):
-        kept = {
-            (getattr(s, name), type(s).__dataclass_fields__[name].metadata["help"]) for s in SMALL.values()
-        }
-        assert len(kept) == 1
-
-
 def _take_in(settings: Any, *instants: list[View]) -> Views:
     rig = ViewStore(settings)
     for views in instants:

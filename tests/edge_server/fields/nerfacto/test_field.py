@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.fields import Budget, View
+from edge_server.fields import Budget
 from edge_server.fields.nerfacto.field import NerfactoField
 from tests.edge_server.fields.common.test_camera_refinement import _displaced
 from tests.edge_server.fields.nerfacto.small import SMALL
@@ -18,21 +18,15 @@ from tests.edge_server.fields.small import HELD, SEEN, score
 def test_the_proposal_learns_where_surfaces_are() -> None:
     """Fewer samples do with it than without: that is what it is for. Without a depth guide, which would tell
     both where surfaces are."""
-    few = {"max_samples": 4}
     scores = []
     for interlevel in (SMALL.interlevel, 0.0):
         field = NerfactoField(replace(SMALL, interlevel=interlevel, depth_guide=0.0))
         field.fit(SEEN, Budget(steps=250))
-        color, _, _ = field.snapshot().render_pixels(
-            HELD.camera_to_world, HELD.intrinsics, _pixels(HELD), **few
-        )
-        scores.append(psnr(color.reshape(HELD.image.shape), HELD.image / 255.0))
+        full = field.snapshot()
+        few = replace(full, sampling=full.sampling._replace(samples=4))
+        color = few.render(HELD.camera_to_world, HELD.intrinsics).color
+        scores.append(psnr(color, HELD.image / 255.0))
     assert scores[0] > scores[1] + 0.5
-
-
-def _pixels(view: View) -> np.ndarray:
-    v, u = np.mgrid[0 : view.intrinsics.height, 0 : view.intrinsics.width]
-    return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
 
 
 def test_appearances_take_up_what_differs_between_cameras() -> None:

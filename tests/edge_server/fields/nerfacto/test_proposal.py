@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -310,8 +308,8 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     assert field.view_store.box is not None
     data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
     recipe = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
-    weights = Weights(F(0.0), F(0.0), F(0.0))
-    space = OccupancyGrid.for_box(replace(settings, min_views=0), field.view_store.box).space(0.1)
+    weights = Weights(F(0.0))
+    space = OccupancyGrid.for_box(settings.cells, 0, field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:

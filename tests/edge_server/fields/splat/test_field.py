@@ -288,7 +288,7 @@ def test_the_default_rates_find_positions() -> None:
 
 @pytest.mark.parametrize("options", [
     {"harmonics": 4}, {"harmonics": 9}, {"loss": "l1"}, {"dssim": 0.02}, {"opacity_reset": 80},
-    {"views_a_step": 3, "tile_share": 0.4}, {"seed_cells": 0}, {"fade": 1e-3},
+    {"views_a_step": 3}, {"seed_cells": 0}, {"fade": 1e-3},
 ])  # fmt: skip
 def test_every_option_learns(options: dict) -> None:
     field = SplatField(replace(SMALL, **options))

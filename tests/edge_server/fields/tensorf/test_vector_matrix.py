@@ -13,7 +13,6 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     Planes,
     color_components,
     raw_density,
-    regularize,
     scatter_planes,
 )
 from edge_server.fields.tensorf.settings import TensorfSettings
@@ -116,25 +115,6 @@ def test_gradient_equals_finite_differences() -> None:
         step[row, column] = 1e-4
         slope = _loss(planes, table + step, x, d, counts) - _loss(planes, table - step, x, d, counts)
         assert slope.item() / 2e-4 == pytest.approx(gradient[row, column], rel=1e-3, abs=1e-4)
-
-
-def test_regularizers_equal_the_oracle_where_something_is_dirty() -> None:
-    planes = _planes()
-    table = torch.as_tensor(planes.table).requires_grad_(True)
-    n, total = planes.size, torch.zeros(())
-    for g in range(planes.groups):
-        rows = table[g * planes.rows : g * planes.rows + n * (n + 1)]
-        plane = rows[: n * n].reshape(n, n, CHANNELS)
-        total = total + 0.05 * (plane.diff(dim=0).square().sum() + plane.diff(dim=1).square().sum())
-        if g < planes.density_groups:
-            total = total + 0.03 * rows.abs().sum()
-    total.backward()
-    assert table.grad is not None
-    gradient, dirty = np.zeros_like(planes.table), np.zeros(len(planes.table) // ROWS, np.bool_)
-    dirty[::3] = True
-    regularize(np.zeros(1, np.int64), 0, planes, np.float32(0.1), np.float32(0.03), gradient, dirty)
-    expected = np.where(np.repeat(dirty, ROWS)[:, None], table.grad.numpy(), 0.0)
-    np.testing.assert_allclose(gradient, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("new", [17, 31])

@@ -11,7 +11,7 @@ from edge_server.fields.common.kernels.rays import NEVER, Space, interval, march
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.ngp.torch_field import TorchModel
+from edge_server.fields.ngp.torch_field import TorchSnapshot
 from edge_server.fields.ngp.torch_model import TorchGrid
 from freshfield.geometry import Pinhole, look_at
 
@@ -56,9 +56,9 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     settings = NgpSettings(cells=CELLS, samples=32)
     none = torch.zeros(0)
     box = SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0, 0.1)
-    model = TorchModel(
+    model = TorchSnapshot(
         settings, box, TorchGrid([], [], [], none), 0, [], none,
-        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step),
+        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step), (), 0,
     )  # fmt: skip
     rng = np.random.default_rng(6)
     for _ in range(20):

@@ -27,7 +27,7 @@ SETTINGS = NgpSettings(
     cells=16, samples_start=48, threads=1,
 )  # fmt: skip
 VIEWS = ring(5, size=24)
-DISTORTION, SPARSITY = 0.2, 0.03
+DISTORTION = 0.2
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def _train(
     )  # fmt: skip
     space = field._occupancy.space(step_length(SETTINGS, field.step))
     space = space._replace(density=space.density * np.float32(over))
-    weights = Weights(np.float32(DISTORTION), np.float32(SPARSITY), np.float32(0.0))
+    weights = Weights(np.float32(DISTORTION))
     batch, scratch = field._batch, field._scratch
     field.pool.run(train_chunks, data, recipe, space, field._grid, field._net, weights, batch, scratch)
     return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
@@ -78,7 +78,7 @@ def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Ten
         at = column[a:b]
         t, delta = (torch.as_tensor(scratch.line[0, k, at], dtype=torch.float64)[None] for k in (0, 1))
         target, back = (torch.as_tensor(ray[r, k : k + 3], dtype=torch.float64)[None] for k in (3, 6))
-        of_ray = ray_losses(sigma[None, a:b], color[None, a:b], t, delta, target, back, DISTORTION, SPARSITY)
+        of_ray = ray_losses(sigma[None, a:b], color[None, a:b], t, delta, target, back, DISTORTION)
         error, loss = error + weight[r] * of_ray[0].sum(), loss + weight[r] * of_ray[1].sum()
     return error, loss
 
