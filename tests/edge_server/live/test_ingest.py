@@ -39,7 +39,7 @@ def good(sequence: int = 0, **other):
 def test_an_accepted_frame_is_buffered_and_written_down(ingest):
     answer = ingest.take(to_request(good()))
     assert (answer.outcome, answer.sequence) == (pb.OUTCOME_ACCEPTED, 0)
-    assert ingest._buffer.ages_ms(NOW)["cam01"] == pytest.approx(50.0)
+    assert ingest.buffer.ages_ms(NOW)["cam01"] == pytest.approx(50.0)
     (event,) = LedgerReader(ingest.test_ledger.path).events
     assert (event.event, event.camera, event.sequence) == ("delivered", "cam01", 0)
 
@@ -48,7 +48,7 @@ def test_held_out_frames_never_reach_the_training_buffer(ingest):
     answer = ingest.take(to_request(good(camera="cam00", held_out=True)))
     assert answer.outcome == pb.OUTCOME_ACCEPTED
     assert [f.camera for f in ingest.test_held] == ["cam00"]
-    assert ingest._buffer.newest() == {}
+    assert ingest.buffer.newest() == {}
 
 
 def bad(kind: str) -> pb.PushRequest:
