@@ -28,7 +28,8 @@ TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 
 def pack(field: Any) -> Arrays:
-    """Everything in one dictionary of copies."""
+    """Everything in one dictionary of copies, without what follows from the rest: what frames showed when
+    they were aligned is read only until the next alignment, which no call outlasts."""
     state: Arrays = {}
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
@@ -47,8 +48,8 @@ def pack(field: Any) -> Arrays:
     for k, o in enumerate(field.observations):
         observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
         arrays: dict[str, NDArray[Any] | None] = {
-            "image": o.view.image, "foreground": o.foreground, "weight": o.weight, "shown": o.shown,
-                  "given": o.view.weight}  # fmt: skip
+            "image": o.view.image, "foreground": o.foreground, "given": o.view.weight,
+            "weight": None if o.weight is None else _half(o.weight)}  # fmt: skip
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
@@ -59,7 +60,7 @@ def pack(field: Any) -> Arrays:
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
         tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
-    meta = {"version": 1, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
+    meta = {"version": 2, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
             "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
@@ -118,9 +119,15 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
     if "matrix" in found:
         row = ViewRow(facts["instant_s"], found["matrix"], found["vector"], found["around"])
     return Observation(
-        facts["instant_s"], view.camera, view, found["foreground"], found.get("weight"), row,
-        found.get("shown"), facts["fresh"],
+        facts["instant_s"], view.camera, view, found["foreground"],
+        found["weight"].astype(np.float32) if "weight" in found else None, row, fresh=facts["fresh"],
     )  # fmt: skip
+
+
+def _half(weight: NDArray[np.float32]) -> NDArray[Any]:
+    """The same numbers with half the bytes, where these hold them."""
+    half = weight.astype(np.float16)
+    return half if np.array_equal(half, weight) else weight
 
 
 def _facts(view: View) -> dict[str, Any]:

@@ -60,7 +60,10 @@ class Plate:
             deviation=zeros(), known=np.zeros((height, width), bool),
         )  # fmt: skip
         self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
-        self._recent = np.zeros((max(LAGS), height, width, 3), np.float32)  # blurred frames, a ring
+        # The latest frames, a ring: as taken, their gains since, and blurred.
+        self._frames = np.zeros((max(LAGS), height, width, 3), np.uint8)
+        self._gains = np.ones((max(LAGS), 3), np.float32)
+        self._recent = np.zeros(self._frames.shape, np.float32)
         self._held: NDArray[Any] = np.zeros((height, width), np.uint8)
         self._static, self._has_static = zeros(3), False
         self._static_blurred: NDArray[Any] = zeros(3)
@@ -80,7 +83,8 @@ class Plate:
 
         may_refuse: a frame that is nearly all foreground changes nothing; None is returned for it.
         """
-        gain = self._follow_exposure(image)
+        before = dict(vars(self))
+        self._follow_exposure(image)
         blurred = cv2.boxFilter(image, cv2.CV_32F, (3, 3))
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
@@ -93,8 +97,7 @@ class Plate:
         if self.count > 0:
             foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
             if may_refuse and foreground.mean() > REFUSED_SHARE:
-                if gain is not None:
-                    self._scale(1.0 / gain)
+                vars(self).update(before)  # what ``_scale`` has replaced
                 return None
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
             votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
@@ -102,7 +105,8 @@ class Plate:
             vote, image, blurred, self._difference, foreground, votes.astype(np.uint8), self._held,
             self.arrays, self._static, self._has_static, self.picture,
         )  # fmt: skip
-        self._recent[self.count % len(self._recent)] = blurred
+        slot = self.count % len(self._recent)
+        self._frames[slot], self._gains[slot], self._recent[slot] = image, 1.0, blurred
         self.count += 1
         return foreground > 0
 
@@ -123,13 +127,25 @@ class Plate:
         """Use the static field's rendering, float32 (H, W, 3) in [0, 1] at the exposure of the first frame,
         where there is no plate."""
         self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)
-        self._static_blurred, self._has_static = cv2.blur(self._static, (3, 3)), True
-        self.picture = np.where(self.known[..., None], self.arrays.means[0], self._static)
+        self._has_static = True
+        self._blur()
+        self._fill()
+
+    def _blur(self) -> None:
+        """What follows from the static field's rendering and the latest frames."""
+        self._static_blurred = cv2.blur(self._static, (3, 3))
+        self._recent = np.stack([cv2.boxFilter(frame, cv2.CV_32F, (3, 3)) for frame in self._frames])
+        self._recent *= self._gains[:, None, None]
+
+    def _fill(self) -> None:
+        """The picture, as ``vote`` leaves it."""
+        shows_plate = self.known[..., None] | (not self._has_static)
+        self.picture = np.where(shows_plate, self.arrays.means[0], self._static)
 
     def state(self) -> Arrays:
         """Everything needed to continue bit for bit."""
-        mine = {**self.arrays._asdict(), "picture": self.picture, "gain": self.gain, "recent": self._recent,
-                "held": self._held, "static": self._static, "static_blurred": self._static_blurred,
+        mine = {**self.arrays._asdict(), "gain": self.gain, "frames": self._frames, "gains": self._gains,
+                "held": self._held, "static": self._static,
                 "counters": np.array([self.count, int(self._has_static)])}  # fmt: skip
         return {name: array.copy() for name, array in mine.items()}
 
@@ -137,15 +153,17 @@ class Plate:
         """Continue from ``state``. KeyError: it lacks something."""
         mine = {name: np.array(array) for name, array in state.items()}
         self.arrays = PlateArrays(*(mine[name] for name in PlateArrays._fields))
-        self.picture, self.gain, self._recent = mine["picture"], mine["gain"], mine["recent"]
-        self._held, self._static, self._static_blurred = mine["held"], mine["static"], mine["static_blurred"]
+        self.gain, self._frames, self._gains = mine["gain"], mine["frames"], mine["gains"]
+        self._held, self._static = mine["held"], mine["static"]
         self.count, self._has_static = int(mine["counters"][0]), bool(mine["counters"][1])
+        self._blur()
+        self._fill()
 
-    def _follow_exposure(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    def _follow_exposure(self, image: NDArray[np.uint8]) -> None:
         """Scale everything remembered when light or exposure change: by the median ratio of frame and plate,
-        for each channel, where that is off by more than GAIN_STEP for one. Returns the ratios if so."""
+        for each channel, where that is off by more than GAIN_STEP for one."""
         if self.count == 0:
-            return None
+            return
         counts = np.zeros((3, 3), np.int64)
         self.pool.run(count_exposure, image, self.arrays, counts)
         used = counts[:, 0]
@@ -154,21 +172,19 @@ class Plate:
             used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4
             or (2 * counts[:, 1:] <= used[:, None]).all()
         ):
-            return None
+            return
         plate = self.arrays.means[0, ::2, ::2]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
         gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
-        if not ((gain > 1.0 / GAIN_MOST) & (gain < GAIN_MOST)).all():
-            return None  # a black or broken frame
-        self._scale(gain)
-        return gain
+        if ((gain > 1.0 / GAIN_MOST) & (gain < GAIN_MOST)).all():  # no black or broken frame
+            self._scale(gain)
 
     def _scale(self, gain: NDArray[np.float32]) -> None:
-        self.gain = self.gain * gain
-        for array in (self.arrays.means, self.arrays.blurred):
-            np.clip(array * gain, 0.0, 255.0, out=array)
-        for array in (self._recent, self._static, self._static_blurred):
-            array *= gain
+        """Replace what is remembered; the arrays themselves stay as they were."""
+        means, blurred = (np.clip(a * gain, 0.0, 255.0) for a in (self.arrays.means, self.arrays.blurred))
+        self.arrays = self.arrays._replace(means=means, blurred=blurred)
+        self.gain, self._static, self._gains = self.gain * gain, self._static * gain, self._gains * gain
+        self._blur()
 
 
 class FinePlate:

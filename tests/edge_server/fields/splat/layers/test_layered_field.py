@@ -149,6 +149,17 @@ def test_a_state_continues_bit_for_bit() -> None:
     np.testing.assert_array_equal(one, two)
 
 
+def test_a_state_holds_nothing_that_follows_from_the_rest() -> None:
+    state = _moving().state()
+    pixels = CAMERAS[0].image.shape[0] * CAMERAS[0].image.shape[1]
+
+    plates = sum(a.nbytes for name, a in state.items() if ".plate." in name) / pixels / len(CAMERAS)
+    assert plates < 130  # of which 88 for three colors, their blurred ones, votes and what is known of them
+    frames = [name for name in state if name.startswith("frame_") and name.endswith(".weight")]
+    assert frames and all(state[name].nbytes == 2 * pixels for name in frames)
+    assert not any(name.endswith((".shown", ".picture", ".static_blurred")) for name in state)
+
+
 def test_the_order_and_the_threads_change_nothing() -> None:
     one, two = LayeredField(SMALL), LayeredField(replace(SMALL, threads=1))
     for field in (one, two):

@@ -79,8 +79,12 @@ def test_a_state_continues_bit_for_bit() -> None:
     plate = _seen()
     plate.take(_frame(4))
     plate.fill_unknown(WALL / np.float32(255.0))
+    plate.take((WALL * 0.8 + 0.5).astype(np.uint8))  # all that is remembered becomes darker
     other = Plate(SIZE, SIZE, CallerPool())
     other.load_state(plate.state())
+    for name, array in vars(plate).items():  # also what is not stored
+        if isinstance(array, np.ndarray) and name not in ("_difference", "_flags"):
+            np.testing.assert_array_equal(array, vars(other)[name], err_msg=name)
     for at in (8, 12, 40):
         np.testing.assert_array_equal(plate.take(_frame(at)), other.take(_frame(at)))
     for name, array in plate.state().items():
