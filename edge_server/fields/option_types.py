@@ -31,8 +31,8 @@ def _typed(hint: Any, what: str, value: Any) -> Any:
         parts = get_args(hint)
         any_length = parts[-1] is Ellipsis
         if not isinstance(value, (list, tuple)) or not (any_length or len(value) == len(parts)):
-            how_many = "" if any_length else f"{len(parts)} "
-            raise ValueError(f"{what} must be a list of {how_many}numbers, not {value!r}")
+            wanted = "like [32, 64]" if any_length else f"of {len(parts)} numbers"
+            raise ValueError(f"{what} must be a list {wanted}, not {value!r}")
         return tuple(_typed(parts[0], what, v) for v in value)
     if hint is float:
         return float(_number(what, value))
