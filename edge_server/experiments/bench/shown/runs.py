@@ -1,0 +1,183 @@
+"""Runs of the table: what is shown, and the same where computing is free and where nothing is late.
+
+``layers`` is the splat field in layers on arrivals, a decision each 20 ms; ``before`` the same field without
+layers, in cycles of 250 ms. Computing is charged as measured on one core: an update of layers by the part
+times of the run in which nothing is late, the static field's training left out, which another core does; a
+cycle by what docs/studies.md charges.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.bench.shown.rows import FIRST_SEED, Row, find
+from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.common.tables import number
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.fidelity.psnr import psnr_of_mse
+from edge_server.live.state import Publication
+from edge_server.live.view_decoder import ViewDecoder
+from freshfield.scenario import Scenario, ScenarioError
+
+SECONDS, QUICK_SECONDS = 12.0, 8.0
+SHOWN_EVERY_MS = 50.0
+_OFF_THE_WAY = ("static field", "static renders")  # parts of an update that another core does
+_CYCLE = Compute(ms_per_step=3.0, ms_per_update=70.0)
+_LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
+_CYCLE_RUN = replace(_LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """edge: of ``rows.EDGES``. late: the scene's own network, else an ideal one. charged: computing takes
+    time. splits: tells network and computing apart."""
+
+    edge: str
+    late: bool = True
+    charged: bool = True
+    splits: bool = False
+
+    def settings(self, compute: Compute) -> RunSettings:
+        """compute: what an update of layers takes."""
+        if self.edge == "before":
+            return _CYCLE_RUN
+        return replace(_LAYERS_RUN, compute=compute) if self.charged else _LAYERS_RUN
+
+
+FIRST_VARIANT = "nothing late"  # measures what the others are charged
+VARIANTS = {
+    FIRST_VARIANT: Variant("layers", late=False, charged=False),
+    "shown": Variant("layers"),
+    "computing free": Variant("layers", charged=False, splits=True),
+    "before": Variant("before"),
+}
+
+
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{ROW: {VARIANT: {seed: means over the instants of the last third}}}. BenchError: a scenario cannot
+    run."""
+    rows, seconds = find(run.scenes), QUICK_SECONDS if run.quick else SECONDS
+    try:
+        worlds = {row.name: KnownWorld(row.scenario(FIRST_SEED, "layers")) for row in rows}
+        for row in rows:  # the other seeds come last: what is stopped before has every row
+            for name, variant in VARIANTS.items():
+                if row.split or not variant.splits:
+                    _measure(row, name, FIRST_SEED, worlds[row.name], run.store, seconds)
+        for row in rows if not run.quick else ():
+            for seed in range(FIRST_SEED + 1, FIRST_SEED + row.seeds):
+                _measure(row, "shown", seed, worlds[row.name], run.store, seconds)
+    except ScenarioError as error:
+        raise BenchError(str(error)) from None
+    return run.store.results
+
+
+def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultStore, seconds: float) -> None:
+    """One run, unless it is known."""
+    variant, scenario = VARIANTS[name], row.scenario(seed, VARIANTS[name].edge)
+    if not variant.late:
+        scenario = replace(scenario, channel={"preset": "ideal"})
+    compute = Compute()
+    if name != FIRST_VARIANT:
+        cost = store.results[row.name][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
+        compute = Compute(ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
+    sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
+    known = {
+        "seconds": seconds, "cameras": len(scenario.cameras), "charged": variant.charged, **sections,
+        "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
+    }  # fmt: skip
+    work = partial(_run, scenario, variant.settings(compute), world, seconds)
+    found = store.get(row.name, name, str(seed), settings=known, compute=work)
+    text = ", ".join(f"{part} {number(found['psnr_db'][part])}" for part in PARTS)
+    print(f"  {row.name}, {name}, seed {seed}: {text} dB", flush=True)
+
+
+def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: float) -> dict[str, Any]:
+    """One deployment, its last third."""
+    truth = ShownTruth(world, from_ns=round(seconds * 2e9 / 3))
+    costs = UpdateCosts()
+
+    def published(publication: Publication) -> None:
+        truth.published(publication)
+        costs.published(deployment, publication.published_ns >= truth.from_ns)
+
+    deployment = build_deployment(scenario, settings, truth=truth, on_published=published)
+    costs.watch(deployment)
+    begun = time.monotonic()
+    deployment.run(seconds)
+    if not truth.instants:
+        raise ScenarioError(f"{scenario.path}: nothing was published within {seconds:g} s")
+    found = {**means(truth.instants), "cost": costs.measured(deployment), "wall_s": time.monotonic() - begun}
+    return {**found, "updates": len(deployment.publications), "charged": vars(settings.compute)}
+
+
+class UpdateCosts:
+    """What updates of a field in layers take, by the time of the processor."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
+        self._seen, self._spent_s = 0, 0.0
+
+    def watch(self, deployment: VirtualDeployment) -> None:
+        """Have the field measure its parts by the time of this thread, which others cannot slow down."""
+        field: Any = deployment.updates.field
+        if hasattr(field, "part_s"):
+            field.now = field.part_s.now = time.thread_time
+
+    def published(self, deployment: VirtualDeployment, counts: bool) -> None:
+        """Take an update in. counts: or leave it out."""
+        parts: dict[str, float] = getattr(deployment.updates.field, "part_s", {})
+        spent_s = sum(s for part, s in parts.items() if part not in _OFF_THE_WAY)
+        arrivals = deployment.updates.buffer.arrivals
+        if counts:
+            self._rows.append((arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
+        self._seen, self._spent_s = arrivals, spent_s
+
+    def measured(self, deployment: VirtualDeployment) -> dict[str, float]:
+        """update_ms, and view_ms for each frame that has arrived: least squares over the updates, and what
+        decoding a frame takes."""
+        if len(self._rows) < 2:
+            return {"update_ms": 0.0, "view_ms": 0.0}
+        frames, spent_ms = (np.array(column, float) for column in zip(*self._rows))
+        spread = float(((frames - frames.mean()) ** 2).sum())
+        slope = float(((frames - frames.mean()) * spent_ms).sum() / spread) if spread else 0.0
+        view_ms = min(max(slope, 0.0), float(spent_ms.mean() / max(frames.mean(), 1.0)))
+        items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
+        begun = time.thread_time()
+        ViewDecoder().views(items)
+        decoding_ms = 1e3 * (time.thread_time() - begun) / max(len(items), 1)
+        return {
+            "update_ms": float(spent_ms.mean() - view_ms * frames.mean()),
+            "view_ms": view_ms + decoding_ms,
+        }
+
+
+def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """psnr_db, squared_error by part; the perfect field's of ``newest`` and ``mean``; lag_ms p50 and p95;
+    mean ages."""
+    lags = [i["lag_ms"] for i in instants if i["lag_ms"] is not None]
+    found: dict[str, Any] = {
+        "instants": len(instants),
+        "lag_ms": {f"p{q}": float(np.percentile(lags, q)) if lags else None for q in (50, 95)},
+        "age_ms": {
+            name: statistics.fmean(i["age_ms"][name] or 0.0 for i in instants)
+            for name in instants[0]["age_ms"]
+        },
+    }  # fmt: skip
+    for kind in ("shown", "newest", "mean"):
+        errors = {part: [e for i in instants if (e := i[kind][part]) is not None] for part in PARTS}
+        place = found if kind == "shown" else found.setdefault("perfect", {}).setdefault(kind, {})
+        place["psnr_db"] = {
+            p: statistics.fmean(map(psnr_of_mse, e)) if e else None for p, e in errors.items()
+        }
+        place["squared_error"] = {p: statistics.fmean(e) if e else None for p, e in errors.items()}
+    return found
