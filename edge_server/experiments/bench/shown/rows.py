@@ -69,7 +69,7 @@ def drawn(seed: int) -> Row:
         f"drawn {seed}: {base}, {cameras['count'] - 1} cameras, {source['fps']:g} fps, "
         f"{source['speed_m_per_s']:g} m/s, {channel['preset']}"
     )
-    return Row(name, base, {"source": source, "cameras": cameras, "channel": channel}, seeds=2)
+    return Row(name, base, {"source": source, "cameras": cameras, "channel": channel})
 
 
 def _case(name: str, **changes: Any) -> Row:
@@ -78,9 +78,9 @@ def _case(name: str, **changes: Any) -> Row:
 
 ROWS: tuple[Row, ...] = (
     Row("room", seeds=5),
-    Row("room19", "room19", {"cameras": {"phase": "spread"}}, seeds=5),
-    Row("tower", "tower", seeds=5),
-    Row("room, 3 m/s", "room", {"source": {"speed_m_per_s": 3.0}}, seeds=5),
+    Row("room19", "room19", {"cameras": {"phase": "spread"}}, seeds=3),
+    Row("tower", "tower", seeds=3),
+    Row("room, 3 m/s", "room", {"source": {"speed_m_per_s": 3.0}}, seeds=3),
     *map(drawn, DRAWN),
     _case("stop and go", source={"params": {"course": "stops"}}),
     _case("reversals", source={"params": {"course": "reverses"}}),

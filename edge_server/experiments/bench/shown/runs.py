@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -40,12 +40,14 @@ _CYCLE_RUN = replace(_LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
 @dataclass(frozen=True)
 class Variant:
     """edge: of ``rows.EDGES``. late: the scene's own network, else an ideal one. charged: computing takes
-    time. splits: tells network and computing apart."""
+    time. splits: tells network and computing apart. repeats: runs with each seed of a row, else with the
+    first."""
 
     edge: str
     late: bool = True
     charged: bool = True
     splits: bool = False
+    repeats: bool = False
 
     def settings(self, compute: Compute) -> RunSettings:
         """compute: what an update of layers takes."""
@@ -57,7 +59,7 @@ class Variant:
 FIRST_VARIANT = "nothing late"  # measures what the others are charged
 VARIANTS = {
     FIRST_VARIANT: Variant("layers", late=False, charged=False),
-    "shown": Variant("layers"),
+    "shown": Variant("layers", repeats=True),
     "computing free": Variant("layers", charged=False, splits=True),
     "before": Variant("before"),
 }
@@ -66,16 +68,15 @@ VARIANTS = {
 def measure(run: BenchRun) -> dict[str, Any]:
     """{ROW: {VARIANT: {seed: means over the instants of the last third}}}. BenchError: a scenario cannot
     run."""
-    rows, seconds = find(run.scenes), QUICK_SECONDS if run.quick else SECONDS
+    seconds = QUICK_SECONDS if run.quick else SECONDS
     try:
-        worlds = {row.name: KnownWorld(row.scenario(FIRST_SEED, "layers")) for row in rows}
-        for row in rows:  # the other seeds come last: what is stopped before has every row
+        for row in find(run.scenes):
+            world = KnownWorld(row.scenario(FIRST_SEED, "layers"))
             for name, variant in VARIANTS.items():
-                if row.split or not variant.splits:
-                    _measure(row, name, FIRST_SEED, worlds[row.name], run.store, seconds)
-        for row in rows if not run.quick else ():
-            for seed in range(FIRST_SEED + 1, FIRST_SEED + row.seeds):
-                _measure(row, "shown", seed, worlds[row.name], run.store, seconds)
+                repeats = row.seeds if variant.repeats and not run.quick else 1
+                for seed in range(FIRST_SEED, FIRST_SEED + repeats):
+                    if row.split or not variant.splits:
+                        _measure(row, name, seed, world, run.store, seconds)
     except ScenarioError as error:
         raise BenchError(str(error)) from None
     return run.store.results
@@ -91,11 +92,12 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
         cost = store.results[row.name][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
         compute = Compute(ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
     sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
+    settings = variant.settings(compute)
     known = {
-        "seconds": seconds, "cameras": len(scenario.cameras), "charged": variant.charged, **sections,
+        "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(settings),
         "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
     }  # fmt: skip
-    work = partial(_run, scenario, variant.settings(compute), world, seconds)
+    work = partial(_run, scenario, settings, world, seconds)
     found = store.get(row.name, name, str(seed), settings=known, compute=work)
     text = ", ".join(f"{part} {number(found['psnr_db'][part])}" for part in PARTS)
     print(f"  {row.name}, {name}, seed {seed}: {text} dB", flush=True)

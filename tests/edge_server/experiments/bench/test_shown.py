@@ -11,13 +11,13 @@ import yaml
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench.shown import output, rows, runs
-from tests.edge_server.experiments.sets import SMALL
 
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A scenario of little pixels; fields of little steps."""
-    edge = {"field": "ngp", "field_options": SMALL, "lpips": "none", "grace_ms": 0.0}
+    options = {"gaussians": 256, "start": 128, "seed_cells": 8}
+    edge = {"field": "splat", "field_options": options, "lpips": "none", "grace_ms": 0.0}
     monkeypatch.setattr(rows, "EDGES", {"layers": {**edge, "updates": "arrivals"}, "before": edge})
     monkeypatch.setattr(runs, "QUICK_SECONDS", 0.9)
     cheap = runs.replace(runs._LAYERS_RUN, steps=1, epoch_ms=100.0)
