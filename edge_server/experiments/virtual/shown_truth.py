@@ -25,7 +25,6 @@ from camera_node.synthetic.render import CameraRenderer
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import to_unit
 from edge_server.fidelity.moving_pixels import LAGS_MS, moving_mask
-from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.live.state import Publication
 from freshfield.geometry import Array, Pinhole, so3_exp, so3_log
 from freshfield.scenario import Scenario, ScenarioError
@@ -97,8 +96,8 @@ class KnownWorld:
         if not pixels.any():
             return None
         steps = range(int(EARLIEST_LAG_MS * 1e6) // GRID_NS, int(LONGEST_LAG_MS * 1e6) // GRID_NS + 1)
-        seen = to_unit(shown, "shown")[pixels]
-        errors = np.array([((to_unit(self.image(index - k))[pixels] - seen) ** 2).mean() for k in steps])
+        seen = 255.0 * to_unit(shown, "shown")[pixels]
+        errors = np.array([((self.image(index - k)[pixels] - seen) ** 2).mean() for k in steps])
         best = int(errors.argmin())
         offset = 0.0
         if 0 < best < len(errors) - 1:
@@ -109,7 +108,7 @@ class KnownWorld:
 
 @dataclass
 class ShownTruth:
-    """A ``Truth`` of a deployment that keeps more than scores: see ``instants``.
+    """A ``Truth`` of a deployment that keeps more than a score of what is shown: ``instants``.
 
     from_ns: what is shown before is not looked at.
     instants: of each picture its mean squared errors (``PARTS``; None where nothing moves), those of the
@@ -121,7 +120,6 @@ class ShownTruth:
     from_ns: int = 0
     instants: list[dict[str, Any]] = field(default_factory=list)
     _publication: Publication | None = None
-    _scorer: Scorer = field(default_factory=Scorer)
 
     def published(self, publication: Publication) -> None:
         """To be called with each publication of the deployment."""
@@ -133,18 +131,18 @@ class ShownTruth:
     def view(self, camera: str, present_ns: int) -> tuple[NDArray[np.uint8], Pinhole, Array]:
         return self.world.image(round(present_ns / GRID_NS)), self.world.lens, self.world.pose
 
-    def score(self, field: Any, present_ns: int) -> Score | None:
-        """Score what is shown, and keep an instant. None before ``from_ns``."""
+    def score(self, field: Any, present_ns: int) -> None:
+        """Keep an instant, instead of a score."""
         publication, world = self._publication, self.world
         if present_ns < self.from_ns or publication is None:
-            return None
+            return
         index = round(present_ns / GRID_NS)
         truth = world.image(index)
         earlier = [world.image(index - round(lag * 1e6) // GRID_NS) for lag in LAGS_MS]
         shown, moving = field.render(world.pose, world.lens).color, moving_mask(truth, earlier)
-        standing_ms = (present_ns - publication.published_ns) / 1e6
+        display_ms = (present_ns - publication.published_ns) / 1e6
         ages_ms = {
-            "newest": min(publication.ages_ms) + standing_ms, "mean": publication.aaoi_ms + standing_ms
+            "newest": min(publication.ages_ms) + display_ms, "mean": publication.aaoi_ms + display_ms
         }  # fmt: skip
         waiting_ms = publication.aaoi_ms - (publication.network_ms or 0.0) - publication.update_ms
         self.instants.append({
@@ -154,10 +152,9 @@ class ShownTruth:
             "lag_ms": world.lag_ms(shown, index, moving),
             "age_ms": {
                 **ages_ms, "network": publication.network_ms, "waiting": waiting_ms,
-                "computing": publication.update_ms, "standing": standing_ms,
+                "computing": publication.update_ms, "display": display_ms,
             },
         })  # fmt: skip
-        return self._scorer.score(world.camera, shown, present_ns, truth, present_ns, earlier)
 
 
 def squared_errors(shown: NDArray, truth: NDArray, moving: NDArray[np.bool_]) -> dict[str, float | None]:

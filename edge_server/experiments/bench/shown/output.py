@@ -13,15 +13,18 @@ from edge_server.experiments.virtual.shown_truth import PARTS
 
 Figures = Mapping[str, Any]
 _SHARES = ("the field's own error", "prediction", "network", "computing")
-_AGES = ("network", "waiting", "computing", "standing")
+_AGES = ("network", "waiting", "computing", "display")
 
 
 def table(figures: Figures) -> str:
     """All figures as Markdown, and what they mean."""
     texts = [_shown_text(figures), _shown_table(figures), _CEILINGS_TEXT, _ceilings_table(figures)]
     if shares := list(_shares(figures)):
+        name, first = shares[0]
+        most = max(first, key=lambda part: first[part])
+        texts.append(f"{_SHARES_TEXT} In `{name}` most of it, {100 * first[most]:.0f} %, is {most}.")
         cells = [(name, *(f"{100 * s:.0f} %" for s in of.values())) for name, of in shares]
-        texts += [_SHARES_TEXT, markdown_table(("scene", *_SHARES), cells)]
+        texts.append(markdown_table(("scene", *_SHARES), cells))
     return "\n\n".join(texts)
 
 
@@ -34,10 +37,13 @@ def _shown_text(figures: Figures) -> str:
     text = (
         f"Virtual time, last third of each run, a seeded random instant in every {SHOWN_EVERY_MS:g} ms. "
         "*layers*: `splat` with `layers: true` on arrivals, as `room` ships it; *before*: `splat` without "
-        "layers in cycles of 250 ms. Both are charged what they were measured to take on one core. PSNR in "
-        "dB, mean and 95 % interval over seeds. Content lag: the tau at which truth(t - tau) matches the "
-        "moving pixels shown best. Age: of the cameras' newest views that the picture rests on, when it was "
-        "looked at; standing: since it was published; the display's own time comes on top."
+        "layers in cycles of 250 ms. Layers are charged the processor time of one core that an update and "
+        "each view took in the scene's own run where nothing is late, without the training of the static "
+        "field, which another core does; *before* is charged 70 ms an update and 3 ms a step, as "
+        "[studies](../studies.md#where-there-is-a-trade-off-at-all). PSNR in dB, mean and 95 % interval over "
+        "seeds. Content lag: the tau, up to 600 ms, at which truth(t - tau) matches the moving pixels shown "
+        "best. Age: of the cameras' newest views that the picture rests on, when it was looked at; display: "
+        "since it was published. The page adds what the browser takes."
     )
     for name in figures:
         ours, before = (_runs(figures, name, variant) for variant in ("shown", "before"))
@@ -68,7 +74,7 @@ _SHARES_TEXT = (
 def _shown_table(figures: Figures) -> str:
     head = (
         "scene|mode|runs|whole|moving|still|content lag p50 / p95, ms|newest view, ms|"
-        "mean age = network + waiting + computing + standing, ms"
+        "mean age = network + waiting + computing + display, ms"
     )
     rows = []
     for name in figures:
@@ -104,15 +110,15 @@ def _ceilings_table(figures: Figures) -> str:
     )
     rows = []
     for name in figures:
-        firsts = {
-            v: (_runs(figures, name, v) or [None])[0] for v in ("shown", "computing free", FIRST_VARIANT)
-        }
-        if (shown := firsts["shown"]) is None:
+        firsts = [
+            next(iter(_runs(figures, name, v)), None) for v in ("shown", "computing free", FIRST_VARIANT)
+        ]
+        if (shown := firsts[0]) is None:
             continue
         perfect = [_pair(shown["perfect"][known]) for known in ("newest", "mean")]
         cost = shown["charged"]
         charged = f"{cost['ms_per_update']:.1f} an update, {cost['ms_per_view']:.2f} a view"
-        rows.append((name, *map(_pair, firsts.values()), *perfect, charged))
+        rows.append((name, *map(_pair, firsts), *perfect, charged))
     return markdown_table(head.split("|"), rows)
 
 
@@ -149,8 +155,8 @@ def draw(figures: Figures, path: Path) -> None:
     shares = dict(_shares(figures))
     with figure(path, 1, 2, 1.0 + 0.3 * len(names), sharey=True) as (_, ((left, right),)):
         for variant, color, mark in (
-            ("before", GREY, "x"), ("shown", BLUE, "o"), ("computing free", ORANGE, "|"),
-            (FIRST_VARIANT, GREEN, "|"),
+            ("before", GREY, "x"), ("shown", BLUE, "o"), ("computing free", ORANGE, "v"),
+            (FIRST_VARIANT, GREEN, "^"),
         ):  # fmt: skip
             at = [(_first_moving(_runs(figures, name, variant)), k) for k, name in enumerate(names)]
             _dots(left, at, color, mark, variant)
@@ -162,7 +168,11 @@ def draw(figures: Figures, path: Path) -> None:
             widths = [100 * max(shares.get(name, {}).get(part, 0.0), 0.0) for name in names]
             right.barh(range(len(names)), widths, left=begun, color=color, label=part, height=0.6)
             begun = [a + b for a, b in zip(begun, widths)]
-        left.set(xlabel="PSNR of moving pixels (dB)", yticks=range(len(names)), yticklabels=names)
+        left.set(
+            xlabel="PSNR of moving pixels (dB)",
+            yticks=range(len(names)),
+            yticklabels=[name.partition(":")[0] for name in names],
+        )
         left.invert_yaxis()
         right.set(xlabel="share of the squared error (%)")
         for ax in (left, right):
@@ -177,4 +187,4 @@ def _first_moving(runs: Sequence[Figures]) -> float | None:
 def _dots(ax: Any, at: Sequence[tuple[float | None, int]], color: str, mark: str, label: str) -> None:
     known = [(x, y) for x, y in at if x is not None]
     if known:
-        ax.plot(*zip(*known), mark, color=color, label=label, markersize=7)
+        ax.plot(*zip(*known), mark, color=color, label=label, markersize=6)

@@ -63,11 +63,11 @@ def drawn(seed: int) -> Row:
         "horizontal_fov_deg": round(float(rng.uniform(-8, 8)) + (64 if base == "room" else 90), 1),
         "fps": float(rng.choice([10.0, 15.0, 20.0])),
     }
-    cameras = {"count": int(rng.integers(9, 18)), "phase": "spread"}
-    channel = {"preset": str(rng.choice(["ch5", "ch6", "ch6-high"]))}
+    count, preset = int(rng.integers(9, 18)), str(rng.choice(["ch5", "ch6", "ch6-high"]))
+    cameras, channel = {"count": count, "phase": "spread"}, {"preset": preset}
     name = (
-        f"drawn {seed}: {base}, {cameras['count'] - 1} cameras, {source['fps']:g} fps, "
-        f"{source['speed_m_per_s']:g} m/s, {channel['preset']}"
+        f"drawn {seed}: {base}, {count - 1} cameras, {source['fps']:g} fps, "
+        f"{source['speed_m_per_s']:g} m/s, {preset}"
     )
     return Row(name, base, {"source": source, "cameras": cameras, "channel": channel})
 
