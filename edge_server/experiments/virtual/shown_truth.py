@@ -11,7 +11,6 @@ The synthetic world is known at any instant, so that of each picture it can be a
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -160,7 +159,5 @@ class ShownTruth:
 def squared_errors(shown: NDArray, truth: NDArray, moving: NDArray[np.bool_]) -> dict[str, float | None]:
     """Mean squared error of the whole image, of the pixels that move and of the others."""
     error = ((to_unit(shown, "shown") - to_unit(truth, "truth")) ** 2).mean(axis=2)
-    masks: dict[str, Callable[[], NDArray]] = {
-        "whole": lambda: error, "moving": lambda: error[moving], "still": lambda: error[~moving]
-    }  # fmt: skip
-    return {part: float(of.mean()) if (of := masks[part]()).size else None for part in PARTS}
+    pixels = {"whole": error, "moving": error[moving], "still": error[~moving]}
+    return {part: float(of.mean()) if of.size else None for part, of in pixels.items()}

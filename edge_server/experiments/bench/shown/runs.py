@@ -23,8 +23,10 @@ from edge_server.experiments.common.result_store import ResultStore, settings_di
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.fidelity.psnr import psnr_of_mse
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield.scenario import Scenario, ScenarioError
@@ -110,57 +112,52 @@ def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: 
 
     def published(publication: Publication) -> None:
         truth.published(publication)
-        costs.published(deployment, publication.published_ns >= truth.from_ns)
+        costs.published(deployment.updates, publication.published_ns >= truth.from_ns)
 
     deployment = build_deployment(scenario, settings, truth=truth, on_published=published)
-    costs.watch(deployment)
+    costs.watch(deployment.updates.field)
     begun = time.monotonic()
     deployment.run(seconds)
     if not truth.instants:
         raise ScenarioError(f"{scenario.path}: nothing was published within {seconds:g} s")
-    found = {**means(truth.instants), "cost": costs.measured(deployment), "wall_s": time.monotonic() - begun}
+    items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
+    found = {**means(truth.instants), "cost": costs.measured(items), "wall_s": time.monotonic() - begun}
     return {**found, "updates": len(deployment.publications), "charged": vars(settings.compute)}
 
 
 class UpdateCosts:
-    """What updates of a field in layers take, by the time of the processor."""
+    """What updates of a field in layers take, by the processor time of the thread."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
         self._seen, self._spent_s = 0, 0.0
 
-    def watch(self, deployment: VirtualDeployment) -> None:
+    def watch(self, field: Any) -> None:
         """Have the field measure its parts by the time of this thread, which others cannot slow down."""
-        field: Any = deployment.updates.field
         if hasattr(field, "part_s"):
             field.now = field.part_s.now = time.thread_time
 
-    def published(self, deployment: VirtualDeployment, counts: bool) -> None:
+    def published(self, updates: FieldUpdater, counts: bool) -> None:
         """Take an update in. counts: or leave it out."""
-        parts: dict[str, float] = getattr(deployment.updates.field, "part_s", {})
+        parts: dict[str, float] = getattr(updates.field, "part_s", {})
         spent_s = sum(s for part, s in parts.items() if part not in _OFF_THE_WAY)
-        arrivals = deployment.updates.buffer.arrivals
         if counts:
-            self._rows.append((arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
-        self._seen, self._spent_s = arrivals, spent_s
+            self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
+        self._seen, self._spent_s = updates.buffer.arrivals, spent_s
 
-    def measured(self, deployment: VirtualDeployment) -> dict[str, float]:
-        """update_ms, and view_ms for each frame that has arrived: least squares over the updates, and what
-        decoding a frame takes."""
-        if len(self._rows) < 2:
+    def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
+        """Of an update, and of each frame that has arrived: least squares over the updates, and what decoding
+        a frame of ``items`` takes."""
+        frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
+        if not spent_ms.any():
             return {"update_ms": 0.0, "view_ms": 0.0}
-        frames, spent_ms = (np.array(column, float) for column in zip(*self._rows))
-        spread = float(((frames - frames.mean()) ** 2).sum())
-        slope = float(((frames - frames.mean()) * spent_ms).sum() / spread) if spread else 0.0
-        view_ms = min(max(slope, 0.0), float(spent_ms.mean() / max(frames.mean(), 1.0)))
-        items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
+        slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
+        view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
         begun = time.thread_time()
         ViewDecoder().views(items)
-        decoding_ms = 1e3 * (time.thread_time() - begun) / max(len(items), 1)
-        return {
-            "update_ms": float(spent_ms.mean() - view_ms * frames.mean()),
-            "view_ms": view_ms + decoding_ms,
-        }
+        decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
+        update_ms = float(spent_ms.mean() - view_ms * frames.mean())
+        return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
 
 
 def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
