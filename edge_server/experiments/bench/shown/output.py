@@ -100,7 +100,8 @@ def _first(figures: Figures, name: str, variant: str) -> dict[str, Any] | None:
 
 def _mean(runs: Iterable[Figures], kind: str, key: str) -> str:
     """Mean of a figure in ms, without decimals."""
-    return number(mean_or_none([run[kind][key] for run in runs]), 0)
+    mean = mean_or_none([run[kind][key] for run in runs])
+    return number(None if mean is None else round(mean), 0)
 
 
 def _pair(run: Figures | None) -> str:

@@ -19,7 +19,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     options = {"gaussians": 256, "start": 128, "seed_cells": 8}
     edge = {"field": "splat", "field_options": options, "lpips": "none", "grace_ms": 0.0}
     monkeypatch.setattr(rows, "EDGES", {"layers": {**edge, "updates": "arrivals"}, "before": edge})
-    monkeypatch.setattr(runs, "QUICK_SECONDS", 0.9)
+    monkeypatch.setattr(runs, "QUICK_SECONDS", 0.6)
     cheap = runs.replace(runs._LAYERS_RUN, steps=1, epoch_ms=100.0)
     monkeypatch.setattr(runs, "_LAYERS_RUN", cheap)
     monkeypatch.setattr(runs, "_CYCLE_RUN", runs.replace(cheap, compute=runs.Compute(ms_per_update=200.0)))
