@@ -26,12 +26,15 @@ _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
 # Largest differences of a drawn walk from the scene's own: shift of its center, factors of radii and speed.
 # Within these it stays clear of the furniture.
 _SHIFT_M, _RADIUS_FACTORS, _SPEED_FACTORS = 0.2, (0.75, 1.15), (0.7, 1.4)
+COURSES = ("loop", "stops", "reverses", "jumps")
 
 
 @dataclass(frozen=True)
 class Walk:
     """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``. direction: seen from above,
-    1.0 is counterclockwise, -1.0 clockwise. start_s: time into the loop at instant 0."""
+    1.0 is counterclockwise, -1.0 clockwise. start_s: time into the loop at instant 0. course: of ``COURSES``:
+    round and round; with a stop of PERIOD_UNIT_S after each PERIOD_UNIT_S; half a loop and backwards again;
+    half a loop and at once back to its start."""
 
     center: tuple[float, float]
     radii: tuple[float, float]
@@ -40,10 +43,26 @@ class Walk:
     still: bool = False
     direction: float = 1.0
     start_s: float = 0.0
+    course: str = "loop"
+
+    @property
+    def repeats_s(self) -> float:
+        """Time after which the motion repeats."""
+        return 2.0 * self.period_s if self.course == "stops" else self.period_s
 
     def phase(self, t_s: float) -> float:
         """Phase in [0, 1) of an instant."""
-        return motion.phase_of(t_s + self.start_s, self.period_s)
+        return motion.phase_of(self._walked_s(t_s) + self.start_s, self.period_s)
+
+    def _walked_s(self, t_s: float) -> float:
+        """Time of walking the loop that leads to where the course is at an instant."""
+        if self.course == "stops":
+            stops, rest_s = divmod(t_s, 2.0 * PERIOD_UNIT_S)
+            return stops * PERIOD_UNIT_S + min(rest_s, PERIOD_UNIT_S)
+        if self.course == "reverses":
+            rest_s = t_s % self.period_s
+            return min(rest_s, self.period_s - rest_s)
+        return t_s % (0.5 * self.period_s) if self.course == "jumps" else t_s
 
     def at(self, phase: float) -> tuple[float, float]:
         """Position on the floor at a phase, in metres."""

@@ -29,7 +29,7 @@ _RANGES = (
     ("supersample", 1, 8),
 )
 # Parameters that do not change static parts.
-_MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed")
+_MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "course", "people")
 # Renderers kept to be shared by scenes with the same static parts: of two sets of cameras.
 _MAX_STATIC_RENDERERS = 2 * MAX_CAMERAS
 _STATIC_RENDERERS: dict[tuple[str, str], CameraRenderer] = {}

@@ -6,14 +6,14 @@ and more than 15 degrees from every other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.person import make_walk, walking_person
+from camera_node.synthetic.person import COURSES, make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
@@ -32,14 +32,26 @@ _LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 @dataclass(frozen=True)
 class Params(MovingParams):
-    """speed_m_per_s: mean speed of the person's parts; 0 stands still."""
+    """speed_m_per_s: mean speed of the person's parts; 0 stands still. course: loop, stops, reverses or
+    jumps, how the person walks it. people: 1, or 2, half a loop apart."""
 
     horizontal_fov_deg: float = 64.0
+    course: str = "loop"
+    people: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.course not in COURSES:
+            raise ValueError(f"course: expected one of {', '.join(COURSES)}, got {self.course!r}")
+        if self.people not in (1, 2):
+            raise ValueError(f"people: expected 1 or 2, got {self.people}")
 
 
 def build(params: Params) -> Scene:
     """The room as a scene."""
     walk = make_walk(_LOOP_CENTER, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
+    walk = replace(walk, course=params.course)
+    walks = (walk, replace(walk, start_s=walk.start_s + 0.5 * walk.period_s))[: params.people]
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.80, falloff_m=4.0, tint=(1.0, 0.96, 0.88),
@@ -50,9 +62,9 @@ def build(params: Params) -> Scene:
         params=params,
         cameras=build_rig(_ANGLES_DEG, _TARGET, _RADIUS_M, params.count, pinhole(params)),
         target=_TARGET,
-        world=World((*_shell(), *_furniture()), (walking_person(walk),), light),
+        world=World((*_shell(), *_furniture()), tuple(map(walking_person, walks)), light),
         bounds=np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]]),
-        period_s=walk.period_s,
+        period_s=walk.repeats_s,
         moving=not walk.still,
     )
 

@@ -43,6 +43,8 @@ foreground masks of lego against its alpha: IoU and ms by options, what detector
            one), and dB that a field gains; needs FRESHFIELD_DATA; not part of all
 peer       seconds to 20 and 25 dB on lego and kitchen, beside nerfstudio's nerfacto where it is installed and
            the same field in plain torch; needs FRESHFIELD_DATA; not part of all
+shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
+           perfect field would show, and where the decibels go; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
            each stage; needs the extra surface; not part of all
 
@@ -52,13 +54,14 @@ with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on
 
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
-MORE = ("embed", "foreground", "peer", "surface")
+MORE = ("embed", "foreground", "peer", "shown", "surface")
 # Parts that store each figure as it comes, and skip what is known.
-_RESUMABLE = ("field", "track", "drift", "options", "surface")
-_FOLLOWING = ("track", "drift")
+_RESUMABLE = ("field", "track", "drift", "options", "shown", "surface")
+_FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
 # Flags of some parts only.
 _ONLY_OF = {
-    "field": _RESUMABLE, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
+    "field": tuple(part for part in _RESUMABLE if part != "shown"), "resume": (*PARTS, *MORE),
+    "only": ("options",), "scene": (*_FOLLOWING, "shown"),
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
     "option": _FOLLOWING, "model": ("embed", "foreground"),
 }  # fmt: skip
@@ -81,6 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for flag, of in _ONLY_OF.items():
         if getattr(args, flag) and not set(parts) & set(of):
             parser.error(f"--{flag.replace('_', '-')} is for {', '.join(of)}; asked for: {', '.join(parts)}")
+    if set(parts) & set(_FOLLOWING) and (unknown := set(args.scene) - set(_FOLLOWED)):
+        parser.error(f"--scene {', '.join(unknown)}: {', '.join(_FOLLOWING)} know {', '.join(_FOLLOWED)}")
     try:
         args.option = parse_options(args.option)
         for name in args.field or field_names():
@@ -127,10 +132,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
     add("--model", type=Path, metavar="FILE", help="of embed, foreground: a YOLO ONNX [the shipped ones]")
+    add("--scene", action="append", default=[], metavar="NAME",
+        help=f"of track, drift: {', '.join(_FOLLOWED)} [track: both; drift: room]; of shown: a row of its "
+        "table, or any scenario of a synthetic world [all rows]")  # fmt: skip
     track = parser.add_argument_group("of track and drift")
     add = track.add_argument
-    scenes = ("room", "kitchen")
-    add("--scene", action="append", default=[], choices=scenes, help="[track: both; drift: room]")
     add(
         "--updates",
         type=at_least(1),

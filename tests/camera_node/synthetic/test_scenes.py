@@ -253,6 +253,29 @@ def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path():
     assert np.ptp([w.center[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
 
 
+def test_a_walk_may_stop_reverse_or_jump_and_two_may_walk_it():
+    def seen(t_s: float, **params):
+        return make_scene("room", {**SMALL, "supersample": 1, **params}).render("cam00", t_s)
+
+    def same(a, b) -> bool:
+        return np.abs(a.astype(int) - b).max() <= 1
+
+    loop = make_scene("room", SMALL)
+    assert not same(seen(0.5), seen(0.9))
+    assert same(seen(0.5, course="stops"), seen(0.5)) and same(seen(1.3, course="stops"), seen(0.7))
+    assert same(seen(0.7, course="stops"), seen(1.1, course="stops"))
+    assert make_scene("room", {**SMALL, "course": "stops"}).period_s == 2 * loop.period_s
+    back_s = 0.5 * loop.period_s + 0.4
+    assert same(seen(back_s, course="reverses"), seen(loop.period_s - back_s))
+    assert same(seen(back_s, course="jumps"), seen(0.4)) and not same(seen(back_s), seen(0.4))
+    two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * loop.period_s)
+    still = np.abs(one.astype(int) - other).max(axis=2) <= 1
+    assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
+    for params, message in (({"course": "hops"}, "course: expected one of loop"), ({"people": 3}, "1 or 2")):
+        with pytest.raises(SceneError, match=message):
+            make_scene("room", params)
+
+
 def test_a_person_on_a_clockwise_walk_faces_forward():
     walk = next(w for s in range(9) if (w := make_walk((0.0, 1.0), (0.7, 0.5), 1.0, s)).direction < 0)
     for phase in np.linspace(0, 1, 13):

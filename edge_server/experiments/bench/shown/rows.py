@@ -1,0 +1,103 @@
+"""The scenes of the table: shipped ones, some that nothing was tuned on, and the general cases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from freshfield.scenario import Scenario, load, parse
+
+FIRST_SEED = 7
+DRAWN = (101, 102, 103)
+# Not all cores: what is charged is measured on one.
+_LAYERS = {
+    "field": "splat", "field_options": {"layers": True, "threads": 1}, "policy": {"name": "all"},
+    "updates": "arrivals", "lpips": "none", "grace_ms": 1000.0,
+}  # fmt: skip
+_BEFORE = {**_LAYERS, "field_options": {"layers": False, "threads": 1}, "updates": "cycle"}
+EDGES: dict[str, dict[str, Any]] = {"layers": _LAYERS, "before": _BEFORE}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene.
+
+    base: a scenario, shipped or a file. changes: keys of its sections, instead of its own.
+    seeds: how often what is shown is measured, with seeds from FIRST_SEED on.
+    split: whether network and computing are told apart.
+    """
+
+    name: str
+    base: str = "room"
+    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    seeds: int = 1
+    split: bool = True
+
+    def scenario(self, seed: int, edge: str) -> Scenario:
+        """The scene under one of ``EDGES``. Raises ScenarioError."""
+        base = load(self.base, seed)
+        cameras = {"ids": list(base.cameras), "held_out": list(base.held_out), "phase": base.phase}
+        if "count" in (given := self.changes.get("cameras", {})):
+            cameras.pop("ids")
+        source = {**base.source, **self.changes.get("source", {})}
+        return parse(
+            {
+                "name": self.name, "seed": seed, "cameras": {**cameras, **given}, "source": source,
+                "channel": dict(self.changes.get("channel", base.channel)), "edge": EDGES[edge],
+            },
+            base.path,
+        )  # fmt: skip
+
+
+def drawn(seed: int) -> Row:
+    """A scene that nothing was tuned on: place, walk, speed, number and lens of the cameras, and network are
+    drawn from the seed."""
+    rng = np.random.default_rng([seed, 31])
+    base = str(rng.choice(["room", "tower"]))
+    source: dict[str, Any] = {
+        "motion_seed": int(rng.integers(1000)),
+        "speed_m_per_s": round(float(rng.uniform(0.5, 2.0)), 2),
+        "horizontal_fov_deg": round(float(rng.uniform(-8, 8)) + (64 if base == "room" else 90), 1),
+        "fps": float(rng.choice([10.0, 15.0, 20.0])),
+    }
+    count, preset = int(rng.integers(9, 18)), str(rng.choice(["ch5", "ch6", "ch6-high"]))
+    cameras, channel = {"count": count, "phase": "spread"}, {"preset": preset}
+    name = (
+        f"drawn {seed}: {base}, {count - 1} cameras, {source['fps']:g} fps, "
+        f"{source['speed_m_per_s']:g} m/s, {preset}"
+    )
+    return Row(name, base, {"source": source, "cameras": cameras, "channel": channel})
+
+
+def _case(name: str, **changes: Any) -> Row:
+    return Row(f"room, {name}", "room", changes, split=False)
+
+
+ROWS: tuple[Row, ...] = (
+    Row("room", seeds=5),
+    Row("room19", "room19", {"cameras": {"phase": "spread"}}, seeds=3),
+    Row("tower", "tower", seeds=3),
+    Row("room, 3 m/s", "room", {"source": {"speed_m_per_s": 3.0}}, seeds=3),
+    *map(drawn, DRAWN),
+    _case("stop and go", source={"params": {"course": "stops"}}),
+    _case("reversals", source={"params": {"course": "reverses"}}),
+    _case("teleports", source={"params": {"course": "jumps"}}),
+    _case("two people", source={"params": {"people": 2}}),
+    _case("exposure drifts", source={"effects": {"exposure_drift": None}}),
+    _case("noise", source={"effects": {"sensor_noise": {"read_noise_counts": 5.0}}}),
+    _case("JPEG at 50", source={"quality": 50}),
+    _case("6 cameras", cameras={"count": 7}),
+    _case("4 cameras", cameras={"count": 5}),
+    _case("1 camera", cameras={"count": 2}),
+    _case("cameras locked", cameras={"phase": "locked"}),
+)
+
+
+def find(names: tuple[str, ...]) -> list[Row]:
+    """The rows of these names, and any other scenario of a synthetic world by its name or file; all ROWS
+    without names."""
+    known = {row.name: row for row in ROWS}
+    return [known.get(name) or Row(name, name) for name in names] or list(ROWS)

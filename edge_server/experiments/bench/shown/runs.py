@@ -1,0 +1,182 @@
+"""Runs of the table: what is shown, and the same where computing is free and where nothing is late.
+
+``layers`` is the splat field in layers on arrivals, a decision each 20 ms; ``before`` the same field without
+layers, in cycles of 250 ms. Computing is charged as measured on one core: an update of layers by the part
+times of the run in which nothing is late, the static field's training left out, which another core does; a
+cycle by what docs/studies.md charges.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.bench.shown.rows import FIRST_SEED, Row, find
+from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.common.tables import number
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
+from edge_server.fidelity.psnr import psnr_of_mse
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.field_updater import FieldUpdater
+from edge_server.live.state import Publication
+from edge_server.live.view_decoder import ViewDecoder
+from freshfield.scenario import Scenario, ScenarioError
+
+SECONDS, QUICK_SECONDS = 12.0, 8.0
+SHOWN_EVERY_MS = 50.0
+_OFF_THE_WAY = ("static field", "static renders")  # parts of an update that another core does
+_CYCLE = Compute(ms_per_step=3.0, ms_per_update=70.0)
+_LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
+_CYCLE_RUN = replace(_LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """edge: of ``rows.EDGES``. late: the scene's own network, else an ideal one. charged: computing takes
+    time. splits: tells network and computing apart. repeats: runs with each seed of a row, else with the
+    first."""
+
+    edge: str
+    late: bool = True
+    charged: bool = True
+    splits: bool = False
+    repeats: bool = False
+
+    def settings(self, compute: Compute) -> RunSettings:
+        """compute: what an update of layers takes."""
+        if self.edge == "before":
+            return _CYCLE_RUN
+        return replace(_LAYERS_RUN, compute=compute) if self.charged else _LAYERS_RUN
+
+
+FIRST_VARIANT = "nothing late"  # measures what the others are charged
+VARIANTS = {
+    FIRST_VARIANT: Variant("layers", late=False, charged=False),
+    "shown": Variant("layers", repeats=True),
+    "computing free": Variant("layers", charged=False, splits=True),
+    "before": Variant("before"),
+}
+
+
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{ROW: {VARIANT: {seed: means over the instants of the last third}}}. BenchError: a scenario cannot
+    run."""
+    seconds = QUICK_SECONDS if run.quick else SECONDS
+    try:
+        for row in find(run.scenes):
+            world = KnownWorld(row.scenario(FIRST_SEED, "layers"))
+            for name, variant in VARIANTS.items():
+                repeats = row.seeds if variant.repeats and not run.quick else 1
+                for seed in range(FIRST_SEED, FIRST_SEED + repeats):
+                    if row.split or not variant.splits:
+                        _measure(row, name, seed, world, run.store, seconds)
+    except ScenarioError as error:
+        raise BenchError(str(error)) from None
+    return run.store.results
+
+
+def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultStore, seconds: float) -> None:
+    """One run, unless it is known."""
+    variant, scenario = VARIANTS[name], row.scenario(seed, VARIANTS[name].edge)
+    if not variant.late:
+        scenario = replace(scenario, channel={"preset": "ideal"})
+    compute = Compute()
+    if name != FIRST_VARIANT:
+        cost = store.results[row.name][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
+        compute = Compute(ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
+    sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
+    settings = variant.settings(compute)
+    known = {
+        "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(settings),
+        "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
+    }  # fmt: skip
+    work = partial(_run, scenario, settings, world, seconds)
+    found = store.get(row.name, name, str(seed), settings=known, compute=work)
+    text = ", ".join(f"{part} {number(found['psnr_db'][part])}" for part in PARTS)
+    print(f"  {row.name}, {name}, seed {seed}: {text} dB", flush=True)
+
+
+def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: float) -> dict[str, Any]:
+    """One deployment, its last third."""
+    truth = ShownTruth(world, from_ns=round(seconds * 2e9 / 3))
+    costs = UpdateCosts()
+
+    def published(publication: Publication) -> None:
+        truth.published(publication)
+        costs.published(deployment.updates, publication.published_ns >= truth.from_ns)
+
+    deployment = build_deployment(scenario, settings, truth=truth, on_published=published)
+    costs.watch(deployment.updates.field)
+    begun = time.monotonic()
+    deployment.run(seconds)
+    if not truth.instants:
+        raise ScenarioError(f"{scenario.path}: nothing was published within {seconds:g} s")
+    items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
+    found = {**means(truth.instants), "cost": costs.measured(items), "wall_s": time.monotonic() - begun}
+    return {**found, "updates": len(deployment.publications), "charged": vars(settings.compute)}
+
+
+class UpdateCosts:
+    """What updates of a field in layers take, by the processor time of the thread."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
+        self._seen, self._spent_s = 0, 0.0
+
+    def watch(self, field: Any) -> None:
+        """Have the field measure its parts by the time of this thread, which others cannot slow down."""
+        if hasattr(field, "part_s"):
+            field.now = field.part_s.now = time.thread_time
+
+    def published(self, updates: FieldUpdater, counts: bool) -> None:
+        """Take an update in. counts: or leave it out."""
+        parts: dict[str, float] = getattr(updates.field, "part_s", {})
+        spent_s = sum(s for part, s in parts.items() if part not in _OFF_THE_WAY)
+        if counts:
+            self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
+        self._seen, self._spent_s = updates.buffer.arrivals, spent_s
+
+    def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
+        """Of an update, and of each frame that has arrived: least squares over the updates, and what decoding
+        a frame of ``items`` takes."""
+        frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
+        if not spent_ms.any():
+            return {"update_ms": 0.0, "view_ms": 0.0}
+        slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
+        view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
+        begun = time.thread_time()
+        ViewDecoder().views(items)
+        decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
+        update_ms = float(spent_ms.mean() - view_ms * frames.mean())
+        return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
+
+
+def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """psnr_db, squared_error by part; the perfect field's of ``newest`` and ``mean``; lag_ms p50 and p95;
+    mean ages."""
+    lags = [i["lag_ms"] for i in instants if i["lag_ms"] is not None]
+    found: dict[str, Any] = {
+        "instants": len(instants),
+        "lag_ms": {f"p{q}": float(np.percentile(lags, q)) if lags else None for q in (50, 95)},
+        "age_ms": {
+            name: statistics.fmean(i["age_ms"][name] or 0.0 for i in instants)
+            for name in instants[0]["age_ms"]
+        },
+    }  # fmt: skip
+    for kind in ("shown", "newest", "mean"):
+        errors = {part: [e for i in instants if (e := i[kind][part]) is not None] for part in PARTS}
+        place = found if kind == "shown" else found.setdefault("perfect", {}).setdefault(kind, {})
+        place["psnr_db"] = {
+            p: statistics.fmean(map(psnr_of_mse, e)) if e else None for p, e in errors.items()
+        }
+        place["squared_error"] = {p: statistics.fmean(e) if e else None for p, e in errors.items()}
+    return found

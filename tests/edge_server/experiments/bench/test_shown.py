@@ -1,0 +1,82 @@
+"""``edge-server bench shown``: every run of a row once, tables that say what was measured."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from edge_server.cli import main as edge_server
+from edge_server.experiments.bench.shown import output, rows, runs
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scenario of little pixels; fields of little steps."""
+    options = {"gaussians": 256, "start": 128, "seed_cells": 8}
+    edge = {"field": "splat", "field_options": options, "lpips": "none", "grace_ms": 0.0}
+    monkeypatch.setattr(rows, "EDGES", {"layers": {**edge, "updates": "arrivals"}, "before": edge})
+    monkeypatch.setattr(runs, "QUICK_SECONDS", 0.6)
+    cheap = runs.replace(runs._LAYERS_RUN, steps=1, epoch_ms=100.0)
+    monkeypatch.setattr(runs, "_LAYERS_RUN", cheap)
+    monkeypatch.setattr(runs, "_CYCLE_RUN", runs.replace(cheap, compute=runs.Compute(ms_per_update=200.0)))
+    path = tmp_path / "small.yaml"
+    source = {"kind": "world", "scene": "room", "width": 24, "height": 24, "params": {"supersample": 1}}
+    cameras = {"count": 4, "held_out": ["cam00"]}
+    path.write_text(yaml.safe_dump({"cameras": cameras, "source": source, "channel": {"preset": "ch5"}}))
+    return path
+
+
+def test_a_scenario_is_measured_once_and_tabulated(small: Path, capsys) -> None:
+    out = small.with_name("present.json")
+    words = ["bench", "shown", "--quick", "--scene", str(small), "--json", str(out)]
+    assert edge_server(words) == 0
+    found: dict[str, Any] = json.loads(out.read_text())["shown"][str(small)]
+    assert set(found) == set(runs.VARIANTS) and all(set(runs_of) == {"7"} for runs_of in found.values())
+    late, before, ideal = (found[v]["7"] for v in ("shown", "before", "nothing late"))
+    assert ideal["age_ms"]["network"] == 0.0 < late["age_ms"]["network"]
+    assert before["age_ms"]["computing"] == pytest.approx(200.0) and ideal["age_ms"]["computing"] == 0.0
+    assert before["age_ms"]["mean"] > late["age_ms"]["mean"] > ideal["age_ms"]["mean"]
+    for run in (late, before, ideal):  # no field is better than the perfect one of the same ages
+        perfect = run["perfect"]
+        assert run["squared_error"]["moving"] > perfect["newest"]["squared_error"]["moving"]
+        assert perfect["newest"]["squared_error"]["moving"] <= perfect["mean"]["squared_error"]["moving"]
+    text = out.with_suffix(".md").read_text()
+    assert f"| {small} | before | 1 | {before['psnr_db']['whole']:.2f} |" in text
+    assert "ms ago; before, " in text and "![shown](shown.png)" in text
+    assert out.with_name("shown.png").stat().st_size > 1000
+    written = out.read_text()
+    assert edge_server([*words, "--resume"]) == 0
+    again = json.loads(out.read_text())["shown"]
+    assert again == json.loads(written)["shown"], "nothing was measured twice"
+    capsys.readouterr()
+
+
+def test_the_shares_add_up_to_what_is_shown() -> None:
+    def run(error: float, perfect: float) -> dict[str, Any]:
+        return {"7": {"squared_error": {"moving": error},
+                      "perfect": {"newest": {"squared_error": {"moving": perfect}}}}}  # fmt: skip
+
+    figures = {"x": {"nothing late": run(2.0, 0.1), "computing free": run(5.0, 1.1), "shown": run(10.0, 4.1)}}
+    assert output._shares(figures, "x") == pytest.approx([0.2, 0.4, 0.2, 0.2])  # of 10
+    figures["x"].pop("computing free")
+    assert output._shares(figures, "x") == []
+
+
+def test_every_row_can_be_made_and_drawn_ones_follow_from_their_seeds() -> None:
+    assert len({row.name for row in rows.ROWS}) == len(rows.ROWS)
+    for row in rows.ROWS:
+        for edge in rows.EDGES:
+            made = row.scenario(9, edge)
+            assert made.seed == 9 and made.source["kind"] == "world" and made.held_out == ("cam00",)
+    assert rows.drawn(101) == rows.drawn(101) and rows.drawn(101) != rows.drawn(102)
+    assert [row.name for row in rows.find(("tower", "cell"))] == ["tower", "cell"]
+    assert rows.find(()) == list(rows.ROWS)
+
+
+def test_a_scene_that_is_not_known_is_refused(tmp_path: Path, capsys) -> None:
+    assert edge_server(["bench", "shown", "--quick", "--scene", "fox"]) == 1
+    assert "expected a source of kind world" in capsys.readouterr().err
