@@ -104,12 +104,11 @@ def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outco
     shown = [s for s in deployment.shown if begin_ns <= s.published_ns < end_ns]
     updates = [p for p in deployment.publications if begin_ns <= p.published_ns < end_ns]
     names = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
-    scores = [mean_or_none([getattr(s, name) for s in shown]) for name in names]
     return Outcome(
-        *scores,
+        **{name: mean_or_none([getattr(s, name) for s in shown]) for name in names},
         aaoi_ms=mean_or_none([p.aaoi_ms for p in updates]),
-        views=float(np.mean([p.views for p in updates])) if updates else 0.0,
-        wait_ms=float(np.mean([p.update_ms for p in updates])) if updates else 0.0,
+        views=mean_or_none([p.views for p in updates]) or 0.0,
+        wait_ms=mean_or_none([p.update_ms for p in updates]) or 0.0,
     )
 
 

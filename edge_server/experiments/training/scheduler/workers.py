@@ -8,7 +8,7 @@ are evaluated there. A known evaluation is not repeated; with a file, not even b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from multiprocessing import get_context
@@ -175,8 +175,9 @@ class WorkerPool:
 
     def judge(self, setting: Setting, seeds: Sequence[int], who: str | Actor) -> Iterator[dict[str, Any]]:
         """``deployed.judge`` of each episode."""
-        sent = [self._send(s, _judge, setting, [(s, who)]) for s in seeds]
-        for one in sent:
+        sent: Iterable[Future[list[Any]]] = (self._send(s, _judge, setting, [(s, who)]) for s in seeds)
+        # In this process one is done when it is sent: each is given as soon as it is.
+        for one in sent if self.jobs == 1 else list(sent):
             yield one.result()[0]
 
     def _results(self, setting: Setting, tasks: Sequence[_Task]) -> Iterator[tuple[list[str], list[Any]]]:
