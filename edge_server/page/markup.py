@@ -248,8 +248,6 @@ def channel_line(channel: dict[str, Any]) -> str:
     delay = channel.get("drawn_delay_ms")
     mean_ms = delay.get("mean") if isinstance(delay, dict) else None
     parts = [str(channel[key]) for key in ("preset", "discipline") if channel.get(key)]
-    if channel.get("state"):
-        parts.append(f"state {channel['state']}")
     if isinstance(mean_ms, int | float):
         parts.append(f"mean delay {mean_ms:.0f} ms")
     for key in ("forwarded", "dropped_busy", "superseded", "lost"):
