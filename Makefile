@@ -11,7 +11,7 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 
 # Options of `make demo`.
-SCENARIO ?= deploy/scenarios/room.yaml
+SCENARIO ?= deploy/scenarios/card.yaml
 # Seconds (60s, 5m) after everything is up; 0 = until Ctrl-C.
 FOR ?= 60s
 OUT ?= runs/demo

@@ -232,6 +232,30 @@ def following(part: str) -> str:
     return table(head[: len(rows[0])], rows)
 
 
+def card() -> str:
+    """What policies show in the scenario card, and the learnt one against all."""
+    found = measured("deploy/scenarios/card/scores.json")
+    rows = [
+        [name, *(f"{row['own_seed'][m]:.2f}" for m in ("psnr_db", "psnr_moving_db")),
+         f"{row['own_seed']['views']:.1f}"]
+        for name, row in found["policies"].items()
+    ]  # fmt: skip
+    learnt = found["policies"]["learnt"]
+    whole, moving = (_interval(learnt[f"{m}_over_all"]) for m in ("psnr_db", "psnr_moving_db"))
+    omegas = ", ".join(f"{state} {_interval(ms, 0)} ms" for state, ms in learnt["omega_ms"].items())
+    return (
+        table(("policy", "shown, dB", "moving", "views an update"), rows)
+        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}. The learnt policy "
+        f"minus `all`, paired over {found['seeds']} other seeds and motions: {whole} dB, moving {moving}. "
+        f"Its mean threshold by the channel's state: {omegas}."
+    )
+
+
+def _interval(values: Sequence[float | None], digits: int = 2) -> str:
+    mean, low, high = ("-" if v is None else f"{v:.{digits}f}" for v in values)
+    return f"{mean} [{low}, {high}]"
+
+
 def _one_decimal(text: str) -> str:
     return re.sub(r"-?\d+\.\d+", lambda number: re.sub(r"^-(?=0\.0$)", "", f"{float(number[0]):.1f}"), text)
 
@@ -258,6 +282,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "track": lambda: following("track"),
     "drift": lambda: following("drift"),
     "limits": limits,
+    "card": card,
 }
 
 

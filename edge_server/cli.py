@@ -80,6 +80,10 @@ _COMMANDS = {
         "experiments.virtual.simulate",
         "a scenario's whole deployment in virtual time, repeatable bit for bit",
     ),
+    "costs": (
+        "experiments.virtual.costs",
+        "what an update of a scenario takes on this machine, for virtual time to charge",
+    ),
     "chaos": (
         "experiments.virtual.chaos",
         "small deployments in virtual time with faults from seeds, and what must hold after each",

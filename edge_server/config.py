@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge_server.scheduler import Policy, resolve_checkpoint
-from freshfield.scenario import Scenario, read_section
+from freshfield.scenario import Scenario, ScenarioError, read_section
 
 if TYPE_CHECKING:
     from edge_server.embed import EmbeddingConfig
@@ -110,8 +111,10 @@ class EdgeConfig:
     deadline_ms: instead of it, the time from decision to publication. The setting that spends it best is
     looked up in ``frontier``, and the fitting time follows how busy the machine is.
     frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; None: the shipped one.
-    steps, compute: of an update in virtual time, its optimizer steps and what it costs (``zero``, or
-    ms_per_step and ms_per_update).
+    steps, compute: of an update in virtual time, its optimizer steps and what it costs: ``zero``, the
+    milliseconds of ``ComputeConfig``, or a file of ``edge-server costs``, relative to the scenario.
+    scores: what policies reach in virtual time, for the page: the values of a scores.json of ``edge-server
+    train-scheduler --hold``, which a scenario names relative to itself.
     grace_ms: how long the first update waits for cameras that have not reported.
     lpips: network to score with, where its weights are installed; none turns it off.
     noisy_truth: held-out frames are noisy video, so that the bound of moving pixels follows their noise.
@@ -142,6 +145,7 @@ class EdgeConfig:
     foreground: Any = None  # as embedding
     learn: LearnConfig | None = None
     export: ExportConfig | None = None
+    scores: Any = None
 
     def __post_init__(self) -> None:
         for name, least in (("update_ms", 10.0), ("deadline_ms", 20.0)):
@@ -186,6 +190,8 @@ def read_config(scenario: Scenario) -> EdgeConfig:
     section = dict(scenario.edge)
     if section.get("compute") == "zero":
         section["compute"] = {}
+    elif isinstance(section.get("compute"), str):
+        section["compute"] = _read_json(scenario, "compute", section["compute"]).get("compute")
     if section.get("embedding") is not None:
         from edge_server.embed import read_embedding
 
@@ -194,6 +200,24 @@ def read_config(scenario: Scenario) -> EdgeConfig:
         from edge_server.foreground import read_foreground
 
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
+    if section.get("scores") is not None:
+        section["scores"] = _read_json(scenario, "scores", section["scores"])
+        if not isinstance(section["scores"].get("policies"), dict):
+            raise ScenarioError(f"{scenario.path}: edge.scores: not a scores.json of train-scheduler --hold")
     config = read_section(EdgeConfig, section, f"{scenario.path}: edge")
     name = resolve_checkpoint(config.policy.name, scenario.path.parent)
     return dataclasses.replace(config, policy=dataclasses.replace(config.policy, name=name))
+
+
+def _read_json(scenario: Scenario, key: str, name: str) -> dict[str, Any]:
+    """An object in a JSON file that the scenario names, relative to it. Raises ScenarioError."""
+    if not isinstance(name, str):
+        raise ScenarioError(f"{scenario.path}: edge.{key}: expected the name of a file, got {name!r}")
+    path = scenario.path.parent / name
+    try:
+        found = json.loads(path.read_text())
+        if isinstance(found, dict):
+            return found
+        raise ValueError("expected a JSON object")
+    except (OSError, ValueError) as error:
+        raise ScenarioError(f"{scenario.path}: edge.{key}: {path}: {error}") from None

@@ -41,7 +41,8 @@ class Selection:
     earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
     others: other frames that these cameras delivered since the last selection, where the field wants every
     frame and has time for them.
-    arrivals: number of frames of all cameras since the last selection.
+    arrivals: number of frames since the last selection, of all cameras; where the field wants every frame, of
+    those that the update uses.
     """
 
     plan: SelectionWindow
@@ -89,6 +90,7 @@ class FieldUpdater:
         self.buffer = buffer
         self.on_arrivals = on_arrivals
         self._selected_of = 0  # arrivals at the last selection
+        self._selected: dict[str, BufferedFrame] = {}  # the newest selected frame of each camera
         self.decoder = ViewDecoder(foreground)
         self.embedder = embedder
         self.embeddings: EmbeddingCache | None = None
@@ -177,6 +179,10 @@ class FieldUpdater:
         self._selected_of += arrivals
         items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget))
         before = tuple(earlier[c] for i in items if (c := i.frame.camera) in earlier)
+        if self.field.frame_s is not None:
+            own = {item.frame.camera: item for item in items}
+            arrivals = len(others) + sum(self._selected.get(c) is not item for c, item in own.items())
+            self._selected |= own
         return Selection(plan, now_ns, items, before, others, arrivals)
 
     def _most_new(self, budget: Budget | None) -> int | None:
@@ -252,11 +258,18 @@ class FieldUpdater:
 
 
 def open_updater(
-    scenario: Scenario, config: EdgeConfig, policy: Policy, field: Field, start_ns: int, resumed: bool = False
+    scenario: Scenario,
+    config: EdgeConfig,
+    policy: Policy,
+    field: Field,
+    start_ns: int,
+    resumed: bool = False,
+    embedder: EmbedderLike | None = None,
 ) -> FieldUpdater:
     """The updater of a scenario's training cameras, with what its edge section asks for.
 
     resumed: the field has been trained before (see ``Keyframes``).
+    embedder: one that several runs share; None opens the scenario's.
     Nothing of embedder, keyframes and foreground is imported unless asked for. Raises ScenarioError.
     """
     keyframes: Keyframes | None = None
@@ -274,7 +287,7 @@ def open_updater(
         except ForegroundError as error:
             raise ScenarioError(f"{scenario.path}: edge.foreground: {error}") from None
     try:
-        embedder = open_embedder(embedding_for(config, policy))
+        embedder = embedder or open_embedder(embedding_for(config, policy))
         buffer = FrameBuffer(scenario.training)
         on_arrivals = config.updates == "arrivals"
         return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground, on_arrivals)

@@ -147,6 +147,7 @@ class EdgeServer:
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
             channel=ReplacedJson(options.out / "channel.json").read,
+            scores=config.scores,
             field_name=config.field,
             decision=lambda: self.updater.policy.last_decision,
             embed=None if embedder is None else embedder.embed,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,7 @@ class EdgeState:
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
+    scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     learning: one line on a policy that learns while it is used; empty where none does.
     bounds: world box (2, 3) in metres of what the field represents, once known.
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
@@ -135,6 +136,7 @@ class EdgeState:
     channel: Callable[[], dict | None] = lambda: None
     decision: Callable[[], Decision | None] = lambda: None
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
+    scores: dict[str, Any] | None = None
     field_name: str = ""
     learning: Callable[[], str] = lambda: ""
     started: bool = False

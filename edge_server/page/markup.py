@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -189,6 +190,55 @@ def _bar(name: str, share: float, widest: float) -> str:
         f'<div style="{grid}"><span style="overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
         f'<div style="{bar}"></div>'
         f'<span style="text-align:right;font-variant-numeric:tabular-nums">{share:+.2f}</span></div>'
+    )
+
+
+def channel_state(channel: dict[str, Any] | None) -> str:
+    """The state that the channel's chain is in, among all its states, and since when; empty without one."""
+    channel = channel or {}
+    state, states, series = channel.get("state"), channel.get("states"), channel.get("series")
+    if not isinstance(state, str) or not isinstance(states, list) or len(states) < 2:
+        return ""
+    cells = ""
+    for k, name in enumerate(states):
+        look = f"border-left:3px solid {css(scale_color(k / (len(states) - 1)))};font-weight:600"
+        look = look if name == state else f"{_DIM};opacity:.6"
+        cells += (
+            f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{look}">{escape(str(name))}</span>'
+        )
+    since = ""
+    with suppress(KeyError, TypeError, ValueError, IndexError):  # of an emulator of another version
+        since = f"for {float(channel['uptime_s']) - float(series[-1][0]):.1f} s"  # type: ignore[index]
+    style = "padding:0 .9em .5em;font-size:.82em"
+    return f'<div style="{style}">channel {cells}<span style="{_DIM}">{since}</span></div>'
+
+
+def policy_scores(scores: dict[str, Any]) -> str:
+    """What policies reached in virtual time (``edge.scores``): a row each, with what the numbers are."""
+    cell = "padding:.1em .35em;text-align:right"
+    rows = ""
+    for name, row in scores["policies"].items():
+        over = [] if name == "all" else row.get("psnr_db_over_all", [])
+        difference = f"{over[0]:+.2f} [{over[1]:+.2f}, {over[2]:+.2f}]" if None not in over and over else ""
+        values = (number(row["own_seed"]["psnr_db"], 1), number(row["own_seed"]["views"], 1), difference)
+        rows += (
+            f'<tr><td style="{cell};text-align:left">{escape(name)}</td>'
+            + "".join(f'<td style="{cell}">{value}</td>' for value in values)
+            + "</tr>"
+        )
+    head = "".join(
+        f'<th style="{cell};font-weight:400">{n}</th>' for n in ("policy", "dB", "views", "over all, dB")
+    )
+    about = (
+        f"In virtual time, not now: {scores['seconds']:g} s of this scenario and its channel's seed "
+        f"{scores['seed']}, updates charged with what they take on {scores['machine']['cpu']}, "
+        f"{scores['machine']['cores']} cores; PSNR of what was shown. Over all: paired over "
+        f"{scores['seeds']} other seeds, 95 %."
+    )
+    return (
+        f'{note(about)}<div style="padding:0 .6em .5em"><table style="width:100%;border-collapse:collapse;'
+        f'font-size:.78em;font-variant-numeric:tabular-nums"><thead style="{_DIM}"><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
     )
 
 

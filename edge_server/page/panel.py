@@ -35,6 +35,7 @@ class Panel:
         gui.main_panel.set_width(MAIN_WIDTH)
         gui.add_html(markup.INTRO)
         self._status = gui.add_html("")
+        self._channel_state = gui.add_html("", visible=False)
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
         self._compared_update: int | None = None
@@ -44,6 +45,9 @@ class Panel:
             self.controls = ControlPanel(server, state)
             self.surface = MeshLayer(server, state)
         self._explanation = DecisionExplanation(gui, state)
+        if state.scores is not None:
+            with gui.add_folder("What policies reach"):
+                gui.add_html(markup.policy_scores(state.scores))
         side = gui.add_panel()
         with side.add_tab("Timelines"):
             self._timelines = Timelines(gui)
@@ -67,6 +71,8 @@ class Panel:
         self._status.content = markup.status(summary(self._state, cameras, publications))
         self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
+        self._channel_state.content = markup.channel_state(channel)
+        self._channel_state.visible = bool(self._channel_state.content)
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
             self._channel.visible = True

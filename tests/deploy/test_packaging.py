@@ -68,7 +68,7 @@ def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() ->
     (torch,) = re.finditer(r"install .*--no-deps +(torch==\S+)", plan)
     rest = plan.index("-e '.[edge,embed,up]'")
     assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
-    assert "deploy/up.py deploy/scenarios/room.yaml --for 60s" in plan
+    assert "deploy/up.py deploy/scenarios/card.yaml --for 60s" in plan
     assert requirement("torch").specifier == Requirement(torch[1]).specifier
     for early in re.findall(r"install .*'(numba\S+)' '(opencv\S+)'", plan)[0]:
         assert requirement(Requirement(early).name).specifier == Requirement(early).specifier

@@ -17,7 +17,20 @@ from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir
 
 FILES = sorted(SCENARIO_FOLDER.glob("*.yaml"))
-NAMES = {"room", "room19", "tile", "tower", "ideal", "fox", "lego", "people", "kitchen", "cell"}
+NAMES = {
+    "room",
+    "room19",
+    "tile",
+    "tower",
+    "ideal",
+    "fox",
+    "lego",
+    "people",
+    "kitchen",
+    "cell",
+    "card",
+    "thesis",
+}
 
 
 def test_the_promised_scenarios_are_there() -> None:

@@ -73,7 +73,8 @@ def started(tmp_path: Path) -> Iterator:
 
 def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    shipped = {f"freshfield/scenarios/{path.name}" for path in (ROOT / "deploy/scenarios").glob("*.yaml")}
+    scenarios = ROOT / "deploy/scenarios"
+    shipped = {f"freshfield/scenarios/{path.relative_to(scenarios)}" for path in scenarios.rglob("*.*")}
     models = {f"edge_server/embed/models/{p.name}" for p in (ROOT / "edge_server/embed/models").iterdir()}
     assert shipped <= names and models <= names
     assert {"freshfield_up/cli.py", "edge_server/frontier.json"} <= names

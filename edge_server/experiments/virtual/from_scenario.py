@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from camera_node.build import build_cameras
 from camera_node.capture import Camera
@@ -22,6 +23,9 @@ from edge_server.live.state import Publication
 from edge_server.scheduler import make_policy
 from freshfield.scenario import Scenario, ScenarioError
 
+if TYPE_CHECKING:
+    from edge_server.embed.cache import EmbedderLike
+
 # Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
 _CACHE_BYTES = 512 * 2**20
 
@@ -36,6 +40,7 @@ def build_deployment(
     data: Path | None = None,
     on_published: Callable[[Publication], None] | None = None,
     truth: Truth | None = None,
+    embedder: EmbedderLike | None = None,
 ) -> VirtualDeployment:
     """``scenario`` in virtual time, from its seed.
 
@@ -46,6 +51,7 @@ def build_deployment(
     data: folder of recorded data sets.
     on_published: called with each publication.
     truth: of ``build_truth``, where several runs share it.
+    embedder: one that several runs share.
 
     Raises ScenarioError or DatasetError.
     """
@@ -60,7 +66,7 @@ def build_deployment(
     return VirtualDeployment(
         cameras or training_cameras(scenario, data),
         channel,
-        open_updater(scenario, edge, policy, field, start_ns=0),
+        open_updater(scenario, edge, policy, field, start_ns=0, embedder=embedder),
         settings,
         scenario.seed,
         truth or build_truth(scenario, source, edge, scorer or Scorer(), data),

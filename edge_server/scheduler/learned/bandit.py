@@ -1,7 +1,8 @@
 """A learner's checkpoint as a policy: ``bandit:FILE``, live and in virtual time.
 
 It decides as the checkpoint was trained to: a set of cameras at the instant of selection, a threshold, or a
-wait; by default the most probable action, with ``explore`` a sampled one.
+wait; by default the most probable action, with ``explore`` a sampled one. Where its specification says so
+(``hold_ms``), a decision serves several updates, and only the first of them looks at the state.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ class BanditPolicy(Policy):
     def _decide(self, epoch: Epoch) -> NDArray[Any]:
         if epoch.state is None:
             raise ValueError(f"{self.name} needs to see more than ages, which is not offered here")
-        actor = self.actor  # the online trainer may replace it meanwhile
+        actor, last = self.actor, self.last_decision  # the online trainer may replace the actor meanwhile
+        hold_ns = round(actor.spec.hold_ms * 1e6)
+        if hold_ns and last is not None and last.now_ns // hold_ns == epoch.now_ns // hold_ns:
+            return last.action
         state = epoch.state(actor.spec.layout.parts)
         actions, logps = actor.act([state], self._rng if self.explore else None)
         action = np.asarray(actions[0])

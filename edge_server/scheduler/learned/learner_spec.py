@@ -30,6 +30,7 @@ class Spec:
     over ``cameras`` cameras in their order.
     hidden: width of all layers.
     start: every camera's probability before learning.
+    hold_ms: a decision holds until the next multiple of it; 0: every update has one of its own.
     learning_rate, minibatch, max_gradient: of Adam's steps; max_gradient clips the gradient's norm.
     clip: epsilon of (5.23).
     passes: over a batch; they end early once the policy has moved by ``target_kl`` (nats).
@@ -43,6 +44,7 @@ class Spec:
     cameras: int | None = None
     hidden: int = 64
     start: float = 0.5
+    hold_ms: float = 0.0
     learning_rate: float = 3e-3
     clip: float = 0.2
     passes: int = 10
@@ -77,6 +79,8 @@ class Spec:
                 f"a first layer of {first} weights is larger than any that is trained here: fewer cameras, a "
                 "smaller dim or hidden"
             )
+        if not 0.0 <= self.hold_ms < 1e9:
+            raise ValueError(f"hold_ms: expected milliseconds from 0, got {self.hold_ms:g}")
         if not 0.0 < self.start < 1.0:
             raise ValueError(f"start: expected a probability between 0 and 1, got {self.start:g}")
         positive = (self.learning_rate, self.clip, self.max_gradient, self.target_kl)

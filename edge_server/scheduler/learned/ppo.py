@@ -214,8 +214,9 @@ class Learner:
             baseline = networks.value(torch, spec, self._value, features)
         spread = rewards.std(correction=0).item()
         left = (rewards - baseline).std(correction=0).item()
-        varies = spread > _CONSTANT
-        explained = 1.0 - (left / spread) ** 2 if varies else None
+        # A single reward varies against those before it, which standardized it.
+        varies = spread > _CONSTANT or (len(rewards) == 1 and self._rewards.variance > 0.0)
+        explained = 1.0 - (left / spread) ** 2 if spread > _CONSTANT else None
         # Where no action made a difference, only errors of V remain.
         advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
         steps, skipped = 0, 0
@@ -247,8 +248,11 @@ class Learner:
 
     @staticmethod
     def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:
-        """(B,) with mean 0 and, unless nearly constant, standard deviation 1. ``raw`` is in units of the
+        """(B,) with mean 0 and, unless nearly constant, standard deviation 1; a single one as it is, since V
+        alone is its baseline (5.24; algorithms 1 and 2 update after every slot). ``raw`` is in units of the
         rewards' standard deviation."""
+        if len(raw) == 1:
+            return raw
         centered = raw - raw.mean()
         return centered / torch.clamp(centered.std(correction=0), min=_MIN_ADVANTAGE_STD)
 

@@ -54,6 +54,26 @@ def test_the_table_marks_age_truth_use_and_refusals():
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
 
 
+def test_the_channels_state_stands_out_among_all_its_states():
+    channel = {"state": "high", "states": ["low", "high<"], "uptime_s": 12.5,
+               "series": [[3.0, "low"], [9.0, "high"]]}  # fmt: skip
+    html = markup.channel_state(channel | {"states": ["low", "high"]})
+    low, high = html.split("</span>")[:2]
+    assert "high" in high and "600" in high and "600" not in low and "for 3.5 s" in html
+    assert markup.channel_state(None) == markup.channel_state({"state": "-", "states": ["-"]}) == ""
+    assert "high&lt;" in markup.channel_state({**channel, "series": [["soon", "low"]]})
+
+
+def test_the_scores_of_policies_say_where_they_are_from():
+    row = {"own_seed": {"psnr_db": 27.96, "views": 12.0}, "psnr_db_over_all": [-0.03, -0.11, 0.05]}
+    scores = {"policies": {"all": row, "<learnt>": row}, "seconds": 10.0, "seed": 7, "seeds": 12,
+              "machine": {"cpu": "a machine", "cores": 2}}  # fmt: skip
+    html = markup.policy_scores(scores)
+    for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learnt&gt;"):
+        assert part in html
+    assert html.count("-0.03 [-0.11, +0.05]") == 1, "all is not compared with itself"
+
+
 def test_the_channel_line_shows_only_what_the_emulator_reports():
     line = markup.channel_line({"preset": "ch5", "discipline": "drop-new", "drawn_delay_ms": {"mean": 60.4},
                                 "counts": {"forwarded": 481, "dropped_busy": 12, "lost": 0}})  # fmt: skip

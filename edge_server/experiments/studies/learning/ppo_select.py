@@ -44,8 +44,8 @@ THESIS_MINUTES, WANTED_MINUTES = 30, 15
 # Cameras that reward: one, as in the thesis, or four all round, so that a policy cannot serve one viewpoint
 # alone.
 VIEWPOINTS = {"one viewpoint": ("cam00",), "four viewpoints": FOUR_VIEWPOINTS}
-# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view): the first is the
-# thesis's. Without a cost hardly any view ever harms, so using all is hard to beat.
+# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view): the first has the
+# thesis's reward and start. Without a cost hardly any view ever harms, so using all is hard to beat.
 CASES = (
     ("whole", "one viewpoint", True, 0.0), ("whole", "one viewpoint", False, 0.0),
     ("moving", "one viewpoint", False, 0.0), ("whole", "four viewpoints", False, 0.0),

@@ -19,8 +19,10 @@ from edge_server.experiments.common.arguments import (
     run_command,
 )
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import Maker
+from edge_server.experiments.training.scheduler.contest import LEARNT, contest
 from edge_server.experiments.training.scheduler.evaluation import (
     Evaluation,
     baseline_policies,
@@ -59,6 +61,10 @@ publication. Another camera, which is not trained on either, reports how well it
   --kind threshold   how old a view may be (6.3)
   --kind wait        how long to wait for younger ones (6.3, algorithm 2)
 
+  --hold MS          the scheduler decides in the running deployment, every MS milliseconds; the reward is
+                     what is shown until the next decision, with computing charged (edge.compute). The field
+                     is the scenario's
+
   --on whole | moving   whose PSNR it is. Of the whole image of a scene that hardly moves it teaches to ignore
                         how old views are; where nothing moves there are no moving pixels
 
@@ -72,10 +78,12 @@ In a world each episode has a motion of its own, so that it is tested on motions
 small (--size) and the field is quick (--field), so that there are many decisions.
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
-apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. After Ctrl-C the same
-command goes on, bit for bit; so it does whatever --jobs is.
+apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. With --hold these two
+are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
+Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
 """
-LEARNT = "learnt"
+# Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
+_HOLD_LEAD_MS = 5000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -119,6 +127,10 @@ def _train_and_evaluate(
     if not args.test:
         draw_curve(args.out / "training.png", rows)
         return
+    if config.spec.hold_ms:
+        draw_curve(args.out / "training.png", rows)
+        _contest(args, setting, learner.actor, pool)
+        return
     kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
     candidates: dict[str, Maker | Actor] = {**baseline_policies(omegas, kinds), LEARNT: learner.actor}
@@ -132,6 +144,21 @@ def _train_and_evaluate(
         "motions": setting.draws_motions,
     }  # fmt: skip
     _report(args.out, evaluation, kinds[0], rows, about)
+
+
+def _contest(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
+    """Fixed policies and the learnt one in the scenario as it is: its own size, all its training cameras."""
+    scenario = load(args.scenario)
+    report = () if set(setting.report) == set(scenario.held_out) else setting.report
+    scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
+    as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
+    weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
+    found = contest(
+        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "contest.jsonl",
+        lambda line: print(f"  {line}", flush=True),
+    )  # fmt: skip
+    write_json(args.out / "scores.json", found, indent=1)
+    actor.save(args.out / "actor.npz")
 
 
 def _report(
@@ -155,16 +182,19 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
-    if args.field:
-        if args.field not in field_names():
-            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
-        edge["field"] = args.field
-        edge["field_options"] = {"effort": "low"} if args.field in ("splat", "voxel", "ngp") else {}
+    quick = ("" if args.hold else "splat") if args.field is None else args.field
+    if quick:
+        if quick not in field_names():
+            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {quick!r}")
+        edge["field"] = quick
+        edge["field_options"] = {"effort": "low"} if quick in ("splat", "voxel", "ngp") else {}
     if args.distance == "perceptual":
         edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})
     edge["policy"] = {"name": "all"}
     report = _reporting(args, scenario)
     held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
+    if args.hold and not set(report) <= set(scenario.held_out):  # the spared camera rewards
+        report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
         given,
@@ -173,6 +203,8 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch,
         decisions=args.decisions,
+        lead_ms=_HOLD_LEAD_MS if args.hold else 1000.0,
+        span_ms=args.hold * args.decisions or 6000.0,
         compute=read_config(given).compute,
         parts=_parts(args.parts),
     )
@@ -202,7 +234,7 @@ def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
 
 
 def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
-    name = args.reward or ("set" if args.kind == "select" else "corrected")
+    name = args.reward or ("set" if args.kind == "select" or args.hold else "corrected")
     network = read_config(setting.scenario).lpips
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
@@ -216,6 +248,7 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         layout_of(setting, setting.parts),
         _omegas(args),
         network=args.network,
+        hold_ms=args.hold,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
@@ -226,10 +259,15 @@ def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
         return OMEGAS_MS.get(args.kind, ())
     if args.kind == "select":
         raise ValueError("--omegas: --kind select chooses cameras, not an omega")
+    first, dots, last = args.omegas.partition("..")
     try:
+        if dots:
+            return tuple(float(ms) for ms in range(int(first), int(last) + 1))
         return tuple(float(v) for v in args.omegas.split(","))
     except ValueError:
-        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120, got {args.omegas!r}") from None
+        raise ValueError(
+            f"--omegas: expected milliseconds such as 20,60,120 or 0..120, got {args.omegas!r}"
+        ) from None
 
 
 def _parts(text: str) -> tuple[str, ...]:
@@ -256,6 +294,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")
     add("--episodes", type=int, default=600, metavar="N", help="[%(default)s]")
     add("--decisions", type=int, default=4, metavar="N", help="of an episode [%(default)s]")
+    add("--hold", type=float, default=0.0, metavar="MS",
+        help="decide in the running deployment, every MS milliseconds")  # fmt: skip
     add("--batch", type=int, default=10, metavar="N", help="episodes of one update [%(default)s]")
     add("--tries", type=int, default=2, metavar="N", help="actions tried at a decision [%(default)s]")
     add("--reward", choices=tuple(REWARDS), help="[set for select, else corrected]")
@@ -278,13 +318,14 @@ def _parser() -> argparse.ArgumentParser:
         metavar="P,...",
         help=f"of the state: {', '.join(STATE_PARTS)} [%(default)s]",
     )
-    add("--omegas", metavar="MS,...", help="what threshold and wait choose from")
+    add("--omegas", metavar="MS,...", help="what threshold and wait choose from; A..B: every one")
     add("--network", choices=("pooled", "flat"), default="pooled",
         help="pooled takes any number of cameras, flat is the thesis's [%(default)s]")  # fmt: skip
     add("--scratch", action="store_true", help="updates begin with nothing, as in the thesis")
     add("--fit-steps", type=int, metavar="N", help="of an update [20; 50 with --scratch]")
     add("--size", type=int, default=64, metavar="PX", help="of a world's pictures, 0: its own [%(default)s]")
-    add("--field", default="splat", metavar="NAME", help="representation, '': the scenario's [%(default)s]")
+    add("--field", metavar="NAME",
+        help="representation, '': the scenario's ['' with --hold, else splat]")  # fmt: skip
     add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")
     add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
     add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")

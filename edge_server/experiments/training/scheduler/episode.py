@@ -182,13 +182,14 @@ class EpisodeFactory:
         self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=open_listed_perceptual(edge.metrics))
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)
+        self._last: tuple[int, Stage] | None = None
         self._field: tuple[int, Field] | None = None
-        self._embedder: Embedder | None = None
+        self.embedder: Embedder | None = None
         if "semantics" in setting.parts:
             # Loaded only where the state includes semantics.
             from edge_server.embed import EmbeddingConfig, make_embedder
 
-            self._embedder = make_embedder(edge.embedding or EmbeddingConfig())
+            self.embedder = make_embedder(edge.embedding or EmbeddingConfig())
         self._episodes: OrderedDict[int, Episode] = OrderedDict()
 
     def scenario(self, seed: int) -> Scenario:
@@ -196,16 +197,20 @@ class EpisodeFactory:
         return self.setting.seeded(seed, self._moving)
 
     def stage(self, seed: int) -> Stage:
-        """Truth and training cameras of an episode."""
-        return self._shared or self._stage(self.scenario(seed))
+        """Truth and training cameras of an episode; the last one's keep what they have rendered."""
+        if self._shared is not None:
+            return self._shared
+        if self._last is None or self._last[0] != seed:
+            self._last = seed, self._stage(self.scenario(seed))
+        return self._last[1]
 
     def embeddings(self) -> FrameEmbeddings | None:
         """A new cache for one episode: frame numbers repeat across episodes with different images."""
-        if self._embedder is None:
+        if self.embedder is None:
             return None
         from edge_server.embed.cache import EmbeddingCache
 
-        return EmbeddingCache(self._embedder, ViewDecoder().view)
+        return EmbeddingCache(self.embedder, ViewDecoder().view)
 
     def field(self, seed: int) -> Field:
         """The field of an episode, in any state: the caller must reset or load it."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import choice_of_action
-from edge_server.experiments.training.scheduler.episode import DecisionPoint, Outcome
+from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
+from edge_server.experiments.training.scheduler.episode import Outcome
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.workers import Progress, WorkerPool
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -147,6 +148,8 @@ def _train_batch(
     """One update of the weights; returns its row of the log. TrainingError where the first batch has no
     reward."""
     episode_seeds = config.seeds(number)
+    if config.spec.hold_ms:
+        return _train_deployed_batch(setting, config, pool, learner, episode_seeds)
     moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
     pool.forget(setting, episode_seeds)
     # The tries of one decision stand together.
@@ -158,21 +161,63 @@ def _train_batch(
     outcomes = pool.evaluate(setting, requests, periodic_progress(say, f"fits of batch {number + 1}"))
     found = [config.reward.of(outcome) for outcome in outcomes]
     # Rewards that lack a term cannot be compared with others.
-    rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
+    rewards = np.array([_complete(r) for r in found])
     if number == 0 and not np.isfinite(rewards).any():
         raise TrainingError(_missing_reward_reason(outcomes, found))
     advantages = subtract_sibling_baseline(rewards, config.tries)
     update = learner.update(learner.batch(states, actions, logps, advantages))
-    row: Row = {
-        "batch": number, "episodes": episode_seeds[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
+    row = _row(config, episode_seeds, found, outcomes, actions) | {
         "decisions": len(moments), "fits": len(each), "carried_out": pool.evaluated - before,
         "processor_seconds": pool.cost_s(setting, requests),
+    }  # fmt: skip
+    return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
+
+
+def _row(
+    config: TrainingConfig,
+    episode_seeds: range,
+    found: Sequence[RewardTerms],
+    outcomes: Sequence[Outcome],
+    actions: Iterable[Any],
+) -> Row:
+    """What a batch's row of the log says of its decisions."""
+    first = config.seeds(0)[0]
+    row: Row = {
+        "batch": (episode_seeds[0] - first) // config.batch, "episodes": episode_seeds[-1] + 1 - first,
+        "reward": _mean([_complete(r) for r in found]),
     }  # fmt: skip
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
     if config.spec.action != "select":
         row["omega_ms"] = _mean([config.spec.omegas_ms[int(a)] for a in actions])
-    return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
+    return row
+
+
+def _train_deployed_batch(
+    setting: Setting, config: TrainingConfig, pool: WorkerPool, learner: Learner, episode_seeds: range
+) -> Row:
+    """``_train_batch`` where the learner decides in the running deployment (``deployed``)."""
+    each: list[Decided] = []
+    advantages: list[NDArray[np.float64]] = []
+    for tries in pool.play(setting, episode_seeds, learner.actor, config.tries):
+        rewards = [[_complete(config.reward.of(d.outcome)) for d in one] for one in tries]
+        advantages += sibling_advantages(tries, config.spec.hold_ms, rewards)
+        each += [d for one in tries for d in one]
+    found = [config.reward.of(d.outcome) for d in each]
+    if not any(r.complete for r in found):
+        raise TrainingError(_missing_reward_reason([d.outcome for d in each], found))
+    decisions = [d.decision for d in each]
+    batch = learner.batch(
+        [d.state for d in decisions], np.array([d.action for d in decisions]),
+        np.array([d.logp for d in decisions]), np.concatenate(advantages),
+    )  # fmt: skip
+    row = _row(config, episode_seeds, found, [d.outcome for d in each], [d.action for d in decisions])
+    update = dataclasses.asdict(learner.update(batch))
+    return row | {"decisions": len(each)} | {k: v for k, v in update.items() if k != "reward"}
+
+
+def _complete(found: RewardTerms) -> float:
+    return float("nan") if found.total is None or not found.complete else found.total
 
 
 def periodic_progress(say: Callable[[str], None], what: str) -> Progress:
@@ -228,8 +273,13 @@ def _new_learner(setting: Setting, config: TrainingConfig, pool: WorkerPool) -> 
 
     spec = config.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
-        first: list[DecisionPoint] = [m for e in pool.draw(setting, config.seeds(0)) for m in e]
-        spec = dataclasses.replace(spec, layout=spec.layout.standardized([m.state for m in first]))
+        if spec.hold_ms:
+            untrained = Learner(spec, config.seed).actor
+            played = pool.play(setting, config.seeds(0), untrained, 1)
+            states = [d.decision.state for tries in played for one in tries for d in one]
+        else:
+            states = [m.state for e in pool.draw(setting, config.seeds(0)) for m in e]
+        spec = dataclasses.replace(spec, layout=spec.layout.standardized(states))
     return Learner(spec, config.seed)
 
 

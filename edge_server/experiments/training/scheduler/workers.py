@@ -8,7 +8,7 @@ are evaluated there. A known evaluation is not repeated; with a file, not even b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from multiprocessing import get_context
@@ -19,8 +19,10 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.training.scheduler.deployed import Decided, judge, play
 from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.scheduler.learned.actor import Actor
 
 Request = tuple[int, int, Choice]
 """What to evaluate: seed of an episode, number of a decision, choice."""
@@ -57,6 +59,16 @@ def _evaluate(setting: Setting, folders: Folders, requests: Sequence[Request]) -
         outcome = episode.evaluate(number, choice)
         found.append((outcome, round((episode.spent_s - before_s) * 1e3, 3)))
     return found
+
+
+def _play(setting: Setting, folders: Folders, tries: Sequence[tuple[int, Actor, int]]) -> list[list[Decided]]:
+    return [play(_factory(setting, folders), *one) for one in tries]
+
+
+def _judge(
+    setting: Setting, folders: Folders, runs: Sequence[tuple[int, str | Actor]]
+) -> list[dict[str, Any]]:
+    return [judge(_factory(setting, folders), *one) for one in runs]
 
 
 def _init_process() -> None:
@@ -153,6 +165,20 @@ class WorkerPool:
         """Processor time of evaluated requests: episodes, warm fields, fits and scores. Each counts once,
         with the time that it took when it was carried out. KeyError for an unknown one."""
         return math.fsum(self._known[key][1] for key in {self._key(setting, r) for r in requests}) / 1e3
+
+    def play(
+        self, setting: Setting, seeds: Sequence[int], actor: Actor, tries: int
+    ) -> list[list[list[Decided]]]:
+        """The decisions of every try of each episode in which ``actor`` decides."""
+        sent = [self._send(s, _play, setting, [(s, actor, turn) for turn in range(tries)]) for s in seeds]
+        return [one.result() for one in sent]
+
+    def judge(self, setting: Setting, seeds: Sequence[int], who: str | Actor) -> Iterator[dict[str, Any]]:
+        """``deployed.judge`` of each episode."""
+        sent: Iterable[Future[list[Any]]] = (self._send(s, _judge, setting, [(s, who)]) for s in seeds)
+        # In this process one is done when it is sent: each is given as soon as it is.
+        for one in sent if self.jobs == 1 else list(sent):
+            yield one.result()[0]
 
     def _results(self, setting: Setting, tasks: Sequence[_Task]) -> Iterator[tuple[list[str], list[Any]]]:
         """Keys and results of the tasks, as they finish."""

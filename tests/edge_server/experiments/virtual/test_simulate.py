@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from edge_server.config import ComputeConfig, read_config
+from edge_server.experiments.virtual.costs import fitted
+from edge_server.experiments.virtual.costs import main as costs_main
 from edge_server.experiments.virtual.from_scenario import training_cameras
 from edge_server.experiments.virtual.simulate import main
 from edge_server.report.explain_command import main as explain
@@ -113,6 +116,26 @@ def test_the_scenario_says_zero_or_milliseconds():
     for wrong in ("free", {"ms_per_step": -1.0}, {"ms_per_update": float("nan")}, {"seconds": 1}):
         with pytest.raises(ScenarioError, match="compute"):
             config(wrong)
+
+
+def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):
+    out = tmp_path / "costs.json"
+    assert costs_main([str(write(tmp_path, steps=5)), "--seconds", "1.2", "--out", str(out)]) == 0
+    found = json.loads(out.read_text())["compute"]
+    assert sum(found.values()) > 0.0
+    assert read_config(load(write(tmp_path, compute="costs.json"))).compute == ComputeConfig(**found)
+    for wrong in ("missing.json", 3):
+        with pytest.raises(ScenarioError, match=r"edge\.compute"):
+            read_config(load(write(tmp_path, compute=wrong)))
+
+
+def test_costs_are_told_apart():
+    rng = np.random.default_rng(0)
+    steps, frames = rng.integers(1, 11, 200), rng.integers(0, 9, 200)
+    took_ms = 0.5 * steps + 2.0 * frames + 3.0
+    took_ms[:10] += 100.0  # while the machine did something else
+    found = fitted(np.column_stack([steps, frames, took_ms]))
+    assert (found.ms_per_step, found.ms_per_view, found.ms_per_update) == (0.5, 2.0, 3.0)
 
 
 def test_an_arm_keeps_real_time():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from edge_server.fields import checkpoint
+from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -55,6 +56,19 @@ def test_what_cameras_see_is_learned_from_embeddings():
     learner = Learner(Spec("threshold", problem.layout, OMEGAS_MS), 0)
     teach(learner, problem, 8)
     assert regret(learner, problem) < 0.02
+
+
+def test_a_batch_of_one_decision_learns_against_the_value():
+    """Algorithms 1 and 2 update after every slot: centred by its batch, an advantage would be zero."""
+    learner = Learner(Spec("wait", Waits().layout, OMEGAS_MS), 0)
+    teach(learner, Waits(), 1)
+    for better in (1.0, -1.0):
+        states = [Waits().draw(77).state]
+        actions, before = learner.act(states)
+        worth = learner.value(states) + better
+        learner.update(learner.batch(states, actions, before, worth))
+        after = d.omega_log_probabilities(np, learner.actor.logits(learner.spec.layout.batch(states)))
+        assert better * (after[0, actions[0]] - before[0]) > 0.0
 
 
 def test_a_flat_network_learns_as_the_thesis_has_it():

@@ -14,8 +14,10 @@ import yaml
 
 from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.training.scheduler import command, contest
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
+from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
 from edge_server.experiments.training.scheduler.episode import Choice
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
@@ -36,11 +38,13 @@ from edge_server.experiments.training.scheduler.trainer import (
 )
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
-from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.scheduler.online.online_trainer import choose_reward
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
 
@@ -257,6 +261,57 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (out / "contest.csv").exists() and (out / "policy.npz").exists()
     assert main([*words[:-3], "1", "--test", "0", "--out", str(out)]) == 0
     assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
+
+
+def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored_beside_fixed_ones(
+    tmp_path: Path, capsys, monkeypatch
+):
+    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven"))
+    monkeypatch.setattr(contest, "SPAN_MS", 600.0)
+    monkeypatch.setattr(command, "_HOLD_LEAD_MS", 1200.0)
+    file, out = tmp_path / "small.yaml", tmp_path / "out"
+    costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
+    file.write_text(yaml.safe_dump({**RAW, "channel": {"preset": "swing"}, "edge": {
+        **RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals"}}))  # fmt: skip
+    words = [str(file), "--kind", "threshold", "--hold", "200", "--omegas", "50,200", "--episodes", "2",
+             "--batch", "1", "--decisions", "3", "--size", "0", "--test", "1", "--jobs", "1",
+             "--out", str(out)]  # fmt: skip
+    assert main(words) == 0
+    assert "rewarded from cam03; judged from cam00" in capsys.readouterr().out
+    rows = read_log(out)
+    assert all(4 <= row["decisions"] <= 6 for row in rows), (
+        "two tries of three decisions, once frames are there"
+    )
+    scores = json.loads((out / "scores.json").read_text())
+    found = scores["policies"]
+    assert scores["seed"] == RAW["seed"] and scores["compute"]["ms_per_view"] == 1.0
+    assert found["all"]["psnr_db_over_all"][0] == 0.0 and found["learnt"]["own_seed"]["psnr_db"] > 5.0
+    assert found["age-driven"]["own_seed"]["views"] < found["all"]["own_seed"]["views"] == 4.0
+    assert set(found["learnt"]["own_seed"]["omega_ms"]) <= {"low", "high"}
+    before = (out / "contest.jsonl").read_text()
+    assert main(words) == 0  # finished: nothing is run again
+    assert (out / "contest.jsonl").read_text() == before
+    assert json.loads((out / "scores.json").read_text())["policies"] == found
+    actor = Actor.load(out / "actor.npz")
+    assert actor.spec.hold_ms == 200.0 and (out / "actor.npz").stat().st_size < 4e5
+
+
+def test_tries_are_compared_with_the_others_that_decided_at_the_same_time():
+    def decided(*at_ms: int) -> list[Decided]:
+        made = []
+        for t in at_ms:
+            state = State(np.zeros(1), np.zeros((1, 6)), None, np.ones(1, bool))
+            decision = Decision(0, t * 1_000_000, state, np.array(0), 0.0, None)  # type: ignore[arg-type]
+            made.append(Decided(decision, None, ""))  # type: ignore[arg-type]
+        return made
+
+    tries = [decided(0, 110, 205), decided(3, 120), decided(7, 299)]
+    rewards = [[1.0, 2.0, 3.0], [4.0, float("nan")], [7.0, 5.0]]
+    found = sibling_advantages(tries, 100.0, rewards)
+    assert np.allclose(found[0], [1 - 5.5, np.nan, 3 - 5], equal_nan=True)
+    assert np.allclose(found[1], [0.0, np.nan], equal_nan=True)
+    assert np.allclose(found[2], [4.5, 2.0])
+    assert sibling_advantages(tries[:1], 100.0, rewards[:1])[0].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path, pool: WorkerPool):

@@ -1,0 +1,90 @@
+"""What fixed policies and a learnt one show in a scenario as it is, in virtual time with computing charged.
+
+All policies with the scenario's own seed, for the page; the learnt one and its reference with other seeds,
+too: one channel, one motion and the same instants for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from edge_server.experiments.common.result_store import ResultStore, content_key
+from edge_server.experiments.common.source_digest import source_digest
+from edge_server.experiments.common.statistics import Interval, interval, paired
+from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.experiments.training.scheduler.workers import WorkerPool
+from edge_server.report.machine import machine
+from edge_server.scheduler.learned.actor import Actor
+
+LEARNT = "learnt"
+REFERENCE = "all"
+CONTESTANTS = (REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "age-driven")
+# What is shown is scored for so long, after the lead of an episode.
+SPAN_MS = 8000.0
+
+
+def contest(
+    setting: Setting,
+    pool: WorkerPool,
+    seeds: range,
+    learnt: Actor,
+    weights: str,
+    known: Path,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """The scores of all policies as JSON values (the scenario key ``edge.scores``).
+
+    weights: name of the learnt policy's weights.
+    known: file of finished runs, read and appended to.
+    """
+    setting = dataclasses.replace(setting, span_ms=SPAN_MS)
+    own = dataclasses.replace(setting, motions=False)
+    own_seed = range(setting.scenario.seed, setting.scenario.seed + 1)
+    found: dict[str, Any] = {}
+    for name in CONTESTANTS:
+        who = learnt if name == LEARNT else name
+        found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
+        say(f"{name}: {found[name]['own_seed']['psnr_db']:.2f} dB shown with seed {setting.scenario.seed}")
+    runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
+            for who in (REFERENCE, LEARNT)}  # fmt: skip
+    for who, of in runs.items():
+        for m in ("psnr_db", "psnr_moving_db"):
+            values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
+            found[who][m] = _as_list(interval(list(values[who].values())))
+            found[who][f"{m}_over_{REFERENCE}"] = _as_list(paired(values[who], values[REFERENCE]))
+        if who == LEARNT:
+            found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
+    say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
+    return {
+        "scenario": setting.scenario.name, "seed": setting.scenario.seed, "seeds": len(seeds),
+        "lead_s": setting.lead_ms / 1e3, "seconds": setting.span_ms / 1e3, "judged_from": setting.scoring,
+        "policies": found, "compute": dataclasses.asdict(setting.compute), "machine": machine(),
+    }  # fmt: skip
+
+
+def _runs(
+    setting: Setting, pool: WorkerPool, seeds: range, who: str | Actor, weights: str, known: Path
+) -> list[dict[str, Any]]:
+    """``WorkerPool.judge`` of each seed; those in ``known`` are not run again."""
+    store = ResultStore.in_lines(known)
+    name = weights if isinstance(who, Actor) else who
+    keys = {seed: content_key([source_digest(), setting.key, name, seed], 32) for seed in seeds}
+    missing = [seed for seed in seeds if keys[seed] not in store.results]
+    for seed, run in zip(missing, pool.judge(setting, missing, who)):
+        store.put(keys[seed], result=run)
+    found = [store.results[keys[seed]] for seed in seeds]
+    store.close()
+    return found
+
+
+def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
+    """Mean omega in each state of the channel, with the interval over the runs that were in it."""
+    states = sorted({state for run in runs for state in run})
+    return {state: _as_list(interval([run.get(state) for run in runs])) for state in states}
+
+
+def _as_list(i: Interval) -> list[float | None]:
+    return [None if v != v else round(v, 4) for v in (i.mean, i.low, i.high)]

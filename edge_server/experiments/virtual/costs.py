@@ -1,0 +1,109 @@
+"""``edge-server costs``: what the updates of a scenario take on this machine, for virtual time to charge.
+
+The deployment runs in virtual time with updates of several lengths; each is timed, and the times are fitted
+by so much an update, a step and a frame taken in. What runs beside an update live, the static field of
+layers, is not charged.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.config import ComputeConfig, read_config
+from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.report.machine import machine, versions
+from freshfield.files import write_json
+from freshfield.scenario import Scenario, ScenarioError, load
+
+DESCRIPTION = """\
+What an update of a scenario takes on this machine: milliseconds an update, a step and a frame taken in. The
+file is named in a scenario (edge.compute: FILE), so that training and simulation charge the same.
+
+  edge-server costs card --out deploy/scenarios/card/costs.json
+"""
+# Steps of an update, as shares of the scenario's.
+_SHARES = (0.2, 0.6, 1.0)
+# The first part of a run builds the field; a busy machine's slowest updates are left out.
+_SETTLED_SHARE, _SLOWEST_SHARE = 0.5, 0.1
+_EPOCH_MS = 40.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = command_parser("costs", DESCRIPTION)
+    parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="S",
+        help="of virtual time, three times [%(default)g]")  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON to write")
+    add_folders(parser)
+    args = parser.parse_args(argv)
+    try:
+        found = measure(load(args.scenario), args.seconds, folders_of(args).data)
+    except (ScenarioError, DatasetError, ValueError) as error:
+        print(f"edge-server costs: {error}", file=sys.stderr)
+        return 2
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(args.out, found, indent=1)
+    print(", ".join(f"{name} {ms:g}" for name, ms in found["compute"].items() if ms), f"-> {args.out}")
+    return 0
+
+
+def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dict[str, Any]:
+    """The costs (``ComputeConfig``) as ``compute``, and how they were found."""
+    scenario = dataclasses.replace(
+        scenario, edge={**scenario.edge, "policy": {"name": "all"}, "compute": "zero", "embedding": None}
+    )
+    most = read_config(scenario).steps
+    rows = np.concatenate([_timed(scenario, max(1, round(share * most)), seconds, data) for share in _SHARES])
+    compute = fitted(rows)
+    return {
+        "compute": dataclasses.asdict(compute),
+        "scenario": scenario.name,
+        "updates": len(rows),
+        "median_ms": round(float(np.median(rows[:, 2])), 3),
+        "machine": machine(),
+        "versions": versions(),
+    }
+
+
+def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
+    """Non-negative least squares of milliseconds. rows: (n, 3), steps, frames taken in, milliseconds."""
+    kept = rows[rows[:, 2] <= np.quantile(rows[:, 2], 1.0 - _SLOWEST_SHARE)]
+    design = np.column_stack([kept[:, :2], np.ones(len(kept))])
+    a_step, a_view, an_update = (round(float(ms), 3) for ms in nnls(design, kept[:, 2])[0])
+    return ComputeConfig(ms_per_step=a_step, ms_per_update=an_update, ms_per_view=a_view)
+
+
+def _timed(scenario: Scenario, steps: int, seconds: float, data: Path | None) -> NDArray[np.float64]:
+    """(n, 3): steps, frames taken in and milliseconds of the updates of a run."""
+    settings = RunSettings(steps=steps, epoch_ms=_EPOCH_MS, score_every_ms=None)
+    deployment = build_deployment(scenario, settings, data=data)
+    updates, fit = deployment.updates, deployment.updates.fit
+    parts: dict[str, float] = getattr(updates.field, "part_s", {})
+    rows: list[tuple[float, float, float]] = []
+
+    def timed(selection: Any, budget: Any, publishes_ns: int | None = None) -> Any:
+        beside_s, began_s = parts.get("static field", 0.0), time.perf_counter()
+        done = fit(selection, budget, publishes_ns)
+        spent_s = time.perf_counter() - began_s - (parts.get("static field", 0.0) - beside_s)
+        if done is not None:
+            rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))
+        return done
+
+    updates.fit = timed  # type: ignore[method-assign]
+    deployment.run(seconds)
+    if len(rows) < 2:
+        raise ValueError(f"{scenario.path}: no updates in {seconds:g} s of virtual time")
+    return np.array(rows[round(_SETTLED_SHARE * len(rows)) :], float)
