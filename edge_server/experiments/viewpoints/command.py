@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import (
     OptionError,
@@ -16,12 +14,12 @@ from edge_server.experiments.common.arguments import (
     folders_of,
     run_command,
 )
-from edge_server.experiments.viewpoints.stage import Stage, open_stage
+from edge_server.experiments.viewpoints.drawing import draw_plan
+from edge_server.experiments.viewpoints.stage import open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
-from edge_server.report.style import CYCLE, GREY, INK, figure
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.plan import Budget, Plan, plan_capture
+from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.selector import SELECTORS, make_selector
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
@@ -66,7 +64,7 @@ def _run(args: argparse.Namespace) -> None:
     quality = {"psnr_db": score.psnr_db, "ssim": score.ssim, "lpips": score.lpips}
     about = {"scenario": stage.name, "seed": args.seed, "travel_weight": args.travel, "steps": args.steps}
     write_json(args.out / "plan.json", {**about, **plan.as_json(stage.candidates), "held_out": quality})
-    draw_plan(args.out / "plan.png", stage, plan)
+    draw_plan(args.out / "plan.png", stage, [(plan.selector, plan)])
     for n, stop in enumerate(plan.stops, 1):
         print(f"{n:3}  candidate {stop.candidate:3}  {1e3 * stop.seconds:6.0f} ms  {stop.why}")
     if plan.note:
@@ -90,40 +88,6 @@ def read_budget(text: str) -> Budget:
     except ValueError:
         raise OptionError(f"--budget {text}: expected views (8), metres (2.5m) or both (8,2.5m)") from None
     return Budget(views, path_m)
-
-
-def draw_plan(path: Path, stage: Stage, plan: Plan) -> None:
-    """Draw the candidates as seen from above the target, by their value at the last choice, and the path."""
-    candidates = stage.candidates
-    azimuth, height = _polar(candidates.directions)
-    x, y = height * np.sin(azimuth), -height * np.cos(azimuth)
-    values = plan.stops[-1].values if len(plan.stops) > 1 else np.full(len(candidates), np.nan)
-    with figure(path, height_inch=5.0) as (fig, axes):
-        at = axes[0, 0]
-        lost = ~candidates.reachable
-        known = np.isfinite(values)
-        at.scatter(x[lost], y[lost], marker="x", s=18, color=GREY, linewidths=0.8, label="not reachable")
-        closed = ~lost & ~known
-        at.scatter(x[closed], y[closed], s=14, color=GREY, label="closed")
-        shown = at.scatter(x[known], y[known], c=values[known], s=22, cmap="viridis", label="open")
-        if known.any():
-            fig.colorbar(shown, ax=at, label="value at the last choice")
-        order = plan.order
-        at.plot(x[order], y[order], color=CYCLE[1], linewidth=1.0)
-        for n, k in enumerate(order, 1):
-            at.annotate(
-                str(n), (x[k], y[k]), color=INK, fontsize=8, textcoords="offset points", xytext=(3, 3)
-            )
-        at.set_aspect("equal")
-        at.set_title(f"{stage.name}, {plan.selector}: {len(order)} views, {plan.path_m:.2f} m")
-        at.set_xlabel("from above: degrees from the zenith")
-        at.legend(loc="upper left", bbox_to_anchor=(1.25, 1.0))
-
-
-def _polar(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth (N,) in radians, 0 on the -y side, and angle (N,) from the zenith in degrees."""
-    azimuth = np.arctan2(directions[:, 0], -directions[:, 1])
-    return azimuth, np.rad2deg(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)))
 
 
 def _parser() -> argparse.ArgumentParser:
