@@ -17,8 +17,9 @@ from freshfield.geometry import Pinhole
 
 _CAMERAS_A_RUN = 8  # as many tile lists are kept at a time
 # What is known of a parameter without any view, as a share of what the views say of that parameter on
-# average over all Gaussians: it has the parameter's unit, and bounds what an unseen Gaussian is worth.
-PRIOR = 1e-2
+# average over all Gaussians: it has the parameter's unit, and bounds what an unseen Gaussian is worth. With
+# .01 the views go to the edge of the dome: on four captures of tile, 8 views gave 19.8 dB, with 1 22.2 dB.
+PRIOR = 1.0
 
 
 def information(
