@@ -36,6 +36,7 @@ STUDIES = {
     "representations": ("age.representations", "Representations"),
     "phase": ("age.trade_map", "Phase"),
     "viewpoints": ("viewpoints", "Viewpoints"),
+    "preferences": ("preferences", "Preferences"),
     "ppo-select": ("learning.ppo_select", "PpoSelect"),
     "ppo-wait": ("learning.ppo_wait", "PpoWait"),
     "ablation": ("learning.state_ablation", "Ablation"),
@@ -69,6 +70,7 @@ with 95 % intervals over seeds, and whether it holds.
   representations   figure 6.7: the same trade with other representations
   phase             where the trade exists: speed x delay x memory x compute, and what mask and freshen gain
   viewpoints        tables 4.1, 4.3, figures 4.7, 4.8: which views to take of an object that stands still
+  preferences       figure 4.6, tables 4.2, 4.3: what simulated experts' preferences teach
 
   ppo-select        figure 5.9: a scheduler that learns which views to use, against everything else
   ppo-wait          figure 6.8: one that learns how long to wait, or how old is too old, by traffic

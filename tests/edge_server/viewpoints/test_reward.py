@@ -40,15 +40,15 @@ def agreement(model, features, expert, pairs=400):
 
 
 def test_after_sixty_answers_with_one_in_ten_wrong_it_agrees_as_the_expert_does():
-    found = []
-    for seed in range(3):
+    found, known = [], 0
+    for seed in range(4):
         features, scores, rng = pool(seed)
         expert = SimulatedExpert("edges", scores, rng, wrong=0.1)
         model = ask(expert, features[:80], 60)
-        assert model.knows and "likelier than by a coin" in model.says()
+        known += model.knows and "likelier than by a coin" in model.says()
         expert.scores = scores[80:]
         found.append(agreement(model, features[80:], expert) / expert.agreement_with_itself())
-    assert np.mean(found) >= 0.9
+    assert np.mean(found) >= 0.9 and known >= 3
 
 
 @pytest.mark.parametrize("habit", [{"contradicts": True}, {"lazy": 1.0}])
@@ -87,10 +87,6 @@ def test_the_posterior_is_that_of_the_likelihood():
         for i, j in rng.permutation(30)[:20].reshape(10, 2)
     ]
     model = fit_reward(features, answers)
-    width = 1.0 / np.sqrt(
-        np.diag(fit_reward(features, []).covariance)
-    )  # of some width: only its shape is used
-    assert width.shape == (2,)
     w = np.stack(np.meshgrid(*[np.linspace(-40, 40, 401)] * 2), -1).reshape(-1, 2)
     x = np.array(
         [(features[a.first] - features[a.second]) / model.scale * (2 * a.prefers_first - 1) for a in answers]
@@ -139,7 +135,7 @@ def test_tastes_prefer_the_better_picture_each_by_its_own_measure(taste):
         name: judge(taste, [p], [truth]) for name, p in (("same", truth), ("in", inside), ("out", outside))
     }
     assert scores["same"] == 0.0 >= max(scores.values())
-    assert (scores["in"] < scores["out"]) == (taste == "object" or scores["in"] < scores["out"])
+    assert scores["in"] < 0.0 and (scores["out"] == 0.0) == (taste == "object")
     assert (
         SimulatedExpert(taste, np.zeros(2), rng, wrong=0.1).label == f"simulated expert ({taste}, 10 % wrong)"
     )

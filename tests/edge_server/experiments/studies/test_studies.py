@@ -17,8 +17,8 @@ from edge_server.experiments.studies.engine import Engine
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, run_study
 from edge_server.scheduler import make_policy
 
-# "metrics" and "viewpoints" run no deployments.
-NAMES = [n for n in STUDIES if n not in ("metrics", "viewpoints", *LEARNING)]
+NO_DEPLOYMENTS = ("metrics", "viewpoints", "preferences")
+NAMES = [n for n in STUDIES if n not in (*NO_DEPLOYMENTS, *LEARNING)]
 
 
 def request(tmp_path: Path, **more: Any) -> StudyRequest:
