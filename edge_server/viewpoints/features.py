@@ -23,14 +23,9 @@ GEOMETRY = (
 
 @dataclass(frozen=True)
 class StepFeatures:
-    """Features of taking each candidate next.
-
-    embeddings: (N, d) of the candidates' pictures by the YOLO backbone (4.8), standardized; None: geometry
-    only.
-    """
+    """Features of taking each candidate next."""
 
     candidates: Candidates
-    embeddings: Array | None = None
     _alike: Array = field(init=False, repr=False)
     _way: Array = field(init=False, repr=False)
     _place: Array = field(init=False, repr=False)
@@ -43,19 +38,13 @@ class StepFeatures:
         at = self.candidates.poses[:, :3, 3] - self.candidates.target
         place = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
         place = np.column_stack([place, place[:, 0] ** 2, place[:, 2] ** 2])
-        if self.embeddings is not None:
-            place = np.column_stack([place, self.embeddings])
         for name, value in (("_alike", alike), ("_way", way), ("_place", place)):
             object.__setattr__(self, name, value)
 
-    @property
-    def width(self) -> int:
-        return 2 * len(_WIDTHS_RAD) + 1 + self._place.shape[1]
-
     def actions(self, order: Sequence[int]) -> Array:
-        """(N, width) features of each candidate as the next view after those of ``order``: GEOMETRY, then
-        the embedding of its picture. How much better all reachable directions are seen by their nearest and
-        by their second nearest view; the way in metres; the place, in mean distances to the target."""
+        """(N, F) features of each candidate as the next view after those of ``order``, GEOMETRY: how much
+        better all reachable directions are seen by their nearest and by their second nearest view; the way in
+        metres; the place, in mean distances to the target."""
         seen = list(order)
         columns = []
         for alike in self._alike:
@@ -68,5 +57,5 @@ class StepFeatures:
         return np.column_stack([*columns, way, self._place])
 
     def trajectory(self, order: Sequence[int]) -> Array:
-        """(width,) the sum of the steps' features, as (4.12) sums a reward that is linear in them."""
-        return sum((self.actions(order[:t])[k] for t, k in enumerate(order)), np.zeros(self.width))
+        """(F,) the sum of the steps' features, as (4.12) sums a reward that is linear in them."""
+        return sum((self.actions(order[:t])[k] for t, k in enumerate(order)), np.zeros(len(GEOMETRY)))

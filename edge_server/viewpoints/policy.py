@@ -9,7 +9,7 @@ that are open.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class PolicyConfig:
 class Rows:
     """Turns a capture under way into the rows of a network.
 
-    steps: of the candidates, whose embeddings (N, d) are shown only once captured; None: geometry only.
+    embeddings: (N, d) of the candidates' pictures, shown only once captured; None: geometry only.
     """
 
     def __init__(self, candidates: Candidates, embeddings: Array | None, layout: StateLayout) -> None:
@@ -75,28 +75,29 @@ class Rows:
         ages = np.full(len(candidates), np.inf)
         for age, k in enumerate(reversed(order)):
             ages[k] = age * _STEP_MS
-        seen = np.zeros((len(candidates), self.layout.dim - len(GEOMETRY)))
+        # What is not captured yet has the usual embedding, which is 0 once it is standardized.
+        seen = np.tile(self.layout.centre[len(GEOMETRY) :], (len(candidates), 1))
         if self.embeddings is not None and len(order):
             seen[list(order)] = self.embeddings[list(order)]
         both = np.column_stack([self.steps.actions(order), seen])
         return self.layout.features(State(ages, self._poses, both.astype(np.float32), candidates.reachable))
 
 
-def layout_of(steps: StepFeatures, embedding: int, views: int, rng: np.random.Generator) -> StateLayout:
-    """The layout whose step features are standardized over random captures. embedding: width, 0 for none."""
+def layout_of(
+    steps: StepFeatures, embeddings: Array | None, views: int, rng: np.random.Generator
+) -> StateLayout:
+    """The layout whose step features are standardized over random captures, and embeddings (N, d) over all
+    candidates; None: without them."""
     reachable = np.flatnonzero(steps.candidates.reachable)
     some = [
         steps.actions(rng.choice(reachable, min(t, len(reachable)), replace=False))[reachable]
         for t in range(1, views + 1)
     ]
-    rows = np.concatenate(some)
-    centre = [*rows.mean(axis=0), *[0.0] * embedding]
-    spread = [*np.maximum(rows.std(axis=0), 1e-3), *[1.0] * embedding]
+    parts = [np.concatenate(some), *([] if embeddings is None else [embeddings])]
+    centre = np.concatenate([part.mean(axis=0) for part in parts])
+    spread = np.concatenate([np.maximum(part.std(axis=0), 1e-3) for part in parts])
     return StateLayout(
-        dim=len(centre),
-        age_scale_ms=_STEP_MS,
-        centre=tuple(map(float, centre)),
-        spread=tuple(map(float, spread)),
+        dim=len(centre), age_scale_ms=_STEP_MS, centre=tuple(centre.tolist()), spread=tuple(spread.tolist())
     )
 
 
@@ -104,26 +105,21 @@ def layout_of(steps: StepFeatures, embedding: int, views: int, rng: np.random.Ge
 class CandidatePolicy:
     """A trained policy as a selector: its values are logits.
 
-    weights: of the actor. embed: of pictures, standardized as in training; needed where the policy was
-    trained with embeddings.
+    weights: of the actor. embed: pictures to embeddings, as in training; needed where there were some.
     """
 
     spec: Spec
     weights: dict[str, NDArray[np.float64]]
     embed: Embed | None = None
     name: str = "ppo"
-    _known: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def values(self, state: CaptureState) -> Array:
         width = self.spec.layout.dim - len(GEOMETRY)
         embeddings = np.zeros((len(state.candidates), width))
-        if width:
-            if self.embed is None:
-                raise ViewpointError("this policy was trained with embeddings: give it the embedder")
-            for k, view in zip(state.order, state.views):
-                if k not in self._known:
-                    self._known[k] = self.embed([view.image])[0]
-                embeddings[k] = self._known[k]
+        if width and self.embed is None:
+            raise ViewpointError("this policy was trained with embeddings: give it the embedder")
+        if width and self.embed is not None:
+            embeddings[state.order] = self.embed([view.image for view in state.views])
         rows = Rows(state.candidates, embeddings, self.spec.layout).features(state.order)
         return np.asarray(networks.logits(np, self.spec, self.weights, rows[None])[0])
 
@@ -152,7 +148,8 @@ def train_policy(
     """Train a policy on ``reward``, of step features (..., GEOMETRY), such as ``RewardModel.reward``. Returns
     it with the mean return of each update (figure 4.6).
 
-    embeddings: (N, d) of the candidates' pictures, standardized. ViewpointError for fewer reachable
+    embeddings: (N, d) of the candidates' pictures, which the policy sees once they are captured; embed: makes
+        them, for its later use. ViewpointError for fewer reachable
     candidates than views.
     """
     import torch
@@ -161,8 +158,8 @@ def train_policy(
     if len(usable) < config.views:
         raise ViewpointError(f"{len(usable)} candidates can be reached, an episode has {config.views} views")
     rng = np.random.default_rng(seed)
-    steps, width = StepFeatures(candidates), 0 if embeddings is None else embeddings.shape[1]
-    layout = layout_of(steps, width, config.views, rng)
+    steps = StepFeatures(candidates)
+    layout = layout_of(steps, embeddings, config.views, rng)
     spec = Spec("select", layout, hidden=config.hidden, learning_rate=config.learning_rate)
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])

@@ -20,7 +20,7 @@ SELECTORS: dict[str, tuple[str, str, str]] = {
     "farthest": ("geometric", "FarthestPoint", "the candidate farthest from all earlier views"),
     "coverage": ("geometric", "Coverage", "most of the object's box newly seen, from its geometry alone"),
     "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far"),
-    "ppo": ("policy", "CandidatePolicy", "a policy learned from preferences (4.14); FILE as ppo:FILE"),
+    "ppo": ("policy", "CandidatePolicy", "ppo:FILE, a policy learned from preferences (study preferences)"),
 }
 
 
@@ -79,5 +79,7 @@ def make_selector(name: str, **options: Any) -> Selector:
         raise ViewpointError(f"no selector is called {base!r}; there are: {', '.join(SELECTORS)}")
     module, cls, _ = SELECTORS[base]
     made: Any = getattr(importlib.import_module(f"edge_server.viewpoints.{module}"), cls)
+    if bool(file) != hasattr(made, "from_file"):
+        raise ViewpointError(f"selector {name}: {'it takes no file' if file else f'expected {base}:FILE'}")
     selector: Selector = made.from_file(file, **options) if file else made(**options)
     return selector

@@ -15,7 +15,7 @@ from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.studies.trial import Row
 from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Workload, plan
-from edge_server.experiments.viewpoints.stage import Stage, open_stage
+from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
 from edge_server.fidelity.images import to_unit
 from edge_server.fidelity.scorer import Scorer
 from edge_server.report.style import figure, label_lines
@@ -33,7 +33,9 @@ HABITS: dict[str, dict[str, float | bool]] = {
     "contradicting": {"contradicts": True},
 }  # fmt: skip
 _UNSEEN = 400  # pairs
+_EMBEDDED = "edges"  # the taste whose policy is also trained with embeddings of the captured pictures (4.8)
 _TRAINED_ON = "10 % wrong"
+_UPDATES = {True: 30, False: 80}  # of PPO
 _POOL = {True: 60, False: 120}  # reconstructions; a third of them is kept for unseen pairs
 
 
@@ -85,26 +87,32 @@ class Preferences:
         policy's return against the number of updates (figure 4.6)."""
         captures: list[Row] = []
         curves: dict[str, dict[float, dict[int, float | None]]] = {}
-        config = PolicyConfig(views=JUDGED, updates=30 if request.quick else 80)
+        config = PolicyConfig(views=JUDGED, updates=_UPDATES[request.quick])
+        embed, missing = open_embedder()
+        if missing:
+            print(f"  embeddings are left out: {missing}")
+        seen = embed([stage.take(k).image for k in range(len(stage.candidates))]) if embed else None
         for seed in request.repeats(3, 5):
             for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
                 key = content_key([arm, seed, vars(work), source_digest()], 40)
                 run = partial(_capture, stage, arm, seed, work)
                 captures.append({"arm": arm, "seed": seed, **store.get(key, compute=run)})
-            for taste in TASTES:
+            for taste, embedded in [*((t, False) for t in TASTES), *([(_EMBEDDED, True)] if embed else [])]:
                 expert = SimulatedExpert(taste, scores[taste], np.random.default_rng(seed), wrong=0.1)
                 model = ask(expert, features, ASKED[-1])
-                policy, returns = train_policy(stage.candidates, model.reward, config, seed)
+                policy, returns = train_policy(
+                    stage.candidates, model.reward, config, seed, seen if embedded else None, embed
+                )
+                label = f"{taste}, embeddings" if embedded else taste
                 for n in range(0, config.updates, 5):
-                    curves.setdefault(taste, {}).setdefault(float(n), {})[seed] = float(
-                        np.mean(returns[n : n + 5])
-                    )
+                    of_seed = curves.setdefault(label, {}).setdefault(float(n), {})
+                    of_seed[seed] = float(np.mean(returns[n : n + 5]))
                 if seed == 0:
-                    policy.save(request.out / f"policy-{taste}.npz")
+                    policy.save(request.out / f"policy-{label.replace(', ', '-')}.npz")
                 # The seed draws the same first view as for the others.
                 made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
                 measured = _measured(stage, made, work, seed)
-                captures.append({"arm": f"policy, {taste}", "seed": seed, **measured})
+                captures.append({"arm": f"policy, {label}", "seed": seed, **measured})
                 print(f"  seed {seed}, {expert.label}: {model.says()}", flush=True)
         return captures, curves
 
@@ -209,8 +217,7 @@ def judge_answers(rows: list[Row]) -> list[Verdict]:
 
 def judge_captures(captures: list[Row]) -> list[Verdict]:
     verdicts = []
-    for taste in TASTES:
-        arm = f"policy, {taste}"
+    for arm in [a for a in dict.fromkeys(c["arm"] for c in captures) if a.startswith("policy")]:
         for other in ("random", "FisherRF"):
             gain = paired(_of(captures, "psnr_db", arm=arm), _of(captures, "psnr_db", arm=other))
             way = paired(_of(captures, "path_m", arm=arm), _of(captures, "path_m", arm=other))

@@ -15,7 +15,7 @@ from edge_server.experiments.common.arguments import (
     run_command,
 )
 from edge_server.experiments.viewpoints.drawing import draw_plan
-from edge_server.experiments.viewpoints.stage import open_stage
+from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
@@ -50,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> None:
     folders = folders_of(args)
     budget = read_budget(args.budget)
-    selector = make_selector(args.selector)
+    learned = args.selector.startswith("ppo:")
+    selector = make_selector(args.selector, **({"embed": open_embedder()[0]} if learned else {}))
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from camera_node.config import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
+from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene
@@ -20,8 +21,10 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
+from edge_server.viewpoints.policy import Embed
 from freshfield.scenario import Scenario, load
 
+_EMBEDDING = 8  # numbers a picture
 # Held-out viewpoints of a synthetic scene, on the candidates' sector between them.
 HELD_OUT = 20
 _BETWEEN = 0.25  # of the sector: see ``half_hemisphere``
@@ -133,3 +136,11 @@ def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None, sc
 def _render(scene: Scene, name: str, candidates: Candidates, k: int) -> View:
     pose = candidates.poses[k]
     return View(name, scene.view(candidates.lens, pose).image(0.0), pose, candidates.lens)
+
+
+def open_embedder() -> tuple[Embed | None, str | None]:
+    """(pictures to embeddings by the shipped YOLO backbone (4.8), None), or (None, why there is none)."""
+    try:
+        return make_embedder(EmbeddingConfig(dim=_EMBEDDING)).embed, None
+    except EmbeddingError as error:
+        return None, str(error)
