@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -89,13 +90,14 @@ class SimulatedExpert:
         return 0.5 if self.contradicts else 1.0 - 2.0 * self.wrong * (1.0 - self.wrong)
 
 
-def judge(taste: str, renderings: Sequence[Picture], truths: Sequence[Picture]) -> float:
+def judge(taste: str, renderings: Sequence[NDArray[Any]], truths: Sequence[NDArray[Any]]) -> float:
     """The score of one reconstruction, seen from several viewpoints: (H, W, 3) in [0, 1] each. Raises
     ViewpointError for an unknown taste."""
     if taste not in TASTES:
         raise ViewpointError(f"no expert has the taste {taste!r}; there are: {', '.join(TASTES)}")
     pairs = zip(renderings, truths, strict=True)
-    return float(np.mean([TASTES[taste](np.float32(r), np.float32(t)) for r, t in pairs]))
+    found = [TASTES[taste](np.asarray(r, np.float32), np.asarray(t, np.float32)) for r, t in pairs]
+    return float(np.mean(found))
 
 
 def _gradient(picture: Picture) -> Picture:

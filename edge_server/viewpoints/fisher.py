@@ -69,7 +69,7 @@ class FisherRF:
         known += PRIOR * np.maximum(known.mean(axis=0), 1e-12)
         scale = (1.0 / known).astype(np.float32)
         values, asked = np.zeros(len(poses)), np.flatnonzero(state.open)
-        rows = information(snapshot, poses[asked], [lens] * len(asked))
+        rows = information(snapshot, list(poses[asked]), [lens] * len(asked))
         for k, row in zip(asked, rows):
             values[k] = 0.5 * float(np.log1p(row * scale).sum(dtype=np.float64))
         return values

@@ -115,7 +115,7 @@ def plan_capture(
     refused: list[int] = []
     free, equal = candidates.reachable.copy(), 0
     while len(stops) < state.views_wanted:
-        travel = candidates.travel_m(state.at) if stops else np.zeros(len(candidates))
+        travel = candidates.travel_m(stops[-1].candidate) if stops else np.zeros(len(candidates))
         left_m = np.inf if budget.path_m is None else budget.path_m - sum(s.travel_m for s in stops)
         state.open = free & (travel <= left_m)
         if not state.open.any():

@@ -90,7 +90,7 @@ def layout_of(
     candidates; None: without them."""
     reachable = np.flatnonzero(steps.candidates.reachable)
     some = [
-        steps.actions(rng.choice(reachable, min(t, len(reachable)), replace=False))[reachable]
+        steps.actions(rng.choice(reachable, min(t, len(reachable)), replace=False).tolist())[reachable]
         for t in range(1, views + 1)
     ]
     parts = [np.concatenate(some), *([] if embeddings is None else [embeddings])]
@@ -190,7 +190,7 @@ def _episodes(
     count, way = config.episodes, GEOMETRY.index("way")
     usable = np.flatnonzero(rows.steps.candidates.reachable)
     orders = [[int(k)] for k in rng.choice(usable, count)]
-    kept: list[tuple[Array, ...]] = []
+    kept: list[tuple[NDArray[Any], ...]] = []
     for _ in range(config.views - 1):
         features = np.stack([rows.features(order) for order in orders])
         closed = np.tile(~rows.steps.candidates.reachable, (count, 1))

@@ -154,7 +154,8 @@ def _laplace(x: Array, width: float) -> tuple[Array, Array, float]:
     p = 0.5 * (1.0 + np.tanh(0.5 * (x @ w)))
     hessian = precision + (x * (p * (1.0 - p))[:, None]).T @ x
     log_det = float(np.linalg.slogdet(hessian)[1])
-    return w, np.linalg.inv(hessian), -now - 0.5 * log_det - count * np.log(width)
+    covariance = np.asarray(np.linalg.inv(hessian), np.float64)
+    return w, covariance, -now - 0.5 * log_det - count * float(np.log(width))
 
 
 def _expected(mean: Array, variance: Array) -> tuple[Array, Array]:

@@ -47,11 +47,6 @@ class CaptureState:
     def __post_init__(self) -> None:
         self.open = self.candidates.reachable.copy()
 
-    @property
-    def at(self) -> int | None:
-        """The candidate at which the camera stands; None before the first view."""
-        return self.order[-1] if self.order else None
-
     def field(self) -> Field:
         """A field fitted to the views so far, at most once a view. ViewpointError where nothing fits one."""
         if self.fit is None:

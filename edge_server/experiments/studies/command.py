@@ -52,6 +52,8 @@ CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
 LEARNING = (
     "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
 )  # fmt: skip
+# Studies of captures: they run in this process, and are not part of "all" either.
+CAPTURING = ("viewpoints", "preferences")
 DESCRIPTION = """\
 The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
 with 95 % intervals over seeds, and whether it holds.
@@ -104,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
 
     def work() -> None:
-        names = {"all": [n for n in STUDIES if n not in LEARNING], "learning": list(LEARNING)}
+        names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING)], "learning": list(LEARNING)}
         for name in _checked(names.get(args.study, [args.study]), request, args.ray):
             _run(name, request, engine)
 
@@ -147,6 +149,8 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
             raise StudyError(f"--scene {scene}: expected {', '.join(SCENARIOS)}")
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
+    if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
+        raise StudyError("--scene and --ray: captures are made here, and those of preferences of tile")
     if request.cases and not set(names) <= set(CASED):
         raise StudyError(f"--case is for {', '.join(CASED)}")
     if request.episodes is not None and not set(names) <= set(LEARNING):
@@ -158,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("study", DESCRIPTION)
     add = parser.add_argument
     add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
-        help=f"{', '.join(STUDIES)}; all: those before ppo-select; learning: those from it on")  # fmt: skip
+        help=f"{', '.join(STUDIES)}; all: before viewpoints; learning: from ppo-select on")  # fmt: skip
     add(
         "--quick",
         action="store_true",

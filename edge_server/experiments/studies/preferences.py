@@ -91,7 +91,8 @@ class Preferences:
         embed, missing = open_embedder()
         if missing:
             print(f"  embeddings are left out: {missing}")
-        seen = embed([stage.take(k).image for k in range(len(stage.candidates))]) if embed else None
+        pictures = [stage.take(k).image for k in range(len(stage.candidates))]
+        seen = embed(pictures).astype(np.float64) if embed else None
         for seed in request.repeats(3, 5):
             for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
                 key = content_key([arm, seed, vars(work), source_digest()], 40)

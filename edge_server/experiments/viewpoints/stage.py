@@ -91,7 +91,12 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
         source = replace(source, width=size, height=size)
     scene, _ = exact_scene(scenario, source)
     lens, pose = next(iter(scene.cameras.values()))
-    target, radius_m = np.asarray(scene.target), float(np.linalg.norm(pose[:3, 3] - scene.target))
+    target = np.asarray(scene.target)
+    radius_m = float(np.linalg.norm(target - pose[:3, 3]))
+    if pose[:3, 2] @ (target - pose[:3, 3]) < 0.0:
+        raise ViewpointError(
+            f"{scenario.path}: source: its cameras look outward: there is no object to go round"
+        )
     path = None if source.arm is None else source.arm.path
     sector: dict[str, Any] = {}
     if path is not None:

@@ -33,6 +33,7 @@ def test_a_capture_is_planned_and_written(tmp_path, capsys):
         (["tile", "--budget", "4", "--selector", "best"], "no selector is called"),
         (["tile", "--budget", "4", "--travel", "-1"], "--travel"),
         (["nowhere", "--budget", "4"], "nowhere"),
+        (["tower", "--budget", "4"], "its cameras look outward"),
     ],
 )
 def test_wrong_requests_say_what_was_expected(words, said, capsys, tmp_path):
