@@ -22,7 +22,7 @@ def draw_plan(path: Path, stage: Stage, plans: Sequence[tuple[str, Plan]]) -> No
     zenith_deg = np.rad2deg(np.arccos(np.clip(candidates.directions[:, 2], -1.0, 1.0)))
     x, y = zenith_deg * np.sin(azimuth), -zenith_deg * np.cos(azimuth)
     columns = min(len(plans), _A_ROW)
-    with figure(path, -(-len(plans) // columns), columns, height_inch=6.0 / columns + 1.0) as (fig, axes):
+    with figure(path, -(-len(plans) // columns), columns, height_inch=5.0 / columns + 0.8) as (fig, axes):
         for at in axes.ravel()[len(plans) :]:
             at.axis("off")
         for at, (title, plan) in zip(axes.ravel(), plans):
@@ -43,4 +43,5 @@ def draw_plan(path: Path, stage: Stage, plans: Sequence[tuple[str, Plan]]) -> No
             at.set_aspect("equal")
             at.set_title(f"{stage.name}, {title}: {plan.path_m:.2f} m", fontsize=8.5)
             at.set_xlabel("from above: degrees from the zenith")
-        axes[0, 0].legend(loc="lower left", fontsize=7)
+        if not candidates.reachable.all():
+            axes[0, 0].legend(loc="lower left", fontsize=7)
