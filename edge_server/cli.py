@@ -30,6 +30,7 @@ The edge of freshfield: takes posed frames, keeps a radiance field up to date, s
   edge-server frontier --quick --out runs/frontier
   edge-server simulate room --seconds 10
   edge-server chaos --seeds 0..99 --jobs 2
+  edge-server viewpoints tile --budget 8
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
   edge-server explain runs/room --decision 12
@@ -87,6 +88,10 @@ _COMMANDS = {
     "chaos": (
         "experiments.virtual.chaos",
         "small deployments in virtual time with faults from seeds, and what must hold after each",
+    ),
+    "viewpoints": (
+        "experiments.viewpoints.command",
+        "choose where a camera goes next around an object, within a budget of views or metres",
     ),
     "study": ("experiments.studies.command", "the thesis's figures as commands, each with a verdict"),
     "bench": (

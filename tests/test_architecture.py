@@ -36,6 +36,9 @@ FORBIDDEN = {
     ),
     "edge_server.fidelity": ("edge_server.live", "edge_server.page"),
     "edge_server.report": ("edge_server.live", "edge_server.page"),
+    "edge_server.viewpoints": (
+        "edge_server.live", "edge_server.page", "edge_server.report", "edge_server.fidelity",
+    ),
 }  # fmt: skip
 FILES_A_LEVEL = 16  # fifteen and an __init__
 

@@ -9,6 +9,7 @@ the stop.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,19 +89,9 @@ def plan_tour(
     start: current joint angles (6,); the tour begins near them, with a viewpoint to which the path is free.
     Raises PathError if the arm can visit fewer than three viewpoints.
     """
-    camera_to_flange, base_inverse = se3_inverse(hand_eye), se3_inverse(base)
-    goals = [
-        [base_inverse @ pose @ _roll(turn) @ camera_to_flange for turn in path.rolls_deg]
-        for pose in viewpoints(path)
-    ]
+    poses = viewpoints(path)
     begin = None if start is None else np.asarray(start, dtype=np.float64)
-    postures = [
-        (p.joints, k)
-        for k, turned in enumerate(goals)
-        for goal in turned
-        for p in arm.inverse(goal, begin)
-        if not p.singular
-    ]
+    postures = _postures(arm, base, hand_eye, path, poses, begin)
     if begin is not None:
         postures.sort(key=lambda each: float(np.abs(each[0] - begin).max()))
     roadmap = Roadmap(arm, base, [joints for joints, _ in postures], [k for _, k in postures], path.floor_m)
@@ -113,13 +104,40 @@ def plan_tour(
         if roadmap.has_visited(joints):
             continue
         if is_free(arm, base, joints if begin is None else begin, joints, path.floor_m).all():
-            best = max(best, _extend_tour(roadmap, len(goals), joints, k), key=lambda each: each.reached)
+            best = max(best, _extend_tour(roadmap, len(poses), joints, k), key=lambda each: each.reached)
     if best.reached < 3:
         raise PathError(
-            f"the arm reaches {best.reached} of {len(goals)} viewpoints: change radius_m, elevations_deg, "
+            f"the arm reaches {best.reached} of {len(poses)} viewpoints: change radius_m, elevations_deg, "
             "azimuths_deg, where the base stands, or the arm's posture before"
         )
     return best
+
+
+def reachable(
+    arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, poses: Sequence[Array]
+) -> NDArray[np.bool_]:
+    """Whether the arm can hold the camera at each of ``poses`` (N, 4, 4), camera-to-world, (N,): in a posture
+    that is not singular and touches neither itself nor the floor. The way there is not looked at. Other
+    arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are read."""
+    found = _postures(arm, base, hand_eye, path, poses, None)
+    joints, places = np.reshape([q for q, _ in found], (-1, 6)), np.array([k for _, k in found], np.int64)
+    out = np.zeros(len(poses), np.bool_)
+    out[places[is_free(arm, base, joints, joints, path.floor_m)]] = True
+    return out
+
+
+def _postures(
+    arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, poses: Sequence[Array], near: Array | None
+) -> list[tuple[Array, int]]:
+    """Joint angles (6,) that bring the camera to each of ``poses``, with the pose's number."""
+    camera_to_flange, base_inverse = se3_inverse(hand_eye), se3_inverse(base)
+    return [
+        (p.joints, k)
+        for k, pose in enumerate(poses)
+        for turn in path.rolls_deg
+        for p in arm.inverse(base_inverse @ pose @ _roll(turn) @ camera_to_flange, near)
+        if not p.singular
+    ]
 
 
 def _extend_tour(roadmap: Roadmap, count: int, first: Array, place: int) -> Tour:

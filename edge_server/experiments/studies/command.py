@@ -35,6 +35,8 @@ STUDIES = {
     "images": ("age.image_count", "Images"),
     "representations": ("age.representations", "Representations"),
     "phase": ("age.trade_map", "Phase"),
+    "viewpoints": ("viewpoints", "Viewpoints"),
+    "preferences": ("preferences", "Preferences"),
     "ppo-select": ("learning.ppo_select", "PpoSelect"),
     "ppo-wait": ("learning.ppo_wait", "PpoWait"),
     "ablation": ("learning.state_ablation", "Ablation"),
@@ -50,6 +52,8 @@ CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
 LEARNING = (
     "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
 )  # fmt: skip
+# Studies of captures: they run in this process, and are not part of "all" either.
+CAPTURING = ("viewpoints", "preferences")
 DESCRIPTION = """\
 The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
 with 95 % intervals over seeds, and whether it holds.
@@ -67,6 +71,8 @@ with 95 % intervals over seeds, and whether it holds.
   images            figures 6.5, 6.6: LPIPS and age against the number of images
   representations   figure 6.7: the same trade with other representations
   phase             where the trade exists: speed x delay x memory x compute, and what mask and freshen gain
+  viewpoints        tables 4.1, 4.3, figures 4.7, 4.8: which views to take of an object that stands still
+  preferences       figure 4.6, tables 4.2, 4.3: what simulated experts' preferences teach
 
   ppo-select        figure 5.9: a scheduler that learns which views to use, against everything else
   ppo-wait          figure 6.8: one that learns how long to wait, or how old is too old, by traffic
@@ -100,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
 
     def work() -> None:
-        names = {"all": [n for n in STUDIES if n not in LEARNING], "learning": list(LEARNING)}
+        names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING)], "learning": list(LEARNING)}
         for name in _checked(names.get(args.study, [args.study]), request, args.ray):
             _run(name, request, engine)
 
@@ -143,6 +149,8 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
             raise StudyError(f"--scene {scene}: expected {', '.join(SCENARIOS)}")
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
+    if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
+        raise StudyError("--scene and --ray: captures are made here, and those of preferences of tile")
     if request.cases and not set(names) <= set(CASED):
         raise StudyError(f"--case is for {', '.join(CASED)}")
     if request.episodes is not None and not set(names) <= set(LEARNING):
@@ -154,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("study", DESCRIPTION)
     add = parser.add_argument
     add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
-        help=f"{', '.join(STUDIES)}; all: those before ppo-select; learning: those from it on")  # fmt: skip
+        help=f"{', '.join(STUDIES)}; all: before viewpoints; learning: from ppo-select on")  # fmt: skip
     add(
         "--quick",
         action="store_true",

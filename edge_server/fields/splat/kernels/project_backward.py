@@ -36,7 +36,7 @@ from edge_server.fields.splat.kernels.project import (
 # Rows of BLOCK numbers: position, velocity, raw scale, quaternion, raw opacity; then for one camera: opacity,
 # conic, sums over pairs, whether there are any pairs, and the length of the gradient by the projected mean;
 # from GRADIENT on, a row for each parameter's gradient.
-_X, _VX, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, _SUM = (n * BLOCK for n in (0, 3, 6, 9, 13, 14, 15, 16, 17, 18))
+_X, _VX, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, SUM = (n * BLOCK for n in (0, 3, 6, 9, 13, 14, 15, 16, 17, 18))
 SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (27, 28, 29))
 _ROWS = 29
 
@@ -79,7 +79,7 @@ def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
             s0, s1, s2, s3, s4 = s0 + row[0], s1 + row[1], s2 + row[2], s3 + row[3], s4 + row[4]
             s5, s6, s7, s8 = s5 + row[5], s6 + row[6], s7 + row[7], s8 + row[8]
         for k, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8)):
-            s[_SUM + k * BLOCK + j] = value
+            s[SUM + k * BLOCK + j] = value
         row = projected[b, i]
         s[_ALPHA + j] = row[ALPHA]
         s[_QA + j], s[_QB + j], s[_QC + j] = row[CONIC_A], row[CONIC_B], row[CONIC_C]
@@ -126,9 +126,9 @@ def project_backward(cam, s):
             t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
         # mean and conic
         qa, qb, qc = s[_QA + j], s[_QB + j], s[_QC + j]
-        hx, hy = s[_SUM + BLOCK + j], s[_SUM + 2 * BLOCK + j]
+        hx, hy = s[SUM + BLOCK + j], s[SUM + 2 * BLOCK + j]
         du, dv = qa * hx + qb * hy, qb * hx + qc * hy
-        hxx, hxy, hyy = s[_SUM + 3 * BLOCK + j], s[_SUM + 4 * BLOCK + j], s[_SUM + 5 * BLOCK + j]
+        hxx, hxy, hyy = s[SUM + 3 * BLOCK + j], s[SUM + 4 * BLOCK + j], s[SUM + 5 * BLOCK + j]
         ga, gb, gc = -_HALF * hxx, -_HALF * hxy, -_HALF * hyy
         # d cov = - Q G Q
         m0, m1 = qa * ga + qb * gb, qa * gb + qb * gc
@@ -183,11 +183,11 @@ def project_backward(cam, s):
         s[at] += o0 if seen else _F0
         s[at + BLOCK] += o1 if seen else _F0
         s[at + 2 * BLOCK] += o2 if seen else _F0
-        opaque = s[_SUM + j] * (_F1 - s[_ALPHA + j])
+        opaque = s[SUM + j] * (_F1 - s[_ALPHA + j])
         s[at + OPACITY * BLOCK] += opaque if seen & (abs(s[_RAW + j]) < bounded) else _F0
-        s[at + COLOR * BLOCK] += s[_SUM + 6 * BLOCK + j]
-        s[at + (COLOR + 1) * BLOCK] += s[_SUM + 7 * BLOCK + j]
-        s[at + (COLOR + 2) * BLOCK] += s[_SUM + 8 * BLOCK + j]
+        s[at + COLOR * BLOCK] += s[SUM + 6 * BLOCK + j]
+        s[at + (COLOR + 1) * BLOCK] += s[SUM + 7 * BLOCK + j]
+        s[at + (COLOR + 2) * BLOCK] += s[SUM + 8 * BLOCK + j]
         s[SLOPE + j] = np.sqrt(du * du + dv * dv) if seen else _F0
 
 
@@ -233,7 +233,7 @@ def harmonics_backward(cam, gaussians, ids, count, s):
             hx, hy, hz = _harmonic_slope(h, nx, ny, nz)
             share = _F0
             for k in range(3):
-                column, given = BASE + 3 * (h - 1) + k, s[_SUM + (6 + k) * BLOCK + j]
+                column, given = BASE + 3 * (h - 1) + k, s[SUM + (6 + k) * BLOCK + j]
                 s[at + column * BLOCK] += value * given
                 share += params[i, column] * given
             lx, ly, lz = lx + share * hx, ly + share * hy, lz + share * hz

@@ -8,7 +8,7 @@ from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand
 from camera_node.robot.arm.capsules import CapsuleModel, link_frames
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from camera_node.robot.arm.roadmap import FARTHEST_RAD, Roadmap, is_free
-from camera_node.robot.arm.viewpoint_tour import PathError, plan_tour, viewpoints
+from camera_node.robot.arm.viewpoint_tour import PathError, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
@@ -186,3 +186,16 @@ def test_a_camera_that_may_roll_comes_to_more_viewpoints():
 def test_rolls_that_are_none_are_refused(rolls):
     with pytest.raises(ValueError, match="rolls_deg"):
         PathConfig(rolls_deg=rolls)
+
+
+def test_reachable_viewpoints_are_those_with_a_free_posture():
+    """Every stop of a tour is reachable; what lies beyond the arm, or in the floor, is not."""
+    poses = viewpoints(ARM.path)
+    found = reachable(UR3E, BASE, MOUNT, ARM.path, poses)
+    assert found[plan_tour(UR3E, BASE, MOUNT, ARM.path).places].all()
+    far = [pose.copy() for pose in poses[:3]]
+    for pose, z_m in zip(far, (2.0, -0.2, 0.02)):
+        pose[2, 3] = z_m
+    assert not reachable(UR3E, BASE, MOUNT, ARM.path, far).any()
+    high = dataclasses.replace(ARM.path, floor_m=5.0)
+    assert not reachable(UR3E, BASE, MOUNT, high, poses).any()

@@ -12,12 +12,12 @@ import pytest
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies.age import omega, trade_map
-from edge_server.experiments.studies.command import LEARNING, STUDIES, main, make_study
+from edge_server.experiments.studies.command import CAPTURING, LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, run_study
 from edge_server.scheduler import make_policy
 
-NAMES = [n for n in STUDIES if n not in ("metrics", *LEARNING)]
+NAMES = [n for n in STUDIES if n not in ("metrics", *CAPTURING, *LEARNING)]
 
 
 def request(tmp_path: Path, **more: Any) -> StudyRequest:

@@ -1,0 +1,1 @@
+"""Captures planned in scenarios: their candidates, pictures and reconstructions."""

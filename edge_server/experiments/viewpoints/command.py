@@ -1,0 +1,107 @@
+"""``edge-server viewpoints``: plans the capture of a scenario within a budget of views or metres of path."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.arguments import (
+    OptionError,
+    add_folders,
+    command_parser,
+    folders_of,
+    run_command,
+)
+from edge_server.experiments.viewpoints.drawing import draw_plan
+from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Scorer
+from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.plan import Budget, plan_capture
+from edge_server.viewpoints.selector import SELECTORS, make_selector
+from freshfield.files import write_json
+from freshfield.scenario import ScenarioError
+
+DESCRIPTION = """\
+Chooses where a camera goes next around an object, view by view, within a budget (thesis 4.5).
+
+  edge-server viewpoints tile --budget 8
+  edge-server viewpoints cell --budget 2.5m --selector fisher --travel .3
+  edge-server viewpoints lego --budget 12 --selector coverage --data ~/data
+
+Candidates of a synthetic world stand on a half-hemisphere round its object; a scenario with an arm says which
+of them it reaches. A recording's candidates are the views that it has. Writes OUT/plan.json (the stops with
+their poses, values and reasons) and OUT/plan.png (the candidates by value, and the path). The quality that is
+printed is of a splat field fitted to the chosen views, on viewpoints held out.
+
+selectors:
+""" + "\n".join(f"  {name:10} {text}" for name, (_, _, text) in SELECTORS.items())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    errors = (ScenarioError, DatasetError, ViewpointError, OptionError)
+    return run_command("viewpoints", lambda: _run(args), errors, "nothing was written")
+
+
+def _run(args: argparse.Namespace) -> None:
+    folders = folders_of(args)
+    budget = read_budget(args.budget)
+    learned = args.selector.startswith("ppo:")
+    selector = make_selector(args.selector, **({"embed": open_embedder()[0]} if learned else {}))
+    if args.travel < 0.0:
+        raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
+    stage = open_stage(args.scenario, args.candidates, data=folders.data)
+    plan = plan_capture(
+        stage.candidates, selector, budget, stage.take, seed=args.seed, travel_weight=args.travel,
+        fit=lambda views: stage.fit(views, args.steps, args.seed),
+    )  # fmt: skip
+    scorer = Scorer(open_lpips(folders.lpips)[0], background=stage.background)
+    score = stage.score(stage.fit(plan.views, args.steps, args.seed), scorer)
+    args.out.mkdir(parents=True, exist_ok=True)
+    quality = {"psnr_db": score.psnr_db, "ssim": score.ssim, "lpips": score.lpips}
+    about = {"scenario": stage.name, "seed": args.seed, "travel_weight": args.travel, "steps": args.steps}
+    write_json(args.out / "plan.json", {**about, **plan.as_json(stage.candidates), "held_out": quality})
+    draw_plan(args.out / "plan.png", stage, [(plan.selector, plan)])
+    for n, stop in enumerate(plan.stops, 1):
+        print(f"{n:3}  candidate {stop.candidate:3}  {1e3 * stop.seconds:6.0f} ms  {stop.why}")
+    if plan.note:
+        print(plan.note)
+    print(f"{len(plan.stops)} views, {plan.path_m:.2f} m of path; held out: PSNR {score.psnr_db:.2f} dB"
+          + (f", SSIM {score.ssim:.3f}" if score.ssim is not None else "")
+          + (f", LPIPS {score.lpips:.3f}" if score.lpips is not None else ""))  # fmt: skip
+    print(f"{args.out / 'plan.json'} and plan.png", flush=True)
+
+
+def read_budget(text: str) -> Budget:
+    """``8`` is views, ``2.5m`` metres of path, ``8,2.5m`` both. Raises OptionError or ViewpointError."""
+    views: int | None = None
+    path_m: float | None = None
+    try:
+        for word in text.split(","):
+            if word.endswith("m"):
+                path_m = float(word[:-1])
+            else:
+                views = int(word)
+    except ValueError:
+        raise OptionError(f"--budget {text}: expected views (8), metres (2.5m) or both (8,2.5m)") from None
+    return Budget(views, path_m)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser("viewpoints", DESCRIPTION)
+    add = parser.add_argument
+    add("scenario", help="scenario file, or the name of a shipped one")
+    add("--budget", required=True, metavar="N|Dm|N,Dm", help="views, metres of path, or both")
+    add("--selector", default="coverage", metavar="NAME", help="[%(default)s]")
+    add("--travel", type=float, default=0.2, metavar="W",
+        help="of the way against the value, as shares of their ranges; 0: none [%(default)g]")  # fmt: skip
+    add("--candidates", type=int, default=100, metavar="N", help="of a synthetic world [%(default)s]")
+    add("--steps", type=int, default=400, metavar="N", help="of each fit [%(default)s]")
+    add("--seed", type=int, default=0, metavar="N", help="of the first view and what is drawn [%(default)s]")
+    add_folders(parser)
+    add("--out", type=Path, default=Path("runs/viewpoints"), metavar="DIR", help="[%(default)s]")
+    return parser

@@ -1,0 +1,151 @@
+"""Where a capture takes place: the candidates of a scenario, their pictures, and what is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.config import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
+from camera_node.synthetic.scene import Scene
+from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.experiments.scenes.multiview_still import WHITE, score_views
+from edge_server.experiments.scenes.recorded import load_recorded
+from edge_server.experiments.virtual.from_scenario import exact_scene
+from edge_server.fidelity.images import BLACK, Color
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fields import Budget, Field, View
+from edge_server.fields.registry import make_field
+from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
+from edge_server.viewpoints.policy import Embed
+from freshfield.scenario import Scenario, load
+
+_EMBEDDING = 8  # numbers a picture
+# Held-out viewpoints of a synthetic scene, on the candidates' sector between them.
+HELD_OUT = 20
+_BETWEEN = 0.25  # of the sector: see ``half_hemisphere``
+
+
+@dataclass
+class Stage:
+    """name: of the scenario. candidates: with reachability. held_out: views that no capture takes. options:
+    of the field, as far as the scene is known. background: under transparent images."""
+
+    name: str
+    candidates: Candidates
+    held_out: tuple[View, ...]
+    options: dict[str, Any]
+    background: Color = BLACK
+    scene: Scene | None = None
+    recorded: tuple[View, ...] = ()
+    _taken: dict[int, View] = field(default_factory=dict)
+
+    def take(self, k: int) -> View:
+        """The picture at candidate k, rendered where the scene is synthetic, and kept."""
+        if self.scene is None:
+            return self.recorded[k]
+        if k not in self._taken:
+            self._taken[k] = _render(self.scene, f"view{k:03d}", self.candidates, k)
+        return self._taken[k]
+
+    def fit(self, views: Sequence[View], steps: int, seed: int, representation: str = "splat") -> Field:
+        """A field fitted to the views from scratch."""
+        made = make_field(representation, self.options, seed=seed)
+        made.fit(list(views), Budget(steps=steps))
+        return made
+
+    def score(self, made: Field, scorer: Scorer) -> Score:
+        """Mean fidelity on the views held out."""
+        return score_views(made, self.held_out, scorer)[0]
+
+
+def open_stage(
+    name: str, count: int = 100, size: int | None = None, data: Path | None = None, scale: float = 1.0
+) -> Stage:
+    """The stage of a scenario, a file or the name of a shipped one.
+
+    A synthetic world has ``count`` candidates on a half-hemisphere round its object, at the distance of the
+    scenario's held-out camera or of its arm's path; an arm says which of them it reaches. Of a recording the
+    candidates are the views that it has, every eighth is held out. size: pixels a side of a world's images,
+    None: the scenario's. scale: recorded images are divided by it.
+
+    Raises ScenarioError, DatasetError or ViewpointError.
+    """
+    scenario = load(name)
+    source = source_config(scenario)
+    if isinstance(source, WorldConfig):
+        return _world(scenario, source, count, size)
+    if isinstance(source, RecordedConfig):
+        return _recording(scenario, source, data, scale)
+    raise ViewpointError(
+        f"{scenario.path}: source: its cameras are real: a plan needs a synthetic world or a recording"
+    )
+
+
+def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None) -> Stage:
+    if size is not None:
+        source = replace(source, width=size, height=size)
+    scene, _ = exact_scene(scenario, source)
+    lens, pose = next(iter(scene.cameras.values()))
+    target = np.asarray(scene.target)
+    radius_m = float(np.linalg.norm(target - pose[:3, 3]))
+    if pose[:3, 2] @ (target - pose[:3, 3]) < 0.0:
+        raise ViewpointError(
+            f"{scenario.path}: source: its cameras look outward: there is no object to go round"
+        )
+    path = None if source.arm is None else source.arm.path
+    sector: dict[str, Any] = {}
+    if path is not None:
+        target, radius_m = np.asarray(path.target_m), path.radius_m
+        sector = {"azimuths_deg": path.azimuths_deg}
+    candidates = replace(half_hemisphere(target, radius_m, lens, count, **sector), bounds=scene.bounds)
+    tests = half_hemisphere(target, radius_m, lens, HELD_OUT, offset=_BETWEEN, **sector)
+    if path is not None:
+        candidates = candidates.within(_arm_reaches(scenario, source, candidates))
+        # What the robot cannot show is not asked for either.
+        reached = tests.within(_arm_reaches(scenario, source, tests)).reachable
+        tests = Candidates(tests.poses[reached], lens, target, reached[reached])
+    held_out = tuple(_render(scene, f"test{k:02d}", tests, k) for k in range(len(tests)))
+    low, high = scene.bounds
+    options = {
+        "centre_m": [float(c) for c in 0.5 * (low + high)],
+        "radius_m": float(0.5 * (high - low).max()) + 0.01, "near_m": 0.3 * radius_m, "contracted": False,
+        "background": "#" + "".join(f"{round(255 * c):02x}" for c in scene.world.background),
+    }  # fmt: skip
+    return Stage(scenario.name, candidates, held_out, options, scene=scene)
+
+
+def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidates) -> NDArray[np.bool_]:
+    from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_hand
+    from camera_node.robot.arm.viewpoint_tour import reachable
+
+    arm = source.arm  # type: ignore[attr-defined]
+    mount = mount_on_hand(scenario, arm)
+    return reachable(arm_model(scenario, arm), base_matrix(arm), mount, arm.path, list(candidates.poses))
+
+
+def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None, scale: float) -> Stage:
+    found = load_recorded(find_data(source.data, scenario, data), scale=scale * source.scale)
+    views = found.training
+    candidates = from_poses([v.camera_to_world for v in views], views[0].intrinsics)
+    transparent = views[0].image.shape[2] == 4
+    options: dict[str, Any] = {"background": "white"} if transparent else {}
+    return Stage(scenario.name, candidates, found.held_out, options, WHITE if transparent else BLACK,
+                 recorded=views)  # fmt: skip
+
+
+def _render(scene: Scene, name: str, candidates: Candidates, k: int) -> View:
+    pose = candidates.poses[k]
+    return View(name, scene.view(candidates.lens, pose).image(0.0), pose, candidates.lens)
+
+
+def open_embedder() -> tuple[Embed | None, str | None]:
+    """(pictures to embeddings by the shipped YOLO backbone (4.8), None), or (None, why there is none)."""
+    try:
+        return make_embedder(EmbeddingConfig(dim=_EMBEDDING)).embed, None
+    except EmbeddingError as error:
+        return None, str(error)

@@ -1,0 +1,110 @@
+"""Simulated experts: they compare reconstructions by their pictures, so that studies run without people.
+
+What they say is never mixed with what people said: every record of an answer carries ``label``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.reward import Answer
+
+Picture = NDArray[np.float32]
+_OBJECT = 0.08  # difference of a color from the background's, from which a pixel shows the object
+_BLUR_PX = 2.0
+
+
+def edges(rendering: Picture, truth: Picture) -> float:
+    """How well outlines are where they are in truth: the gradients' mean difference, negated."""
+    return -float(np.abs(_gradient(rendering) - _gradient(truth)).mean())
+
+
+def whole_object(rendering: Picture, truth: Picture) -> float:
+    """How well the object itself looks: the mean squared difference over its pixels, negated. The background
+    is the color of the corners."""
+    corners = np.stack([truth[0, 0], truth[0, -1], truth[-1, 0], truth[-1, -1]])
+    shows = np.abs(truth - np.median(corners, axis=0)).max(axis=-1) > _OBJECT
+    difference = ((rendering - truth) ** 2).mean(axis=-1)
+    return -float(difference[shows].mean() if shows.any() else difference.mean())
+
+
+def texture(rendering: Picture, truth: Picture) -> float:
+    """How well fine detail is kept: the mean difference of what a blur takes away, negated."""
+    return -float(np.abs(_detail(rendering) - _detail(truth)).mean())
+
+
+Taste = Callable[[Picture, Picture], float]
+TASTES: dict[str, Taste] = {"edges": edges, "object": whole_object, "texture": texture}
+
+
+@dataclass
+class SimulatedExpert:
+    """Answers as its taste and its habits have it.
+
+    taste: of ``TASTES``. scores: (N,) of the reconstructions, by ``judge``.
+    wrong: share of answers that are the opposite of what the taste says.
+    lazy: share of pairs at which it does not look and takes the first one.
+    contradicts: it answers by a coin.
+    """
+
+    taste: str
+    scores: NDArray[np.float64]
+    rng: np.random.Generator
+    wrong: float = 0.0
+    lazy: float = 0.0
+    contradicts: bool = False
+    asked: list[Answer] = field(default_factory=list)
+
+    @property
+    def label(self) -> str:
+        """Who answered, for every record and figure."""
+        habits = [f"{100 * self.wrong:g} % wrong"] if self.wrong else []
+        habits += [f"{100 * self.lazy:g} % lazy"] if self.lazy else []
+        habits += ["contradicting"] if self.contradicts else []
+        return f"simulated expert ({', '.join([self.taste, *habits])})"
+
+    def taste_prefers(self, first: int, second: int) -> bool:
+        """What it would say if it made no mistakes."""
+        return bool(self.scores[first] >= self.scores[second])
+
+    def answer(self, first: int, second: int) -> Answer:
+        """Its answer to a pair, kept in ``asked``."""
+        draw = self.rng.random(3)  # as many for every pair, whatever the habits
+        prefers = self.taste_prefers(first, second) != bool(draw[0] < self.wrong)
+        if draw[1] < self.lazy:
+            prefers = True
+        if self.contradicts:
+            prefers = bool(draw[2] < 0.5)
+        self.asked.append(Answer(first, second, prefers))
+        return self.asked[-1]
+
+    def agreement_with_itself(self) -> float:
+        """The probability that it gives the same answer twice, where it looks at both of a pair."""
+        return 0.5 if self.contradicts else 1.0 - 2.0 * self.wrong * (1.0 - self.wrong)
+
+
+def judge(taste: str, renderings: Sequence[NDArray[Any]], truths: Sequence[NDArray[Any]]) -> float:
+    """The score of one reconstruction, seen from several viewpoints: (H, W, 3) in [0, 1] each. Raises
+    ViewpointError for an unknown taste."""
+    if taste not in TASTES:
+        raise ViewpointError(f"no expert has the taste {taste!r}; there are: {', '.join(TASTES)}")
+    pairs = zip(renderings, truths, strict=True)
+    found = [TASTES[taste](np.asarray(r, np.float32), np.asarray(t, np.float32)) for r, t in pairs]
+    return float(np.mean(found))
+
+
+def _gradient(picture: Picture) -> Picture:
+    """(H, W) lengths of the brightness's gradient."""
+    grey = picture.mean(axis=-1)
+    return np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+
+
+def _detail(picture: Picture) -> Picture:
+    return picture - cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)

@@ -1,0 +1,61 @@
+"""What a step of a trajectory is described by, (s_t, a_t) of 4.5.2: for the reward model and the policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.viewpoints.candidates import Candidates
+
+Array = NDArray[np.float64]
+
+# Widths of the likeness of two directions, exp(-(angle / width)^2): fine detail needs near views, the whole
+# needs any.
+_WIDTHS_RAD = (0.25, 0.5, 1.0)
+GEOMETRY = (
+    *(f"{n} within {w:g} rad" for w in _WIDTHS_RAD for n in ("first view", "second view")),
+    "way", "x", "y", "z", "x^2", "z^2",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StepFeatures:
+    """Features of taking each candidate next."""
+
+    candidates: Candidates
+    _alike: Array = field(init=False, repr=False)
+    _way: Array = field(init=False, repr=False)
+    _place: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        d = self.candidates.directions
+        angle = np.arccos(np.clip(d @ d.T, -1.0, 1.0))
+        alike = np.stack([np.exp(-((angle / width) ** 2)) for width in _WIDTHS_RAD])
+        way = np.stack([self.candidates.travel_m(k) for k in range(len(d))])
+        at = self.candidates.poses[:, :3, 3] - self.candidates.target
+        place = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
+        place = np.column_stack([place, place[:, 0] ** 2, place[:, 2] ** 2])
+        for name, value in (("_alike", alike), ("_way", way), ("_place", place)):
+            object.__setattr__(self, name, value)
+
+    def actions(self, order: Sequence[int]) -> Array:
+        """(N, F) features of each candidate as the next view after those of ``order``, GEOMETRY: how much
+        better all reachable directions are seen by their nearest and by their second nearest view; the way in
+        metres; the place, in mean distances to the target."""
+        seen = list(order)
+        columns = []
+        for alike in self._alike:
+            new = alike[:, self.candidates.reachable]
+            nearest = np.sort(np.concatenate([np.zeros((2, new.shape[1])), new[seen]]), axis=0)[-2:]
+            second, first = nearest
+            columns.append(np.maximum(new - first, 0.0).mean(axis=1))
+            columns.append((np.maximum(np.minimum(new, first), second) - second).mean(axis=1))
+        way = self._way[seen[-1]] if seen else np.zeros(len(self._way))
+        return np.column_stack([*columns, way, self._place])
+
+    def trajectory(self, order: Sequence[int]) -> Array:
+        """(F,) the sum of the steps' features, as (4.12) sums a reward that is linear in them."""
+        return sum((self.actions(order[:t])[k] for t, k in enumerate(order)), np.zeros(len(GEOMETRY)))

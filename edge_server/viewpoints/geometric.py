@@ -1,0 +1,139 @@
+"""Selectors that look at geometry only: random, uniform spacing, farthest point, coverage."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.viewpoints.candidates import Candidates
+from edge_server.viewpoints.selector import CaptureState
+
+Array = NDArray[np.float64]
+
+_LLOYD_ROUNDS = 20
+_STAND_IN = 1e-2
+_SAMPLES_A_SIDE = 8  # of each face of the object's box
+# A view from this much aside is unlike: exp(-1), for small angles.
+_ALIKE_RAD = 0.5
+_MOST_WANTED = 128  # directions that are to be covered: of more candidates, every second, third, ...
+# Where the object's size is not known, it is taken to reach this far from the target, in distances of the
+# nearest camera.
+_UNKNOWN_SIZE = 0.3
+
+
+class RandomOrder:
+    """Every open candidate is as likely."""
+
+    name = "random"
+
+    def values(self, state: CaptureState) -> Array:
+        return state.rng.random(len(state.candidates))
+
+
+class FarthestPoint:
+    """The angle, at the target, to the nearest earlier view."""
+
+    name = "farthest"
+
+    def values(self, state: CaptureState) -> Array:
+        directions = state.candidates.directions
+        if not state.order:
+            return np.zeros(len(directions))
+        return np.arccos(np.clip(directions @ directions[state.order].T, -1.0, 1.0)).min(axis=1)
+
+
+class UniformSpacing:
+    """Members of one evenly spaced set of ``views_wanted`` candidates are worth 1. Others stand in for
+    members that are refused: they are worth little, and the more the nearer they are to one."""
+
+    name = "uniform"
+
+    def values(self, state: CaptureState) -> Array:
+        directions = state.candidates.directions
+        usable = np.flatnonzero(state.open)
+        usable = np.union1d(usable, state.order).astype(np.int64)
+        members = _spread(directions, usable, state.order[:1], max(state.views_wanted, 1))
+        left = np.setdiff1d(members, state.order)
+        if not len(left):
+            return FarthestPoint().values(state)
+        values = _STAND_IN * (directions @ directions[left].T).max(axis=1)
+        values[left] = 1.0
+        return values
+
+
+def _spread(directions: Array, usable: NDArray[np.int64], fixed: list[int], count: int) -> NDArray[np.int64]:
+    """``count`` of the ``usable`` candidates, evenly spaced, with those of ``fixed`` among them: farthest
+    points first, then moved to the middles of their shares (Lloyd)."""
+    chosen = list(fixed) or [int(usable[0])]
+    while len(chosen) < min(count, len(usable)):
+        nearest = (directions[usable] @ directions[chosen].T).max(axis=1)
+        chosen.append(int(usable[np.argmin(np.round(nearest, 9))]))
+    for _ in range(_LLOYD_ROUNDS):
+        share = np.argmax(directions[usable] @ directions[chosen].T, axis=1)
+        moved = list(chosen)
+        for k in range(len(fixed), len(chosen)):
+            middle = directions[usable[share == k]].sum(axis=0)
+            moved[k] = int(usable[np.argmax(np.round(directions[usable] @ middle, 9))])
+        if moved == chosen or len(set(moved)) < len(moved):
+            break
+        chosen = moved
+    return np.array(sorted(chosen), np.int64)
+
+
+class Coverage:
+    """How much of the object's box is covered anew. Covered is what was seen from nearby: for each point of
+    a face, and each direction from which some candidate sees it (weighed by how squarely and closely), the
+    likeness of the nearest direction from which a view saw it. Views therefore go amid what is open (facility
+    location), not to its edges."""
+
+    name = "coverage"
+
+    def values(self, state: CaptureState) -> Array:
+        weight, toward = _sight(state.candidates)
+        sees = weight > 0.0
+        total = np.zeros(len(weight))
+        usable = np.flatnonzero(state.candidates.reachable)
+        for wanted in usable[:: max(len(usable) // _MOST_WANTED, 1)]:
+            cosine = np.einsum("npd,pd->np", toward, toward[wanted])
+            alike = np.where(sees, np.exp(-2.0 * (1.0 - cosine) / _ALIKE_RAD**2), 0.0)
+            known = alike[state.order].max(axis=0, initial=0.0)
+            total += np.maximum(alike - known, 0.0) @ weight[wanted]
+        return total
+
+
+def _sight(candidates: Candidates) -> tuple[Array, Array]:
+    """(N, P) how well each candidate sees each point of the box: the cosine of the angle to its face, by the
+    square of how much nearer than usual the camera is; 0 from behind and outside the image. And the
+    directions (N, P, 3) from the points to the cameras."""
+    points, normals = _box(candidates)
+    ray = candidates.poses[:, None, :3, 3] - points
+    far = np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
+    toward = ray / far[..., None]
+    inside = np.empty(far.shape, bool)
+    for row, pose in zip(inside, candidates.poses):
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        ahead = local[:, 2] > 1e-6
+        pixel = candidates.lens.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+        size = (candidates.lens.width, candidates.lens.height)
+        row[:] = ahead & ((pixel >= 0) & (pixel < size)).all(axis=1)
+    squarely = np.maximum((toward * normals).sum(axis=-1), 0.0)
+    return np.where(inside, squarely * (np.median(far) / far) ** 2, 0.0), toward
+
+
+def _box(candidates: Candidates) -> tuple[Array, Array]:
+    """Points (P, 3) on all faces of the object's box but the lower one, and their outward normals (P, 3)."""
+    if candidates.bounds is not None:
+        low, high = candidates.bounds
+    else:
+        nearest = np.linalg.norm(candidates.poses[:, :3, 3] - candidates.target, axis=1).min()
+        low, high = candidates.target - _UNKNOWN_SIZE * nearest, candidates.target + _UNKNOWN_SIZE * nearest
+    middles = (np.arange(_SAMPLES_A_SIDE) + 0.5) / _SAMPLES_A_SIDE
+    u, v = (w.ravel() for w in np.meshgrid(middles, middles))
+    points, normals = [], []
+    for axis in range(3):
+        for side in (0.0, 1.0) if axis < 2 else (1.0,):
+            share = np.stack([u, v], axis=-1)
+            share = np.insert(share, axis, side, axis=1)
+            points.append(low + share * (high - low))
+            normals.append(np.broadcast_to((2.0 * side - 1.0) * np.eye(3)[axis], share.shape))
+    return np.concatenate(points), np.concatenate(normals)

@@ -1,0 +1,248 @@
+"""The thesis's policy over candidate viewpoints: PPO (4.9, 4.14) on a learned reward, with the way as a cost.
+
+The network is the schedulers' pooled one (``scheduler.learned.networks``): each candidate is a row, with the
+features of the step it would be, the embedding of its picture once it is captured (4.8), its age and its
+pose; the mean and the maximum over all rows are context. A logit a candidate makes a categorical over those
+that are open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import checkpoint
+from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.state import State, StateLayout
+from edge_server.viewpoints.candidates import Candidates, ViewpointError
+from edge_server.viewpoints.features import GEOMETRY, StepFeatures
+from edge_server.viewpoints.selector import CaptureState
+from freshfield.geometry import so3_log
+
+Array = NDArray[np.float64]
+Embed = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
+
+KIND = "viewpoint policy"
+_STEP_MS = 1000.0  # an age of one step, in the unit of the schedulers' state
+_CLOSED = -1e9
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """How a policy is trained.
+
+    views: of an episode. updates, episodes: of training, and of each update.
+    way: cost of a metre, in standard deviations of the reward of a step.
+    gamma: discount of (4.14). Others as in ``learner_spec.Spec``.
+    """
+
+    views: int = 8
+    updates: int = 60
+    episodes: int = 16
+    way: float = 0.5
+    gamma: float = 1.0
+    hidden: int = 32
+    learning_rate: float = 3e-3
+    clip: float = 0.2
+    passes: int = 4
+    minibatch: int = 64
+    entropy: float = 0.01
+
+
+class Rows:
+    """Turns a capture under way into the rows of a network.
+
+    embeddings: (N, d) of the candidates' pictures, shown only once captured; None: geometry only.
+    """
+
+    def __init__(self, candidates: Candidates, embeddings: Array | None, layout: StateLayout) -> None:
+        self.steps = StepFeatures(candidates)
+        self.embeddings, self.layout = embeddings, layout
+        at = candidates.poses[:, :3, 3] - candidates.target
+        at = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
+        turns = np.stack([so3_log(pose[:3, :3]) for pose in candidates.poses])
+        self._poses = np.column_stack([at, turns])
+
+    def features(self, order: Sequence[int]) -> Array:
+        """(N, width) after the views of ``order``."""
+        candidates = self.steps.candidates
+        ages = np.full(len(candidates), np.inf)
+        for age, k in enumerate(reversed(order)):
+            ages[k] = age * _STEP_MS
+        # What is not captured yet has the usual embedding, which is 0 once it is standardized.
+        seen = np.tile(self.layout.centre[len(GEOMETRY) :], (len(candidates), 1))
+        if self.embeddings is not None and len(order):
+            seen[list(order)] = self.embeddings[list(order)]
+        both = np.column_stack([self.steps.actions(order), seen])
+        return self.layout.features(State(ages, self._poses, both.astype(np.float32), candidates.reachable))
+
+
+def layout_of(
+    steps: StepFeatures, embeddings: Array | None, views: int, rng: np.random.Generator
+) -> StateLayout:
+    """The layout whose step features are standardized over random captures, and embeddings (N, d) over all
+    candidates; None: without them."""
+    reachable = np.flatnonzero(steps.candidates.reachable)
+    some = [
+        steps.actions(rng.choice(reachable, min(t, len(reachable)), replace=False).tolist())[reachable]
+        for t in range(1, views + 1)
+    ]
+    parts = [np.concatenate(some), *([] if embeddings is None else [embeddings])]
+    centre = np.concatenate([part.mean(axis=0) for part in parts])
+    spread = np.concatenate([np.maximum(part.std(axis=0), 1e-3) for part in parts])
+    return StateLayout(
+        dim=len(centre), age_scale_ms=_STEP_MS, centre=tuple(centre.tolist()), spread=tuple(spread.tolist())
+    )
+
+
+@dataclass
+class CandidatePolicy:
+    """A trained policy as a selector: its values are logits.
+
+    weights: of the actor. embed: pictures to embeddings, as in training; needed where there were some.
+    """
+
+    spec: Spec
+    weights: dict[str, NDArray[np.float64]]
+    embed: Embed | None = None
+    name: str = "ppo"
+
+    def values(self, state: CaptureState) -> Array:
+        width = self.spec.layout.dim - len(GEOMETRY)
+        embeddings = np.zeros((len(state.candidates), width))
+        if width and self.embed is None:
+            raise ViewpointError("this policy was trained with embeddings: give it the embedder")
+        if width and self.embed is not None:
+            embeddings[state.order] = self.embed([view.image for view in state.views])
+        rows = Rows(state.candidates, embeddings, self.spec.layout).features(state.order)
+        return np.asarray(networks.logits(np, self.spec, self.weights, rows[None])[0])
+
+    def save(self, path: Path | str) -> None:
+        """Write the policy. OSError where it cannot be written."""
+        checkpoint.save(path, dict(self.weights), {"spec": self.spec.as_json()}, kind=KIND)
+
+    @staticmethod
+    def from_file(path: Path | str, embed: Embed | None = None) -> CandidatePolicy:
+        """A policy as ``save`` left it. ViewpointError for anything else."""
+        try:
+            arrays, about = checkpoint.load(path, kind=KIND)
+            spec = Spec.from_json(about["spec"])
+            expected = networks.init_actor(spec, np.random.default_rng(0))
+            if {k: v.shape for k, v in arrays.items()} != {k: v.shape for k, v in expected.items()}:
+                raise ValueError("its weights do not fit its specification")
+        except (OSError, ValueError, KeyError) as error:
+            raise ViewpointError(f"{path}: not a viewpoint policy: {error}") from None
+        return CandidatePolicy(spec, arrays, embed)
+
+
+def train_policy(
+    candidates: Candidates, reward: Callable[[Array], Array], config: PolicyConfig, seed: int = 0,
+    embeddings: Array | None = None, embed: Embed | None = None,
+) -> tuple[CandidatePolicy, list[float]]:  # fmt: skip
+    """Train a policy on ``reward``, of step features (..., GEOMETRY), such as ``RewardModel.reward``. Returns
+    it with the mean return of each update (figure 4.6).
+
+    embeddings: (N, d) of the candidates' pictures, which the policy sees once they are captured; embed: makes
+        them, for its later use. ViewpointError for fewer reachable
+    candidates than views.
+    """
+    import torch
+
+    usable = np.flatnonzero(candidates.reachable)
+    if len(usable) < config.views:
+        raise ViewpointError(f"{len(usable)} candidates can be reached, an episode has {config.views} views")
+    rng = np.random.default_rng(seed)
+    steps = StepFeatures(candidates)
+    layout = layout_of(steps, embeddings, config.views, rng)
+    spec = Spec("select", layout, hidden=config.hidden, learning_rate=config.learning_rate)
+    rows = Rows(candidates, embeddings, layout)
+    usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
+    scale = max(float(usual.std()), 1e-9)
+    actor = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_actor(spec, rng).items()}
+    critic = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_value(spec, rng).items()}
+    parameters = [*actor.values(), *critic.values()]
+    adam = torch.optim.Adam(parameters, lr=config.learning_rate)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the thread count changes the last bits
+    returns: list[float] = []
+    try:
+        for _ in range(config.updates):
+            batch = _episodes(rows, reward, scale, config, _numpy(actor), _numpy(critic), spec, rng)
+            returns.append(batch["mean"])
+            _improve(batch, actor, critic, parameters, adam, spec, config, rng)
+    finally:
+        torch.set_num_threads(threads)
+    return CandidatePolicy(spec, _numpy(actor), embed), returns
+
+
+def _episodes(
+    rows: Rows, reward: Callable[[Array], Array], scale: float, config: PolicyConfig,
+    actor: dict[str, Any], critic: dict[str, Any], spec: Spec, rng: np.random.Generator,
+) -> dict[str, Any]:  # fmt: skip
+    """Episodes side by side: features, open candidates, actions, log-probabilities, returns and values of all
+    steps but the first, whose view is drawn."""
+    count, way = config.episodes, GEOMETRY.index("way")
+    usable = np.flatnonzero(rows.steps.candidates.reachable)
+    orders = [[int(k)] for k in rng.choice(usable, count)]
+    kept: list[tuple[NDArray[Any], ...]] = []
+    for _ in range(config.views - 1):
+        features = np.stack([rows.features(order) for order in orders])
+        closed = np.tile(~rows.steps.candidates.reachable, (count, 1))
+        for line, order in zip(closed, orders):
+            line[order] = True
+        logits = np.where(closed, _CLOSED, networks.logits(np, spec, actor, features))
+        logps = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
+        chosen = np.argmax(logps + rng.gumbel(size=logps.shape), axis=1)
+        taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
+        gained = reward(taken) / scale - config.way * taken[:, way]
+        values = networks.value(np, spec, critic, features)
+        kept.append((features, closed, chosen, logps[np.arange(count), chosen], gained, values))
+        for order, k in zip(orders, chosen):
+            order.append(int(k))
+    features, closed, chosen, logps, gained, values = (np.stack(part) for part in zip(*kept))
+    total, returns = np.zeros(count), np.zeros_like(gained)
+    for t in reversed(range(len(gained))):
+        total = returns[t] = gained[t] + config.gamma * total
+    return {
+        "features": features.reshape(-1, *features.shape[2:]), "closed": closed.reshape(-1, closed.shape[-1]),
+        "chosen": chosen.ravel(), "logps": logps.ravel(), "returns": returns.ravel(),
+        "values": values.ravel(), "mean": float(gained.sum(axis=0).mean()),
+    }  # fmt: skip
+
+
+def _improve(
+    batch: dict[str, Any], actor: dict[str, Any], critic: dict[str, Any], parameters: list[Any], adam: Any,
+    spec: Spec, config: PolicyConfig, rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Passes of PPO's clipped objective over a batch."""
+    import torch
+
+    raw = batch["returns"] - batch["values"]
+    advantage = torch.tensor((raw - raw.mean()) / max(raw.std(), 1e-9))
+    features, returns = torch.tensor(batch["features"]), torch.tensor(batch["returns"])
+    closed, chosen = torch.tensor(batch["closed"]), torch.tensor(batch["chosen"])
+    before = torch.tensor(batch["logps"])
+    for _ in range(config.passes):
+        for some in torch.tensor(rng.permutation(len(returns))).split(config.minibatch):
+            logits = networks.logits(torch, spec, actor, features[some])
+            logps = torch.log_softmax(logits.masked_fill(closed[some], _CLOSED), dim=-1)
+            ratio = torch.exp(logps.gather(1, chosen[some, None])[:, 0] - before[some])
+            gain = advantage[some]
+            clipped = torch.clamp(ratio, 1.0 - config.clip, 1.0 + config.clip)
+            policy = -torch.minimum(ratio * gain, clipped * gain).mean()
+            entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1).mean()
+            value = ((networks.value(torch, spec, critic, features[some]) - returns[some]) ** 2).mean()
+            adam.zero_grad()
+            (policy + spec.value * value - config.entropy * entropy).backward()
+            torch.nn.utils.clip_grad_norm_(parameters, spec.max_gradient)
+            adam.step()
+
+
+def _numpy(weights: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
+    return {name: w.detach().numpy().copy() for name, w in weights.items()}

@@ -1,0 +1,80 @@
+"""What a selector is: it looks at a capture under way and says what each candidate would be worth."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Field, View
+from edge_server.viewpoints.candidates import Candidates, ViewpointError
+
+# name -> (module, class, one line of help)
+SELECTORS: dict[str, tuple[str, str, str]] = {
+    "random": ("geometric", "RandomOrder", "any candidate, each as likely"),
+    "uniform": ("geometric", "UniformSpacing", "an evenly spaced set of the size of the budget"),
+    "farthest": ("geometric", "FarthestPoint", "the candidate farthest from all earlier views"),
+    "coverage": ("geometric", "Coverage", "most of the object's box newly seen, from its geometry alone"),
+    "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far"),
+    "ppo": ("policy", "CandidatePolicy", "ppo:FILE, a policy learned from preferences (study preferences)"),
+}
+
+
+@dataclass
+class CaptureState:
+    """A capture under way, the state s_t of 4.5.2.
+
+    candidates: all of them. views_wanted: the budget, as far as it counts views.
+    order: candidates captured so far, in this order. views: what was captured, likewise.
+    open: (N,) candidates that may be chosen now: reachable, not captured, not refused, within the budget.
+    rng: for selectors that draw.
+    fit: fits a field to ``views``; called by ``field`` where a selector needs one.
+    """
+
+    candidates: Candidates
+    views_wanted: int
+    rng: np.random.Generator
+    fit: Callable[[list[View]], Field] | None = None
+    order: list[int] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
+    open: NDArray[np.bool_] = field(init=False)
+    _fitted: tuple[int, Field] | None = None
+
+    def __post_init__(self) -> None:
+        self.open = self.candidates.reachable.copy()
+
+    def field(self) -> Field:
+        """A field fitted to the views so far, at most once a view. ViewpointError where nothing fits one."""
+        if self.fit is None:
+            raise ViewpointError("this selector needs a field of the views so far, and nothing fits one")
+        if self._fitted is None or self._fitted[0] != len(self.views):
+            self._fitted = len(self.views), self.fit(self.views)
+        return self._fitted[1]
+
+
+class Selector(Protocol):
+    """Chooses viewpoints. name: as the commands know it."""
+
+    name: str
+
+    def values(self, state: CaptureState) -> NDArray[np.float64]:
+        """What each candidate is worth, (N,), in any unit, higher is better. Read where ``state.open``."""
+        ...
+
+
+def make_selector(name: str, **options: Any) -> Selector:
+    """The named selector, whose module is imported only now. ``NAME:FILE`` hands FILE on to it. Raises
+    ViewpointError for an unknown name."""
+    base, _, file = name.partition(":")
+    if base not in SELECTORS:
+        raise ViewpointError(f"no selector is called {base!r}; there are: {', '.join(SELECTORS)}")
+    module, cls, _ = SELECTORS[base]
+    made: Any = getattr(importlib.import_module(f"edge_server.viewpoints.{module}"), cls)
+    if bool(file) != hasattr(made, "from_file"):
+        raise ViewpointError(f"selector {name}: {'it takes no file' if file else f'expected {base}:FILE'}")
+    selector: Selector = made.from_file(file, **options) if file else made(**options)
+    return selector

@@ -1,0 +1,61 @@
+"""The studies of viewpoints and preferences: whole on a tiny workload; verdicts can come out either way."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.studies import preferences, viewpoints
+from edge_server.experiments.studies.engine import Engine
+from edge_server.experiments.studies.study import StudyRequest, run_study
+
+TINY = viewpoints.Workload((3, 8), 16, 3, 24)
+
+
+def rows(better_db):
+    return [
+        {"arm": arm, "seed": s, "views": v,
+         "psnr_db": 20 + v * better_db + 0.01 * s + (arm != "random") * better_db,
+         "path_m": 5.0 - better_db + 0.01 * s * (arm == "random")}
+        for arm in viewpoints.ARMS for s in range(4) for v in (3, 8)
+    ]  # fmt: skip
+
+
+def test_verdicts_of_viewpoints_follow_the_figures():
+    for better, answer in ((1.0, "holds"), (-1.0, "does not hold")):
+        found = {v.about: v.verdict for v in viewpoints.judge("tile", rows(better), (3, 8))}
+        assert found["tile, random"] == found["tile, FisherRF, 8 views"] == answer
+
+
+def test_verdicts_of_preferences_follow_the_figures():
+    def answers(share, knows):
+        return [
+            {"taste": t, "habit": h, "answers": 60, "seed": s, "agreement": 0.82 * share + 0.001 * s,
+             "with_itself": 0.82, "knows": knows}
+            for t in preferences.TASTES for h in preferences.HABITS for s in range(4)
+        ]  # fmt: skip
+
+    assert {v.verdict for v in preferences.judge_answers(answers(0.95, False))} == {"holds"}
+    assert {v.verdict for v in preferences.judge_answers(answers(0.85, True))} == {"does not hold"}
+
+
+@pytest.mark.slow
+def test_both_studies_run_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewpoints, "QUICK", TINY)
+    monkeypatch.setattr(preferences, "QUICK", TINY)
+    monkeypatch.setattr(preferences, "_POOL", {True: 15})
+    monkeypatch.setattr(preferences, "_UPDATES", {True: 1})
+    monkeypatch.setattr(preferences, "ASKED", (3, 6))
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2)
+    for study in (viewpoints.Viewpoints(), preferences.Preferences()):
+        assert run_study(study, request, Engine(tmp_path))
+        assert "simulated" not in study.name and (tmp_path / f"{study.name}-tables.md").exists()
+    assert "Simulated experts only" in (tmp_path / "preferences-tables.md").read_text()
+    table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
+    assert {r["arm"] for r in table} == set(viewpoints.ARMS) and len(table) == len(viewpoints.ARMS) * 2 * 2
+    first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage" and r["views"] == "3"}
+    assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
+    assert (tmp_path / "policy-edges.npz").exists() and (tmp_path / "viewpoints-tile-paths.png").exists()

@@ -1,0 +1,138 @@
+"""Candidates, geometric selectors and plans: what they promise, and clear words in hard cases."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from edge_server.fields import View
+from edge_server.viewpoints.candidates import ViewpointError, from_poses, half_hemisphere
+from edge_server.viewpoints.plan import Budget, plan_capture
+from edge_server.viewpoints.selector import SELECTORS, CaptureState, make_selector
+from freshfield.geometry import Pinhole
+
+LENS = Pinhole.from_fov(16, 16, 50.0)
+TARGET = np.array([0.1, -0.2, 0.3])
+GEOMETRIC = [name for name, (module, _, _) in SELECTORS.items() if module == "geometric"]
+DOME = half_hemisphere(TARGET, 0.8, LENS, 60)
+
+
+def take(k):
+    return View(f"v{k}", np.full((16, 16, 3), k, np.uint8), DOME.poses[k], LENS)
+
+
+class Fixed:
+    """Values that a user's own selector might give."""
+
+    name = "fixed"
+
+    def __init__(self, values):
+        self.given = values
+
+    def values(self, state):
+        return self.given
+
+
+def smallest_angle(order):
+    cosine = DOME.directions[order] @ DOME.directions[order].T
+    return np.arccos(np.clip(cosine[~np.eye(len(order), dtype=bool)], -1, 1)).min()
+
+
+def test_candidates_look_at_the_target_from_an_even_sector():
+    away = DOME.poses[:, :3, 3] - TARGET
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.8)
+    np.testing.assert_allclose(DOME.poses[:, :3, 2], -away / 0.8, atol=1e-12)
+    assert (away[:, 1] <= 1e-9).all() and (away[:, 2] > 0).all()  # a half of the upper half, on the -y side
+    assert smallest_angle(list(range(60))) > 0.4 * np.sqrt(np.pi / 60)
+    np.testing.assert_allclose(from_poses(DOME.poses, LENS).target, TARGET, atol=1e-9)
+
+
+def test_paths_go_round_the_target():
+    one, other = [1.0, 0, 0], [-1.0, 0, 0]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = [one, other, [3.0, 0, 0]]
+    np.testing.assert_allclose(from_poses(poses, LENS, (0, 0, 0)).travel_m(0), [0.0, np.pi, 2.0])
+
+
+@pytest.mark.parametrize("name", GEOMETRIC)
+def test_geometric_selectors_take_the_budget_once_each_and_repeat_by_seed(name):
+    plans = [plan_capture(DOME, make_selector(name), Budget(views=9), take, seed=s) for s in (3, 3, 4)]
+    assert len(set(plans[0].order)) == 9 and plans[0].order == plans[1].order != plans[2].order
+    assert [v.camera for v in plans[0].views] == [f"v{k}" for k in plans[0].order]
+    json.dumps(plans[0].as_json(DOME), allow_nan=False)
+
+
+def test_spread_selectors_spread_and_travel_weight_shortens_the_path():
+    orders = {
+        name: plan_capture(DOME, make_selector(name), Budget(views=9), take, seed=1) for name in GEOMETRIC
+    }
+    for name in ("uniform", "farthest", "coverage"):
+        assert smallest_angle(orders[name].order) > 1.5 * smallest_angle(orders["random"].order)
+    short = plan_capture(DOME, make_selector("uniform"), Budget(views=9), take, seed=1, travel_weight=0.5)
+    assert short.path_m < 0.8 * orders["uniform"].path_m
+    assert smallest_angle(short.order) > 1.5 * smallest_angle(orders["random"].order)
+
+
+def test_coverage_goes_where_the_object_was_not_seen():
+    state = CaptureState(DOME, 5, np.random.default_rng(0))
+    seen = int(np.argmax(DOME.directions @ [1.0, 0.0, 0.2]))  # the +x side
+    state.order = [seen]
+    values = make_selector("coverage").values(state)
+    assert DOME.directions[int(np.argmax(values))] @ DOME.directions[seen] < 0.5 and values[seen] < 1e-9
+
+
+def test_a_budget_of_metres_is_kept():
+    plan = plan_capture(DOME, make_selector("random"), Budget(path_m=2.0), take)
+    assert 1.2 < plan.path_m <= 2.0
+    both = plan_capture(DOME, make_selector("random"), Budget(30, 2.0), take)
+    assert both.order == plan.order and "Only" in both.note and "the path is used up" in both.note
+
+
+def test_no_candidate_is_reachable():
+    with pytest.raises(ViewpointError, match="none of the 60 candidates can be reached"):
+        plan_capture(DOME.within(np.zeros(60)), make_selector("random"), Budget(views=3), take)
+
+
+def test_only_reachable_candidates_are_taken():
+    low = DOME.within(DOME.directions[:, 2] < 0.4)
+    for name in GEOMETRIC:
+        plan = plan_capture(low, make_selector(name), Budget(views=8), take)
+        assert low.reachable[plan.order].all() and "cannot be reached" in plan.note
+
+
+def test_equal_candidates_are_visited_nearest_first_and_the_plan_says_so():
+    plan = plan_capture(DOME, Fixed(np.full(60, 7.0)), Budget(views=4), take, first=10)
+    nearest = np.argsort(DOME.travel_m(10))
+    assert plan.order[:2] == [10, int(nearest[1])] and "of equal value" in plan.note
+    assert "of equal value: the nearest" in plan.stops[1].why
+
+
+def test_half_of_the_views_are_refused():
+    def spoilt(k):
+        return take(k) if k % 2 else None
+
+    plan = plan_capture(DOME, make_selector("farthest"), Budget(views=8), spoilt)
+    assert len(plan.stops) == 8 and all(k % 2 for k in plan.order) and plan.refused
+    assert f"{len(plan.refused)} views were refused" in plan.note
+    every = plan_capture(DOME, make_selector("farthest"), Budget(views=50), spoilt)
+    assert len(every.stops) == 30 and "Only 30 of 50 views: no candidate is left" in every.note
+    with pytest.raises(ViewpointError, match="all 60 reachable candidates were refused"):
+        plan_capture(DOME, make_selector("random"), Budget(views=8), lambda k: None)
+
+
+@pytest.mark.parametrize("values", [np.zeros(3), np.full(60, np.nan)])
+def test_wrong_values_of_a_selector_are_named(values):
+    with pytest.raises(ViewpointError, match="selector fixed: "):
+        plan_capture(DOME, Fixed(values), Budget(views=2), take)
+
+
+def test_wrong_requests_are_refused():
+    for budget in ({}, {"views": 0}, {"path_m": -1.0}):
+        with pytest.raises(ViewpointError, match="budget"):
+            Budget(**budget)
+    with pytest.raises(ViewpointError, match="there are: random, uniform"):
+        make_selector("best")
+    with pytest.raises(ViewpointError, match="expected 1 to"):
+        half_hemisphere(TARGET, 0.8, LENS, 0)
