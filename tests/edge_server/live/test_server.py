@@ -269,12 +269,13 @@ def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(
 
 
 def test_a_token_is_demanded_and_honoured(serve, tmp_path):
-    server, port, _ = serve(transport=Transport(token="open sesame"))
+    secured = Transport(tokens={"camera:*": "open sesame"})
+    server, port, _ = serve(transport=secured)
     refused = Feed(port, server.scenario.cameras, server.scenario.held_out)
     refused.start()
     refused.join(20)
     assert refused.error.code() == grpc.StatusCode.UNAUTHENTICATED
-    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, Transport(token="open sesame"))
+    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, secured)
     welcome.start()
     until(lambda: len(welcome.answers) > 3)
     welcome.stop()
