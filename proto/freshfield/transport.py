@@ -138,7 +138,6 @@ class Transport:
                 f"cannot listen: {words}. Give these options (`edge-server keys` makes the files), listen on "
                 "127.0.0.1, or say --insecure"
             )
-        log.warning("--insecure: %s", words)
         return words
 
     def tls(self, host: str) -> ssl.SSLContext | None:
@@ -180,7 +179,8 @@ class Transport:
             host, number = host_port(address)
         except TransportError as error:
             raise TransportError(f"cannot listen on {address}: {error}") from None
-        self.guard(host, "gRPC")
+        if words := self.guard(host, "gRPC"):
+            log.warning("--insecure: %s", words)
         try:
             if self.cert is None:
                 port = server.add_insecure_port(f"{host}:{number}")
