@@ -68,11 +68,13 @@ def _certify(folder: Path, name: str, extensions: Sequence[str], authority: Path
     """Write cert.pem and key.pem into ``folder``, signed by ``authority`` or by itself."""
     if len(name) > _MOST_NAME_CHARS:
         raise TransportError(f"{name}: a certificate's name has {_MOST_NAME_CHARS} characters at most")
-    signed = [] if authority is None else ["-CA", authority / "cert.pem", "-CAkey", authority / "key.pem"]
+    signed: list[str | Path] = (
+        [] if authority is None else ["-CA", authority / "cert.pem", "-CAkey", authority / "key.pem"]
+    )
     with tempfile.NamedTemporaryFile("w", suffix=".cnf") as config:  # else openssl's own adds extensions
         config.write("[req]\ndistinguished_name=name\n[name]\n")
         config.flush()
-        command = [
+        command: list[str | Path] = [
             "openssl", "req", "-x509", "-config", config.name, "-days", str(_DAYS), "-noenc",
             "-subj", f"/CN={name}", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", *signed,
             *(word for extension in extensions for word in ("-addext", extension)),

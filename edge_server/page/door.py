@@ -178,10 +178,10 @@ class Door:
             known = self._known(request, cookie) if authorization is None else None
             connection.caller = known or self._access.caller(authorization)
         except HttpRefused as error:
-            response = connection.respond(error.status, f"{error}\n")
+            refusal = connection.respond(error.status, f"{error}\n")
             if error.status == 401:
-                response.headers["WWW-Authenticate"] = 'Basic realm="freshfield", charset="UTF-8"'
-            return response
+                refusal.headers["WWW-Authenticate"] = 'Basic realm="freshfield", charset="UTF-8"'
+            return refusal
         if "websocket" in (_one(request, "Upgrade") or "").lower():
             if len(self.visitors) >= MAX_VISITORS:
                 return connection.respond(503, f"{MAX_VISITORS} visitors are here already\n")

@@ -115,9 +115,10 @@ class Access(grpc.aio.ServerInterceptor):
 
         async def admit(request: Any, context: grpc.aio.ServicerContext) -> Any:
             found = self._of_certificate(context) if header is None else self.of_header(header)
+            action = CALLS.get(method, CHANGE)
             if found is None:
                 await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no credential, or a wrong one")
-            action = CALLS.get(method, CHANGE)
+                raise AssertionError("abort raises")
             if not found.may(action):
                 await context.abort(grpc.StatusCode.PERMISSION_DENIED, f"a {found.role} may not {action}")
             caller.set(found)
