@@ -97,6 +97,8 @@ class Access(grpc.aio.ServerInterceptor):
                 token = base64.b64decode(token, validate=True).partition(b":")[2]
             except binascii.Error:
                 return None
+        elif kind.lower() != "bearer":
+            return None
         # All are compared, each in constant time: how long it takes says nothing.
         found = [known for known, expected in self._tokens if hmac.compare_digest(token, expected)]
         return found[0] if found else None

@@ -163,7 +163,14 @@ def test_a_browsers_login_is_the_token_as_password() -> None:
     for name, token in TOKENS.items():
         basic = base64.b64encode(f"whoever:{token}".encode()).decode()
         assert access.of_header(f"Basic {basic}") == access.of_header(f"bearer {token}") == Caller.named(name)
-    for wrong in ("Basic é", "Basic ====", "Basic", "Digest x", f"{TOKENS['viewer']}", "Bearer "):
+    for wrong in (
+        "Basic é",
+        "Basic ====",
+        "Basic",
+        f"Digest {TOKENS['viewer']}",
+        f"{TOKENS['viewer']}",
+        "Bearer ",
+    ):
         assert access.of_header(wrong) is None
 
 
