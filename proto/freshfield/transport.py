@@ -143,11 +143,12 @@ class Transport:
     def tls(self, host: str) -> ssl.SSLContext | None:
         """Of an HTTP server that listens on ``host``; None on loopback or without a certificate. Raises
         TransportError for files that are none."""
-        if self.cert is None or is_loopback(host):
-            return None
+        return None if self.cert is None or is_loopback(host) else self._context()
+
+    def _context(self) -> ssl.SSLContext:
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
-            context.load_cert_chain(self.cert, self.key)
+            context.load_cert_chain(self.cert, self.key, password="")  # type: ignore[arg-type]
         except (OSError, ssl.SSLError) as error:
             raise TransportError(f"cannot use --tls-cert {self.cert} with its --tls-key: {error}") from None
         return context
@@ -206,6 +207,7 @@ class Transport:
     def _server_credentials(self) -> grpc.ServerCredentials:
         if self.key is None:
             raise TransportError("--tls-cert needs --tls-key as well")
+        self._context()  # gRPC does not say what is wrong with a file
         pair = (_pem(self.key), _pem(self.cert))
         return grpc.ssl_server_credentials([pair], _pem(self.ca), require_client_auth=self.ca is not None)
 

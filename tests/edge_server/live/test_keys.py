@@ -66,6 +66,17 @@ def test_a_certificate_lets_its_process_do_its_own_part(keys):
     assert tokens.keys() == {"operator", "viewer"} and len(set(tokens.values())) == 2
 
 
+def test_a_key_of_another_certificate_is_named(keys):
+    async def scene():
+        mixed = Transport(
+            cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem"
+        )
+        with pytest.raises(TransportError, match="cannot use --tls-cert .* with its --tls-key"):
+            mixed.bind(mixed.aio_server(), "127.0.0.1:0")
+
+    asyncio.run(scene())
+
+
 def test_the_health_check_passes_mutual_tls(keys):
     async def scene():
         from grpc_health.v1 import health, health_pb2_grpc
