@@ -71,7 +71,7 @@ def test_a_key_of_another_certificate_is_named(keys):
         mixed = Transport(
             cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem"
         )
-        with pytest.raises(TransportError, match="cannot use --tls-cert .* with its --tls-key"):
+        with pytest.raises(TransportError, match=r"cannot use --tls-cert .* with its --tls-key"):
             mixed.bind(mixed.aio_server(), "127.0.0.1:0")
 
     asyncio.run(scene())
