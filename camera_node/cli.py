@@ -124,6 +124,7 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
     )
     doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
+    transport.add_arguments(doctor)
 
 
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:

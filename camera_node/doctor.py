@@ -59,7 +59,7 @@ class CheckResult:
 def run(args: argparse.Namespace) -> int:
     """Examine and print; 1 if something is wrong."""
     results = []
-    for result in run_checks(args.scenario, args.to, args.data, args.out):
+    for result in run_checks(args.scenario, args.to, args.data, args.out, transport.from_arguments(args)):
         results.append(result)
         if not args.json:
             mark = {True: "ok", False: "WRONG", None: "-"}[result.ok]
@@ -72,12 +72,14 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def run_checks(name: str | None, to: str | None, data: Path | None, out: Path) -> Iterator[CheckResult]:
+def run_checks(
+    name: str | None, to: str | None, data: Path | None, out: Path, security: transport.Transport
+) -> Iterator[CheckResult]:
     """The results, as they come.
 
     name: scenario file, or the name of a shipped one; None checks only what every scenario needs.
     to: HOST:PORT of the next hop; None leaves the network out.
-    data: folder of the data sets. out: where runs will be written.
+    data: folder of the data sets. out: where runs will be written. security: of the connection.
     """
     yield _check("python", _python)
     yield _check("clock", _clock)
@@ -85,7 +87,7 @@ def run_checks(name: str | None, to: str | None, data: Path | None, out: Path) -
     if to is None:
         yield CheckResult("network", None, "not examined: give --to HOST:PORT of the emulator or the edge")
     else:
-        yield _check("network", lambda: _network(to))
+        yield _check("network", lambda: _network(to, security))
     if name is None:
         yield CheckResult("scenario", None, "none given: cameras, arm and files are not examined")
         return
@@ -169,7 +171,7 @@ def _disk(out: Path) -> str:
     return f"{place}: {free_gb:.0f} GB free, can be written to"
 
 
-def _network(to: str) -> str:
+def _network(to: str, security: transport.Transport) -> str:
     host, port = transport.host_port(to)
     try:
         begin = time.perf_counter()
@@ -181,14 +183,14 @@ def _network(to: str) -> str:
             "started, does it listen on this network's address (--listen 0.0.0.0:PORT), does a firewall "
             "stand between?"
         ) from None
-    offset_ms, bound_ms = asyncio.run(_exchange(f"{host}:{port}"))
+    offset_ms, bound_ms = asyncio.run(_exchange(f"{host}:{port}", security))
     return (
         f"{host}:{port} answers: connecting takes {connect_ms:.1f} ms, its clock is {offset_ms:+.2f} "
         f"ms off ours (within {bound_ms:.2f} ms)"
     )
 
 
-async def _exchange(target: str) -> tuple[float, float]:
+async def _exchange(target: str, security: transport.Transport) -> tuple[float, float]:
     """The other clock minus ours and its bound, both in ms."""
     import grpc
     import grpc.aio
@@ -196,20 +198,20 @@ async def _exchange(target: str) -> tuple[float, float]:
     from freshfield.v1 import clock_pb2, clock_pb2_grpc
 
     estimator, clock = OffsetEstimator(), WallClock()
-    options = (("grpc.enable_http_proxy", 0),)
-    async with grpc.aio.insecure_channel(target, options=options) as channel:
+    async with security.aio_channel(target) as channel:
         stub = clock_pb2_grpc.ClockServiceStub(channel)
         try:
             for _ in range(_EXCHANGES):
                 sent = clock.now_ns()
                 answer = await stub.Exchange(
-                    clock_pb2.ExchangeRequest(client_sent_ns=sent), timeout=_ANSWER_S
-                )
+                    clock_pb2.ExchangeRequest(client_sent_ns=sent), timeout=_ANSWER_S,
+                    metadata=security.metadata(),
+                )  # fmt: skip
                 estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, clock.now_ns())
         except grpc.RpcError as error:
             raise CheckFailed(
                 f"{target} takes connections but does not speak with us ({error.code().name.lower()}): "  # type: ignore[attr-defined]
-                "is it an emulator or an edge server, and without TLS?"
+                "is it an emulator or an edge server, and does it ask for --tls-* or --token-file?"
             ) from None
     found = estimator.estimate(clock.now_ns())
     assert found is not None

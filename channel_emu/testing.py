@@ -154,7 +154,7 @@ def put_behind(
     direction: the messages that pass the link: up (to the service), down (its answers) or both.
     shared: one link for all methods of a direction, instead of one each.
     trace: record to this file. replay: repeat the decisions of a recorded file.
-    transport: TLS and token of both sides.
+    transport: TLS and tokens of both sides.
 
     Raises ScenarioError, TraceError, TransportError (all ValueErrors), one line that says what to change.
     """

@@ -114,6 +114,7 @@ _COMMANDS = {
         "experiments.training.detector.perceptual",
         "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
     ),
+    "keys": ("live.keys", "make a development authority, certificates and tokens for a scenario's processes"),
     "fetch-lpips": (
         "fidelity.fetch_lpips",
         "fetch LPIPS weights with the public package and convert them to our weights folder",

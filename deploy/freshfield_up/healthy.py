@@ -3,6 +3,8 @@
 python -m freshfield_up.healthy --serving HOST:PORT   the gRPC health service there says SERVING
 python -m freshfield_up.healthy --node DIR            a node's status file there is younger than ten seconds:
                                                       that of the camera $CAMERA, or of any node
+
+With mutual TLS a server's check shows the server's own certificate (--tls-cert, --tls-key, --tls-ca).
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import sys
 import time
 from pathlib import Path
 
+from freshfield.transport import add_arguments, from_arguments
 from freshfield_up.net import is_serving
 
 FRESH_S = 10.0
@@ -29,9 +32,10 @@ def main() -> int:
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--serving", metavar="HOST:PORT")
     which.add_argument("--node", type=Path, metavar="DIR")
+    add_arguments(parser)
     args = parser.parse_args()
     healthy = (
-        is_serving(args.serving, timeout_s=2.0)
+        is_serving(args.serving, timeout_s=2.0, transport=from_arguments(args))
         if args.serving
         else is_fresh(args.node, os.environ.get("CAMERA"))
     )

@@ -13,6 +13,8 @@ os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from freshfield.transport import Transport
+
 LOOPBACK = "127.0.0.1"
 
 
@@ -40,10 +42,9 @@ def is_free(port: int) -> bool:
         return True
 
 
-def is_serving(address: str, timeout_s: float = 0.5) -> bool:
+def is_serving(address: str, timeout_s: float = 0.5, transport: Transport | None = None) -> bool:
     """Whether the gRPC health service at ``host:port`` says SERVING."""
-    options = [("grpc.enable_http_proxy", 0)]
-    with grpc.insecure_channel(address, options=options) as channel:
+    with (transport or Transport()).channel(address) as channel:
         try:
             stub = health_pb2_grpc.HealthStub(channel)
             reply = stub.Check(health_pb2.HealthCheckRequest(), timeout=timeout_s)

@@ -37,7 +37,7 @@ from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.transport import Transport, TransportError
+from freshfield.transport import Transport, TransportError, host_port
 from freshfield.untrusted import stored_bytes
 
 if TYPE_CHECKING:  # imported at run time only where a run is recorded
@@ -159,7 +159,8 @@ class EdgeServer:
 
     def run(self) -> None:
         """Serve until stopped, then write everything down. Raises what ended the update loop, if it
-        failed."""
+        failed; TransportError if a port would be open to others."""
+        self.state.warnings = self._warnings()
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
@@ -171,14 +172,19 @@ class EdgeServer:
                 from edge_server.page import PageError, start_page
 
                 try:
-                    page = start_page(self.state, self.options.page_host, self.options.page_port)
+                    page = start_page(
+                        self.state, self.options.page_host, self.options.page_port, self.options.transport
+                    )
                 except PageError as error:
                     raise TransportError(f"page: {error}") from None
                 log.info("page: %s", page.url)
             if self.options.metrics_port is not None:
                 from edge_server.live.output.prometheus import serve_metrics
 
-                serve_metrics(self.state, self.ingest, self.options.page_host, self.options.metrics_port)
+                serve_metrics(
+                    self.state, self.ingest, self.options.page_host, self.options.metrics_port,
+                    self.options.transport,
+                )  # fmt: skip
             self.scoring.start()
             if self.trainer is not None:
                 self.trainer.start()
@@ -196,6 +202,15 @@ class EdgeServer:
             self._write_final()
         if self.loop.failure is not None:
             raise self.loop.failure
+
+    def _warnings(self) -> list[str]:
+        """What the page says of every port."""
+        options = self.options
+        ports = [(host_port(options.listen)[0], "gRPC", False)]
+        ports += [(options.page_host, "page", True)] if options.page_port is not None else []
+        ports += [(options.page_host, "metrics", True)] if options.metrics_port is not None else []
+        words = [options.transport.guard(host, what, http) for host, what, http in ports]
+        return [each for each in words if each]
 
     def stop(self) -> None:
         """Ask ``run`` to end; safe from signal handlers and other threads."""

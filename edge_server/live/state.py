@@ -122,6 +122,7 @@ class EdgeState:
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     learning: one line on a policy that learns while it is used; empty where none does.
     bounds: world box (2, 3) in metres of what the field represents, once known.
+    warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
 
@@ -142,6 +143,7 @@ class EdgeState:
     started: bool = False
     bounds: NDArray[np.float64] | None = None
     status_line: str = ""
+    warnings: list[str] = field(default_factory=list)
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
     _renderer: Snapshot | None = None
     _comparison: Comparison | None = None

@@ -17,10 +17,14 @@ import rich
 import viser
 
 from edge_server.live.state import EdgeState
+from edge_server.page.controls import notify
+from edge_server.page.door import Door
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
 from edge_server.page.timelines import History
+from freshfield.access import HttpDoor
+from freshfield.transport import Transport
 
 __all__ = ["Page", "PageError", "start_page"]
 
@@ -53,15 +57,25 @@ class Page:
         _quietly(self._server.stop)
 
 
-def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080) -> Page:
-    """Serve the page of ``state``. Port 0 takes a free one. Raises PageError if the port is not available."""
+def start_page(
+    state: EdgeState, host: str = "127.0.0.1", port: int = 8080, transport: Transport | None = None
+) -> Page:
+    """Serve the page of ``state``. Port 0 takes a free one. Raises PageError if the port is not available,
+    TransportError if it would be open to others (see ``Transport.guard``)."""
     _check_port(host, port)
-    server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
+    transport = transport or Transport()
+    if words := transport.guard(host, "page", http=True):
+        log.warning("--insecure: %s", words)
+    tls = transport.tls(host)
+    door = Door(HttpDoor(transport.access, host), tls)
+    with door.before_viser():
+        server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
+    if not door.used:
+        _quietly(server.stop)
+        raise PageError("page: this version of viser listens in another way: nothing would protect the page")
     if port and server.get_port() != port:  # taken since the check: viser silently takes the next one
         _quietly(server.stop)
         raise PageError(_taken(host, port))
-    # A visitor must not be able to make this machine open a tunnel to the outside.
-    server.request_share_url = _no_sharing  # type: ignore[method-assign]
     server.gui.configure_theme(
         dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium"
     )
@@ -84,9 +98,17 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080) -> P
 
     server.on_client_connect(joined)
     server.on_client_disconnect(left)
+
+    def told(connection: Any) -> None:
+        for number, each in list(server._websock_server._live_connections.items()):
+            if each is connection:
+                notify(server.get_clients().get(number), "Not done", "You logged in to look only.", bad=True)
+
+    door.controls, door.told = server.gui._gui_input_handle_from_uuid, told
     renders.start()
     refresher.start()
-    return Page(page_url(host, server.get_port()), server.get_port(), server, refresher, renders)
+    port = server.get_port()
+    return Page(page_url(host, port, tls is not None), port, server, refresher, renders)
 
 
 class _Refresher:
@@ -152,11 +174,11 @@ class _Refresher:
             self._renders.refresh()
 
 
-def page_url(host: str, port: int) -> str:
+def page_url(host: str, port: int, tls: bool = False) -> str:
     """An address that a browser can open: localhost if the page listens on every interface."""
     if host in ("", "0.0.0.0", "::", "*"):
         host = "localhost"
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return f"http{'s' if tls else ''}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _check_port(host: str, port: int) -> None:
@@ -176,11 +198,6 @@ def _check_port(host: str, port: int) -> None:
 
 def _taken(host: str, port: int) -> str:
     return f"page: cannot listen on {host}:{port}; choose another port with --page-port"
-
-
-def _no_sharing(verbose: bool = True) -> None:
-    del verbose
-    log.warning("page: a visitor asked for a public address; this server does not give one")
 
 
 def _quietly(action: Any) -> Any:

@@ -262,6 +262,11 @@ def note(text: str) -> str:
     return f'<div style="padding:.3em .9em;font-size:.78em;{_DIM}">{escape(text)}</div>'
 
 
+def warning(text: str) -> str:
+    """Lines that must not be missed."""
+    return f'<div style="margin:.4em .9em;padding:.4em .6em;background:#a33;color:#fff">{escape(text)}</div>'
+
+
 def number(value: float | None, digits: int = 0) -> str:
     """A number for people: a dash for None and NaN."""
     if value is None or value != value:

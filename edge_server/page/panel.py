@@ -34,6 +34,8 @@ class Panel:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(MAIN_WIDTH)
         gui.add_html(markup.INTRO)
+        if state.warnings:
+            gui.add_html(markup.warning(f"Insecure: {'; '.join(state.warnings)}."))
         self._status = gui.add_html("")
         self._channel_state = gui.add_html("", visible=False)
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))

@@ -74,6 +74,24 @@ MAX_SCRAPES = 8
 SCRAPE_TIMEOUT_S = 5.0
 """How long one of them may say nothing."""
 
+MAX_VISITORS = 32
+"""Of the page, at once. One who does not read costs what the page sends at first, some megabytes."""
+
+VISITOR_TIMEOUT_S = 30.0
+"""How long a visitor may leave unread what was sent: a slow line takes the first megabytes in that time."""
+
+MAX_VISITOR_MESSAGE_BYTES = 2**16
+"""Of what a visitor sends: viewpoints, clicks and values of controls take less than a kilobyte."""
+
+MAX_CLICKS_HZ = 50.0
+"""Of one visitor, on controls and cameras, and as many at once: a number's arrow, held down, makes 40."""
+
+MAX_VIEW_SIDE_PX = 16384
+"""Of a visitor's window: wider than any screen."""
+
+MAX_PAGE_CONNECTIONS = 128
+"""To the page, visitors and requests, at once: a browser opens six. A new one ends the oldest request."""
+
 MAX_QUEUED_BYTES = 256 * 2**20
 """Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""
 

@@ -11,6 +11,7 @@ from typing import Any
 import grpc
 import grpc.aio
 
+from freshfield.access import caller
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 
@@ -22,6 +23,7 @@ class ServedCall:
         task = asyncio.current_task()
         assert task is not None
         self.task = task
+        self.caller = caller.get()
         self.open = True
         self._context = context
         self._status: tuple[grpc.StatusCode, str] | None = None
@@ -86,7 +88,10 @@ class SessionStreams:
         self._sent: dict[str, OrderedDict[str, tuple[ServedCall, int]]] = {c: OrderedDict() for c in cameras}
 
     def claim(self, camera: str, session: str, call: ServedCall, now_ns: int) -> None:
-        """A frame of ``session`` came on the stream ``call``. Raises FrameRejected: session_in_use."""
+        """A frame of ``session`` came on the stream ``call``. Raises FrameRejected: forbidden_camera,
+        session_in_use."""
+        if not call.caller.may_push(camera):
+            raise FrameRejected("forbidden_camera", f"this credential is not one of camera {camera}")
         sessions = self._sent[camera]
         owner, last_ns = sessions.get(session, (call, now_ns))
         if owner is not call and owner.open and 0 <= now_ns - last_ns < SESSION_IDLE_NS:

@@ -1,4 +1,4 @@
-"""gRPC channels and servers as every process of the project opens them: limits, keepalive, TLS, token.
+"""gRPC channels and servers as every process of the project opens them: limits, keepalive, TLS, tokens.
 
 ``grpc.http2.bdp_probe=0``: with bandwidth probing on, a stalled reader lets a client queue megabytes of
 frames, which is age. Keepalive is set at both ends, because servers punish pings they did not agree to.
@@ -7,9 +7,11 @@ frames, which is age. Keepalive is set at both ends, because servers punish ping
 from __future__ import annotations
 
 import argparse
-import hmac
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+import logging
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,10 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from freshfield.access import Access, is_loopback
 from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES, MAX_PEER_TEXT_CHARS
+
+log = logging.getLogger(__name__)
 
 _KEEPALIVE_MS = 10_000
 
@@ -88,42 +93,95 @@ class Transport:
 
     cert, key: own certificate (a server needs both for TLS; a client for mutual TLS).
     ca: trusted authority (a client uses TLS when given; a server then demands client certificates).
-    token: bearer token sent by clients and demanded by servers.
+    tokens: token by name of its caller (see ``access``). A server takes each of them; a client sends the
+    first, whose name it need not know ("").
+    insecure: a server may listen beyond this machine without TLS or without asking who calls.
     """
 
     cert: Path | None = None
     key: Path | None = None
     ca: Path | None = None
-    token: str | None = None
+    tokens: Mapping[str, str] = field(default_factory=dict)
+    insecure: bool = False
 
     def metadata(self) -> tuple[tuple[str, str], ...]:
         """Per-call metadata of a client."""
-        return (("authorization", f"Bearer {self.token}"),) if self.token else ()
+        return tuple(("authorization", f"Bearer {token}") for token in list(self.tokens.values())[:1])
+
+    @cached_property
+    def access(self) -> Access:
+        """Who may do what at this server. Raises TransportError for options that a server cannot have."""
+        if self.ca is not None and self.cert is None:
+            raise TransportError("--tls-ca of a process that listens needs --tls-cert and --tls-key as well")
+        try:
+            return Access(self.tokens, certificates=self.ca is not None)
+        except ValueError as error:
+            raise TransportError(
+                f"--token-file of a process that listens: a line is NAME TOKEN: {error}"
+            ) from None
+
+    def guard(self, host: str, what: str, http: bool = False) -> str:
+        """What is wrong with listening on ``host`` for ``what``, in words to show; empty where nothing is.
+        Raises TransportError for what is wrong if it was not asked for (``insecure``).
+
+        http: callers can show tokens only.
+        """
+        asked = not self.access.open and bool(self.tokens or not http)
+        missing = [] if self.cert else ["nothing is encrypted (--tls-cert, --tls-key)"]
+        if not asked:
+            missing.append(f"nobody is asked who they are (--token-file{'' if http else ' or --tls-ca'})")
+        if is_loopback(host) or not missing:
+            return ""
+        words = f"{what} on {host} can be reached from other machines, and {' and '.join(missing)}"
+        if not self.insecure:
+            raise TransportError(
+                f"cannot listen: {words}. Give these options (`edge-server keys` makes the files), listen on "
+                "127.0.0.1, or say --insecure"
+            )
+        return words
+
+    def tls(self, host: str) -> ssl.SSLContext | None:
+        """Of an HTTP server that listens on ``host``; None on loopback or without a certificate. Raises
+        TransportError for files that are none."""
+        return None if self.cert is None or is_loopback(host) else self._context()
+
+    def _context(self) -> ssl.SSLContext:
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        try:
+            context.load_cert_chain(self.cert, self.key, password="")  # type: ignore[arg-type]
+        except (OSError, ssl.SSLError) as error:
+            raise TransportError(f"cannot use --tls-cert {self.cert} with its --tls-key: {error}") from None
+        return context
 
     def aio_channel(self, target: str, options: list[tuple[str, Any]] = CLIENT_OPTIONS) -> grpc.aio.Channel:
-        """Client channel; must be called with an event loop running."""
-        if self.ca is None:
+        """Client channel; must be called with an event loop running. Raises TransportError for a token that
+        would go to another machine in plain text."""
+        credentials = self._client_credentials(target)
+        if credentials is None:
             return grpc.aio.insecure_channel(target, options=options)
-        return grpc.aio.secure_channel(target, self._client_credentials(), options=options)
+        return grpc.aio.secure_channel(target, credentials, options=options)
 
     def channel(self, target: str) -> grpc.Channel:
         """Blocking client channel, for tools and tests."""
-        if self.ca is None:
+        credentials = self._client_credentials(target)
+        if credentials is None:
             return grpc.insecure_channel(target, options=CLIENT_OPTIONS)
-        return grpc.secure_channel(target, self._client_credentials(), options=CLIENT_OPTIONS)
+        return grpc.secure_channel(target, credentials, options=CLIENT_OPTIONS)
 
     def aio_server(self) -> grpc.aio.Server:
-        """Server without a port; must be called with an event loop running."""
-        interceptors = [_TokenInterceptor(self.token)] if self.token else []
-        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
+        """Server without a port; must be called with an event loop running. Raises TransportError, see
+        ``access``."""
+        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=[] if self.access.open else [self.access])
 
     def bind(self, server: grpc.aio.Server, address: str) -> int:
         """Listen on ``host:port`` (port 0 = any) and return the port. Raises TransportError if that is no
-        address, the port is taken or the host is another machine."""
+        address, the port is taken, the host is another machine or ``guard`` does not let it."""
         try:
             host, number = host_port(address)
         except TransportError as error:
             raise TransportError(f"cannot listen on {address}: {error}") from None
+        if words := self.guard(host, "gRPC"):
+            log.warning("--insecure: %s", words)
         try:
             if self.cert is None:
                 port = server.add_insecure_port(f"{host}:{number}")
@@ -137,12 +195,19 @@ class Transport:
             )
         return port
 
-    def _client_credentials(self) -> grpc.ChannelCredentials:
-        return grpc.ssl_channel_credentials(_pem(self.ca), _pem(self.key), _pem(self.cert))
+    def _client_credentials(self, target: str) -> grpc.ChannelCredentials | None:
+        if self.ca is not None:
+            return grpc.ssl_channel_credentials(_pem(self.ca), _pem(self.key), _pem(self.cert))
+        if self.tokens and not self.insecure and not is_loopback(target.rpartition(":")[0]):
+            raise TransportError(
+                f"the token would go to {target} in plain text: give --tls-ca, or say --insecure"
+            )
+        return None
 
     def _server_credentials(self) -> grpc.ServerCredentials:
         if self.key is None:
             raise TransportError("--tls-cert needs --tls-key as well")
+        self._context()  # gRPC does not say what is wrong with a file
         pair = (_pem(self.key), _pem(self.cert))
         return grpc.ssl_server_credentials([pair], _pem(self.ca), require_client_auth=self.ca is not None)
 
@@ -156,54 +221,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tls-ca", type=Path, metavar="PEM",
         help="trusted authority: a client then uses TLS, a server then demands client certificates",
     )  # fmt: skip
-    group.add_argument("--token-file", type=Path, metavar="FILE", help="file with the shared bearer token")
+    group.add_argument(
+        "--token-file", type=Path, metavar="FILE",
+        help="lines NAME TOKEN; a name: operator, viewer, camera:ID[,ID], camera:*. A client sends the first "
+        "line's token (which may stand alone), a server takes them all",
+    )  # fmt: skip
+    group.add_argument(
+        "--insecure", action="store_true",
+        help="listen beyond this machine without TLS or without asking who calls",
+    )  # fmt: skip
 
 
 def from_arguments(args: argparse.Namespace) -> Transport:
     """Transport of parsed ``add_arguments`` options. Raises TransportError for unreadable files."""
-    token = None
-    if args.token_file:
-        token = _read(args.token_file).decode().strip()
-        if not token:
-            raise TransportError(f"{args.token_file}: the token file is empty")
     for path in (args.tls_cert, args.tls_key, args.tls_ca):
         if path:
             _read(path)
     if (args.tls_cert is None) != (args.tls_key is None):
         raise TransportError("--tls-cert and --tls-key go together")
-    return Transport(args.tls_cert, args.tls_key, args.tls_ca, token)
+    tokens = _tokens(args.token_file) if args.token_file else {}
+    return Transport(args.tls_cert, args.tls_key, args.tls_ca, tokens, args.insecure)
 
 
-class _TokenInterceptor(grpc.aio.ServerInterceptor):
-    """Refuses calls without the token, which is compared in constant time."""
-
-    def __init__(self, token: str) -> None:
-        self._expected = f"Bearer {token}".encode()
-
-        async def refuse(request: Any, context: grpc.aio.ServicerContext) -> None:
-            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
-
-        # By whether requests and responses are streams.
-        self._refusals = {
-            (False, False): grpc.unary_unary_rpc_method_handler(refuse),
-            (False, True): grpc.unary_stream_rpc_method_handler(refuse),
-            (True, False): grpc.stream_unary_rpc_method_handler(refuse),
-            (True, True): grpc.stream_stream_rpc_method_handler(refuse),
-        }
-
-    async def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> grpc.RpcMethodHandler:
-        for key, value in handler_call_details.invocation_metadata or ():
-            raw = value if isinstance(value, bytes) else value.encode()
-            if key == "authorization" and hmac.compare_digest(raw, self._expected):
-                return await continuation(handler_call_details)
-        handler = await continuation(handler_call_details)
-        if handler is None:
-            return self._refusals[False, False]
-        return self._refusals[bool(handler.request_streaming), bool(handler.response_streaming)]
+def _tokens(path: Path) -> dict[str, str]:
+    lines = [line.split() for line in _read(path).decode(errors="replace").splitlines() if line.strip()]
+    tokens = {words[0] if len(words) == 2 else "": words[-1] for words in lines}
+    if not lines:
+        raise TransportError(f"{path}: the token file is empty")
+    if (
+        any(len(words) > 2 for words in lines)
+        or len(tokens) < len(lines)
+        or ("" in tokens and len(lines) > 1)
+    ):
+        raise TransportError(f"{path}: expected lines NAME TOKEN with different names, or one token alone")
+    return tokens
 
 
 def _read(path: Path) -> bytes:

@@ -52,6 +52,21 @@ def test_only_the_page_is_published_and_only_on_this_machine() -> None:
     assert published == {"edge": ["127.0.0.1:8080:8080"]}
 
 
+def test_what_listens_unprotected_says_so_and_the_secure_file_protects_it() -> None:
+    secure = yaml.safe_load((ROOT / "deploy" / "compose.secure.yaml").read_text())["services"]
+    assert secure.keys() == SERVICES.keys()
+    tls = ["--tls-cert", "/keys/cert.pem", "--tls-key", "/keys/key.pem", "--tls-ca", "/keys/ca.pem"]
+    for name, service in SERVICES.items():
+        words, changed = service["command"].split(), secure[name]["command"].split()
+        assert ("--insecure" in words) == ("--listen" in words)
+        added = [*tls, *(["--token-file", "/keys/tokens.txt"] if name == "edge" else [])]
+        assert sorted(changed) == sorted([*(w for w in words if w != "--insecure"), *added]), name
+        assert secure[name]["volumes"] == [*service["volumes"], f"./keys/{name}:/keys:ro"]
+        check = secure[name].get("healthcheck")
+        assert check is None or check["test"] == [*service["healthcheck"]["test"], *tls]
+        assert (check is None) == (name in CAMERAS)
+
+
 def test_every_service_has_a_health_check_and_no_privileges() -> None:
     for name, service in SERVICES.items():
         check = service["healthcheck"]["test"]  # images in the OCI format carry none

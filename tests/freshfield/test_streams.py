@@ -9,6 +9,7 @@ import grpc
 import grpc.aio
 import pytest
 
+from freshfield.access import ANYBODY
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 from freshfield.streams import OpenStreams, SessionStreams
@@ -101,6 +102,7 @@ def test_a_closed_stream_leaves_its_place():
 
 class Stream:
     open = True
+    caller = ANYBODY
 
 
 def test_a_session_belongs_to_the_stream_that_sends_it():

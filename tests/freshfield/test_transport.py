@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import dataclasses
 import shutil
 import subprocess
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import grpc
 import grpc.aio
@@ -60,10 +62,13 @@ async def ask(transport: Transport, port: int) -> int:
         return (await call).client_sent_ns
 
 
-async def push(transport: Transport, port: int, size: int) -> int:
+async def push(transport: Transport, port: int, size: int | None) -> int:
+    """None writes nothing: a write that meets a stream which the server has just ended may report INTERNAL in
+    place of the server's own status."""
     async with transport.aio_channel(f"localhost:{port}") as channel:
         call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(metadata=transport.metadata(), timeout=20)
-        await call.write(pb.PushRequest(payload=bytes(size)))
+        if size is not None:
+            await call.write(pb.PushRequest(payload=bytes(size)))
         response = await call.read()
         return response.sequence
 
@@ -100,17 +105,20 @@ def test_a_server_refuses_a_message_that_a_stranger_sends_too_large():
     assert refusal(scene()) == grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
+RIGHT = Transport(tokens={"camera:*": "right"})
+
+
 @pytest.mark.parametrize("token", [None, "wrong", "right "])
 def test_without_the_right_token_nothing_is_served(token):
     async def scene(call):
-        async with serving(Transport(token="right")) as port:
-            assert await ask(Transport(token="right"), port) == 42
-            assert await push(Transport(token="right"), port, 7) == 7
+        async with serving(RIGHT) as port:
+            assert await ask(RIGHT, port) == 42
+            assert await push(RIGHT, port, 7) == 7
             await call(port)
 
-    stranger = Transport(token=token)
+    stranger = Transport(tokens={"": token} if token else {})
     assert refusal(scene(lambda port: ask(stranger, port))) == grpc.StatusCode.UNAUTHENTICATED
-    assert refusal(scene(lambda port: push(stranger, port, 7))) == grpc.StatusCode.UNAUTHENTICATED
+    assert refusal(scene(lambda port: push(stranger, port, None))) == grpc.StatusCode.UNAUTHENTICATED
 
 
 def test_a_port_in_use_is_not_shared():
@@ -159,7 +167,7 @@ def test_bind_refuses_what_is_no_address(address):
 def test_bind_says_why_in_its_own_words():
     async def scene():
         with pytest.raises(TransportError) as error:
-            Transport().bind(Transport().aio_server(), "192.0.2.1:7001")
+            Transport(insecure=True).bind(Transport().aio_server(), "192.0.2.1:7001")
         return str(error.value)
 
     said = asyncio.run(scene())
@@ -181,8 +189,8 @@ def pem(tmp_path_factory):
         openssl("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
                 "-keyout", f"{name}.key", "-out", f"{name}.pem")  # fmt: skip
     (folder / "ext").write_text("subjectAltName=DNS:localhost")
-    for name in ("server", "client"):
-        openssl("req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={name}",
+    for name, subject in (("server", "server"), ("client", "viewer")):
+        openssl("req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={subject}",
                 "-keyout", f"{name}.key", "-out", f"{name}.csr")  # fmt: skip
         openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "2",
                 "-CAcreateserial", "-extfile", "ext", "-out", f"{name}.pem")  # fmt: skip
@@ -204,6 +212,49 @@ def test_tls_and_mutual_tls(pem):
     assert asyncio.run(scene(mutual, known)) == 42
     for server_side, client in ((server_tls, deceived), (server_tls, Transport()), (mutual, trusting)):
         assert refusal(scene(server_side, client)) == grpc.StatusCode.UNAVAILABLE
+    other = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
+    assert refusal(scene(mutual, other)) == grpc.StatusCode.UNAUTHENTICATED  # its name is no caller's
+
+
+LISTENING = {
+    "an authority alone": (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
+    "a token without a name": (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
+    "plain text": (RIGHT, "0.0.0.0", "nothing is encrypted"),
+    "nobody asked": (Transport(cert=Path("c"), key=Path("k")), "0.0.0.0", "nobody is asked"),
+    "no address": (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
+}
+
+
+@pytest.mark.parametrize("what", LISTENING)
+def test_a_server_refuses_to_listen_unprotected(what):
+    transport, host, why = LISTENING[what]
+
+    async def scene():
+        with pytest.raises(TransportError, match=why):
+            transport.bind(Transport().aio_server(), f"{host}:0")
+
+    asyncio.run(scene())
+
+
+def test_what_protects_a_port_beyond_this_machine():
+    tls = {"cert": Path("c"), "key": Path("k")}
+    assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
+    assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
+    with pytest.raises(TransportError, match="--token-file"):  # a browser has no certificate
+        Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "page", http=True)
+    for host in ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost"):
+        assert Transport().guard(host, "page") == ""
+    words = Transport(insecure=True).guard("0.0.0.0", "page")
+    assert "nothing is encrypted" in words and "nobody is asked" in words
+
+
+def test_a_token_does_not_leave_the_machine_in_plain_text():
+    async def scene():
+        with pytest.raises(TransportError, match="plain text"):
+            RIGHT.aio_channel("edge:7000")
+        await dataclasses.replace(RIGHT, insecure=True).aio_channel("edge:7000").close()
+
+    asyncio.run(scene())
 
 
 def parsed(*arguments: str) -> Transport:
@@ -218,6 +269,12 @@ def test_options_become_a_transport(tmp_path):
     transport = parsed("--token-file", str(token))
     assert transport.metadata() == (("authorization", "Bearer secret"),)
     assert parsed() == Transport()
+    token.write_text("camera:cam00 one\n\noperator two\n")
+    assert parsed("--token-file", str(token)).tokens == {"camera:cam00": "one", "operator": "two"}
+    for wrong in ("viewer a\nviewer b", "a\nb", "viewer a b"):
+        token.write_text(wrong)
+        with pytest.raises(TransportError, match="NAME TOKEN"):
+            parsed("--token-file", str(token))
     token.write_text("\n")
     with pytest.raises(TransportError, match="empty"):
         parsed("--token-file", str(token))

@@ -231,8 +231,8 @@ def test_photos_that_are_gone_are_counted_and_the_others_go_on(tmp_path, caplog)
 
 def test_the_token_is_needed_and_sent(tmp_path):
     async def scene(token):
-        peer = await Peer(transport=Transport(token="right")).start()
-        node = make_node(tmp_path / str(token), peer.address, transport=Transport(token=token))
+        peer = await Peer(transport=Transport(tokens={"camera:*": "right"})).start()
+        node = make_node(tmp_path / str(token), peer.address, transport=Transport(tokens={"": token}))
         running = asyncio.ensure_future(node.run())
         with contextlib.suppress(TimeoutError):
             await peer.until(5, timeout_s=3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import socket
 import threading
 from collections.abc import Iterator
@@ -16,7 +17,11 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState
+from freshfield.access import HttpDoor, HttpRefused
 from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
+from freshfield.transport import Transport
+
+log = logging.getLogger(__name__)
 
 
 class EdgeCollector:
@@ -97,10 +102,35 @@ class _Server(ThreadingMixIn, WSGIServer):
         """A connection that broke is the client's matter."""
 
 
-def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:
-    """Serve /metrics on a thread until the process ends."""
+def _guarded(metrics: Any, door: HttpDoor) -> Any:
+    """The WSGI application for those who may look."""
+
+    def application(environ: dict[str, Any], start_response: Any) -> Any:
+        try:
+            door.check_origin(environ.get("HTTP_HOST"), environ.get("HTTP_ORIGIN"))
+            door.caller(environ.get("HTTP_AUTHORIZATION"))
+        except HttpRefused as error:
+            challenge = [("WWW-Authenticate", 'Basic realm="freshfield"')] if error.status == 401 else []
+            start_response(f"{error.status} Refused", [("Content-Type", "text/plain"), *challenge])
+            return [f"{error}\n".encode()]
+        return metrics(environ, start_response)
+
+    return application
+
+
+def serve_metrics(
+    state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None
+) -> None:
+    """Serve /metrics on a thread until the process ends. Raises TransportError if they would be open to
+    others (see ``Transport.guard``)."""
+    transport = transport or Transport()
+    if words := transport.guard(host, "metrics", http=True):
+        log.warning("--insecure: %s", words)
+    door, tls = HttpDoor(transport.access, host), transport.tls(host)
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
     server = _Server(host.strip("[]"), port)
-    server.set_app(make_wsgi_app(registry))
+    server.set_app(_guarded(make_wsgi_app(registry), door))
+    if tls is not None:  # a connection's own thread does the handshake
+        server.socket = tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
     threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()

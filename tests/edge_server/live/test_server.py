@@ -22,7 +22,7 @@ from freshfield import payload, scenario
 from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
 from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
-from freshfield.transport import Transport
+from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
@@ -272,15 +272,31 @@ def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(
 
 
 def test_a_token_is_demanded_and_honoured(serve, tmp_path):
-    server, port, _ = serve(transport=Transport(token="open sesame"))
+    secured = Transport(tokens={"camera:*": "open sesame"})
+    server, port, _ = serve(transport=secured)
     refused = Feed(port, server.scenario.cameras, server.scenario.held_out)
     refused.start()
     refused.join(20)
     assert refused.error.code() == grpc.StatusCode.UNAUTHENTICATED
-    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, Transport(token="open sesame"))
+    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, secured)
     welcome.start()
     until(lambda: len(welcome.answers) > 3)
     welcome.stop()
+
+
+def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
+    made = tiny_scenario(tmp_path)
+
+    def server(**options):
+        ports = {"page_host": "0.0.0.0", "page_port": 0, "metrics_port": 0}
+        return EdgeServer(
+            made, read_config(made), ServerOptions("0.0.0.0:0", tmp_path / "o", **ports, **options)
+        )
+
+    with pytest.raises(TransportError, match=r"cannot listen: gRPC on 0\.0\.0\.0"):
+        server().run()
+    named = server(transport=Transport(insecure=True))._warnings()
+    assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 
 
 def test_a_taken_port_is_one_clear_error(serve, tmp_path):

@@ -299,7 +299,7 @@ def test_no_visitor_can_open_a_public_tunnel(tmp_path, caplog):
     with preview_page(tmp_path) as (_, page), Visitor(page.port) as visitor:
         visitor.wait_for(lambda: visitor.counts["GuiHtmlMessage"] > 0, "the panel")
         visitor.send("ShareUrlRequest")
-        wait_until(lambda: "does not give one" in caplog.text, "no log entry")
+        wait_until(lambda: "that visitors do not send" in caplog.text, "no log entry")
         assert page._server._share_tunnel is None
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -21,13 +21,13 @@ from tests.waiting import wait_until
 
 
 class Visitor:
-    """Connects and stands at ``position`` looking at the origin; reads in a thread unless ``reads`` is
-    False. ``counts``: messages by type; ``bytes``: all that came; ``images``: number of renderings;
-    ``image``: the last one, encoded."""
+    """Connects, with more ``headers``, and stands at ``position`` looking at the origin; reads in a thread
+    unless ``reads`` is False. ``counts``: messages by type; ``bytes``: all that came; ``images``: number of
+    renderings; ``image``: the last one, encoded."""
 
     def __init__(
         self, port: int, position: tuple[float, float, float] = (4.0, 0.0, 3.0), reads: bool = True,
-        size: tuple[int, int] = (800, 600),
+        size: tuple[int, int] = (800, 600), headers: Sequence[str] = (),
     ) -> None:  # fmt: skip
         self.counts: Counter[str] = Counter()
         self.bytes = 0
@@ -37,6 +37,7 @@ class Visitor:
         self._closing = False
         self._socket = websocket.create_connection(
             f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], timeout=20,
+            header=list(headers),
             sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
         )  # fmt: skip
         self.stand_at(position)

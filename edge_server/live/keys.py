@@ -1,0 +1,95 @@
+"""``edge-server keys``: an authority of one's own, and for each process what it needs for mutual TLS.
+
+For development and a bench in one's own network: keys have no password, certificates hold for a year.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ipaddress
+import os
+import secrets
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from freshfield.scenario import load
+from freshfield.transport import TransportError
+
+_DAYS = 365
+_MOST_NAME_CHARS = 64  # of a certificate's common name
+_HERE = ("localhost", "127.0.0.1", "::1")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = argparse.ArgumentParser(
+        "edge-server keys", description="Make a development authority, and a folder of certificate, key and "
+        "authority for each process of a scenario: edge, emulator, every camera, operator and viewer. The "
+        "edge's holds tokens.txt as well, with which people log in to the page.",
+    )  # fmt: skip
+    parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder to write")
+    for process in ("edge", "emulator"):
+        parser.add_argument(
+            f"--{process}", action="append", default=[], metavar="HOST",
+            help=f"name or address under which the {process} is reached, besides localhost; may be repeated",
+        )  # fmt: skip
+    args = parser.parse_args(argv)
+    make_keys(args.out, load(args.scenario).cameras, args.edge, args.emulator)
+    print(f"{args.out}: copy each folder to the machine of its process, and keep the rest to yourself")
+    return 0
+
+
+def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: Sequence[str]) -> None:
+    """Write ``out``. edge, emulator: their hosts. Raises TransportError where openssl cannot make a
+    certificate, FileExistsError where ``out`` is there already."""
+    names = {"edge": "edge", "emulator": "camera:*", "operator": "operator", "viewer": "viewer"}
+    names |= {camera: f"camera:{camera}" for camera in cameras if camera not in names}
+    hosts = {"edge": edge, "emulator": emulator}
+    before = os.umask(0o077)
+    try:
+        out.mkdir(parents=True)
+        _certify(out, "freshfield development", ["basicConstraints=critical,CA:TRUE"])
+        for process, name in names.items():
+            folder = out / process
+            folder.mkdir()
+            alternatives = [_alternative(host) for host in (*hosts.get(process, ()), *_HERE)]
+            _certify(folder, name, [f"subjectAltName={','.join(alternatives)}"], authority=out)
+            (folder / "ca.pem").write_bytes((out / "cert.pem").read_bytes())
+        lines = [f"{name} {secrets.token_urlsafe(24)}\n" for name in ("operator", "viewer")]
+        (out / "edge" / "tokens.txt").write_text("".join(lines))
+    finally:
+        os.umask(before)
+
+
+def _certify(folder: Path, name: str, extensions: Sequence[str], authority: Path | None = None) -> None:
+    """Write cert.pem and key.pem into ``folder``, signed by ``authority`` or by itself."""
+    if len(name) > _MOST_NAME_CHARS:
+        raise TransportError(f"{name}: a certificate's name has {_MOST_NAME_CHARS} characters at most")
+    signed: list[str | Path] = (
+        [] if authority is None else ["-CA", authority / "cert.pem", "-CAkey", authority / "key.pem"]
+    )
+    with tempfile.NamedTemporaryFile("w", suffix=".cnf") as config:  # else openssl's own adds extensions
+        config.write("[req]\ndistinguished_name=name\n[name]\n")
+        config.flush()
+        command: list[str | Path] = [
+            "openssl", "req", "-x509", "-config", config.name, "-days", str(_DAYS), "-noenc",
+            "-subj", f"/CN={name}", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", *signed,
+            *(word for extension in extensions for word in ("-addext", extension)),
+            "-keyout", folder / "key.pem", "-out", folder / "cert.pem",
+        ]  # fmt: skip
+        try:
+            done = subprocess.run(command, capture_output=True, text=True)
+        except FileNotFoundError:
+            raise TransportError("keys: the command openssl (3.0 or newer) is not installed") from None
+    if done.returncode != 0:
+        raise TransportError(f"keys: openssl made no certificate of {name}: {done.stderr.strip()[-300:]}")
+
+
+def _alternative(host: str) -> str:
+    try:
+        return f"IP:{ipaddress.ip_address(host)}"
+    except ValueError:
+        return f"DNS:{host}"

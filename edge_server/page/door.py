@@ -1,0 +1,258 @@
+"""What stands between the page and the network: TLS and login, Host and Origin, what a visitor may send, how
+many there may be and how long one may take nothing.
+
+viser listens with the websockets package and has no parameter for any of this: while it starts, its call of
+``websockets.asyncio.server.serve`` is given the hooks of a ``Door``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import hmac
+import logging
+import math
+import secrets
+import ssl
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosedError
+from websockets.http11 import Request, Response
+
+from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
+from freshfield.limits import (
+    MAX_CLICKS_HZ,
+    MAX_PAGE_CONNECTIONS,
+    MAX_VIEW_SIDE_PX,
+    MAX_VISITOR_MESSAGE_BYTES,
+    MAX_VISITORS,
+    VISITOR_TIMEOUT_S,
+)
+
+log = logging.getLogger(__name__)
+
+Vector = tuple[float, float, float]
+Process = Callable[[ServerConnection, Request], Response | None]
+
+
+class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    wxyz: tuple[float, float, float, float]
+    position: Vector
+    fov: float
+    near: float
+    far: float
+    image_height: float
+    image_width: float
+    look_at: Vector
+    up_direction: Vector
+
+    def sound(self) -> bool:
+        numbers = (*self.wxyz, *self.position, *self.look_at, *self.up_direction)
+        sides = (self.image_height, self.image_width)
+        return (
+            all(map(math.isfinite, numbers))
+            and any(self.wxyz)
+            and 0.0 < self.fov < math.pi
+            and all(1 <= side <= MAX_VIEW_SIDE_PX for side in sides)
+        )
+
+
+class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=True):
+    name: str
+    instance_index: int | None
+    ray_origin: Vector
+    ray_direction: Vector
+    screen_pos: tuple[float, float]
+    modifier: str | None
+    owner: str = ""
+
+
+class Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    uuid: str
+    updates: dict[str, bool | int | float | str]
+
+    def sound(self, controls: dict[str, Any]) -> bool:
+        """Whether it is a new value of one of ``controls``, of its kind and among what it offers."""
+        handle, value = controls.get(self.uuid), self.updates.get("value")
+        if handle is None or len(self.updates) != 1 or value is None:
+            return False
+        options = getattr(handle, "options", None)
+        if options is not None:
+            return value in options
+        if isinstance(handle.value, bool):
+            return isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+_DECODER = msgspec.msgpack.Decoder(Viewpoint | Click | Update)
+
+
+class Door:
+    """access: what requests are asked. tls: for the port, or None.
+
+    controls: by their id, those whose values may be set; told: called with the connection of a viewer who
+    tried to. Both are set once the page has been made.
+    """
+
+    def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
+        self.visitors: set[ServerConnection] = set()
+        self.refused: Counter[str] = Counter()
+        self.controls: dict[str, Any] = {}
+        self.told: Callable[[ServerConnection], None] = lambda connection: None
+        self._access = access
+        self._tls = tls
+        self._secret = secrets.token_bytes(32)
+        self._connections: dict[VisitorConnection, None] = {}
+        self.used = False
+
+    @contextlib.contextmanager
+    def before_viser(self) -> Iterator[None]:
+        """What viser serves within the context is served through this door."""
+        serve = websockets.asyncio.server.serve
+
+        def through_the_door(handler: Any, host: Any, port: Any, **options: Any) -> Any:
+            self.used = True
+            process = options.pop("process_request")
+            options |= {
+                "max_size": MAX_VISITOR_MESSAGE_BYTES,
+                "max_queue": 4,
+                "close_timeout": 2.0,
+                "ssl": self._tls,
+                "process_request": lambda connection, request: self._answer(connection, request, process),
+                "create_connection": lambda *words, **more: VisitorConnection(self, *words, **more),
+            }
+            return serve(handler, host, port, **options)
+
+        websockets.asyncio.server.serve = through_the_door  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+    def opened(self, connection: VisitorConnection) -> None:
+        """Of too many connections the oldest ends that is no visitor's."""
+        self._connections[connection] = None
+        if len(self._connections) > MAX_PAGE_CONNECTIONS:
+            next(c for c in self._connections if c not in self.visitors).transport.abort()
+
+    def closed(self, connection: VisitorConnection) -> None:
+        self._connections.pop(connection, None)
+        self.visitors.discard(connection)
+
+    def takes(self, connection: VisitorConnection, data: str | bytes) -> bool:
+        """Whether viser may see what a visitor sent."""
+        try:
+            message = _DECODER.decode(data if isinstance(data, bytes) else b"")
+        except (msgspec.MsgspecError, RecursionError):
+            return self._refuse("a message that visitors do not send")
+        if isinstance(message, Viewpoint):
+            return message.sound() or self._refuse("a viewpoint that nobody can have")
+        if not connection.in_time():
+            return self._refuse("more than a person can click")
+        if isinstance(message, Update):
+            if not connection.caller.may(CHANGE):
+                self.told(connection)
+                return self._refuse("a change by a viewer")
+            return message.sound(self.controls) or self._refuse("a value that no control takes")
+        return True
+
+    def _refuse(self, what: str) -> bool:
+        if not self.refused[what]:
+            log.warning("page: not taken from a visitor: %s (further ones are only counted)", what)
+        self.refused[what] += 1
+        return False
+
+    def _answer(self, connection: VisitorConnection, request: Request, process: Process) -> Response | None:
+        """What to answer a request with; None lets a visitor in."""
+        host, origin = _one(request, "Host"), _one(request, "Origin")
+        authorization = _one(request, "Authorization")
+        cookie = f"freshfield-{connection.local_address[1]}"
+        try:
+            self._access.check_origin(host, origin)
+            known = self._known(request, cookie) if authorization is None else None
+            connection.caller = known or self._access.caller(authorization)
+        except HttpRefused as error:
+            refusal = connection.respond(error.status, f"{error}\n")
+            if error.status == 401:
+                refusal.headers["WWW-Authenticate"] = 'Basic realm="freshfield", charset="UTF-8"'
+            return refusal
+        if "websocket" in (_one(request, "Upgrade") or "").lower():
+            if len(self.visitors) >= MAX_VISITORS:
+                return connection.respond(503, f"{MAX_VISITORS} visitors are here already\n")
+            self.visitors.add(connection)
+        response = process(connection, request)
+        if response is not None:
+            # The pages of others may not show ours in a frame, to have it clicked on.
+            response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
+            if self._access.access is not None and authorization is not None:
+                flags = "; Secure" if self._tls is not None else ""
+                value = self._cookie(connection.caller)
+                response.headers["Set-Cookie"] = f"{cookie}={value}; HttpOnly; SameSite=Strict; Path=/{flags}"
+        return response
+
+    def _known(self, request: Request, cookie: str) -> Caller | None:
+        """Who logged in before: browsers do not all send the login with a websocket."""
+        for part in (_one(request, "Cookie") or "").split(";"):
+            name, _, value = part.strip().partition("=")
+            for role in ("viewer", "operator") if name == cookie else ():
+                if hmac.compare_digest(value.encode(errors="replace"), self._cookie(Caller(role)).encode()):
+                    return Caller(role)
+        return None
+
+    def _cookie(self, caller: Caller) -> str:
+        return hmac.new(self._secret, caller.role.encode(), hashlib.sha256).hexdigest()
+
+
+class VisitorConnection(ServerConnection):
+    """A connection through a door."""
+
+    def __init__(self, door: Door, *words: Any, **more: Any) -> None:
+        super().__init__(*words, **more)
+        self.caller = ANYBODY
+        self._door = door
+        self._clicks = 0.0  # that may come at once
+        self._clicked_s = -math.inf
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._door.opened(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._door.closed(self)
+        super().connection_lost(exc)
+
+    def in_time(self) -> bool:
+        """Whether one more click may come. Each may queue an answer, which a visitor need not read."""
+        now_s = self.loop.time()
+        self._clicks = min(MAX_CLICKS_HZ, self._clicks + MAX_CLICKS_HZ * (now_s - self._clicked_s))
+        self._clicked_s = now_s
+        if self._clicks < 1.0:
+            return False
+        self._clicks -= 1.0
+        return True
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        while not self._door.takes(self, data := await super().recv(decode)):
+            pass
+        return data
+
+    async def send(self, message: Any, text: bool | None = None) -> None:
+        """Whoever takes nothing for long is gone, and so is what was held for them."""
+        try:
+            async with asyncio.timeout(VISITOR_TIMEOUT_S):
+                await super().send(message, text)
+        except TimeoutError:
+            self.transport.abort()
+            raise ConnectionClosedError(None, None) from None
+
+
+def _one(request: Request, name: str) -> str | None:
+    """A header's value. One that is given twice is joined, and so is nobody's."""
+    values = request.headers.get_all(name)
+    return ", ".join(values) if values else None

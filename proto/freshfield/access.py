@@ -1,0 +1,200 @@
+"""Who may do what: the one model of gRPC, page and metrics.
+
+A caller shows a token or, over mutual TLS, a certificate. Either stands for a name, which says the role::
+
+    operator    viewer    camera:cam00    camera:cam00,cam01    camera:*
+
+A server without tokens and without an authority asks nobody: it listens on loopback alone (see
+``Transport``), or ``--insecure`` says otherwise.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hmac
+import inspect
+import ipaddress
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+import grpc.aio
+
+from freshfield.frame import valid_id
+
+LOOK, CHANGE, PUSH, CLOCK = "look", "change", "push", "clock"
+ROLES = {"camera": {PUSH, CLOCK}, "viewer": {LOOK, CLOCK}, "operator": {LOOK, CHANGE, CLOCK}}
+CALLS = {
+    "/freshfield.v1.FrameStreamService/Push": PUSH,
+    "/freshfield.v1.ClockService/Exchange": CLOCK,
+    "/freshfield.v1.EdgeService/GetStatus": LOOK,
+    "/freshfield.v1.EdgeService/WatchDecisions": LOOK,
+    "/freshfield.v1.EdgeService/ResetField": CHANGE,
+    "/freshfield.v1.EdgeService/SaveSnapshot": CHANGE,
+    "/freshfield.v1.EdgeService/SetPolicy": CHANGE,
+    "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": LOOK,
+}
+"""What a gRPC method needs. Others (of a service behind ``channel-emu proxy``) need CHANGE."""
+_OPEN = "/grpc.health.v1.Health/"  # says no more than that the process works
+
+
+@dataclass(frozen=True)
+class Caller:
+    """role: of ROLES, or "anybody" where nobody is asked. cameras: that a camera may push; empty: all."""
+
+    role: str
+    cameras: frozenset[str] = frozenset()
+
+    @classmethod
+    def named(cls, name: str) -> Caller:
+        """The caller of a name. Raises ValueError if it is none."""
+        role, _, listed = name.partition(":")
+        cameras = frozenset() if listed == "*" else frozenset(listed.split(","))
+        if role == "camera" and all(valid_id(camera) for camera in cameras):
+            return cls(role, cameras)
+        if role in ("viewer", "operator") and name == role:
+            return cls(role)
+        raise ValueError(f"expected operator, viewer, camera:ID[,ID] or camera:*, got {name[:80]!r}")
+
+    def may(self, action: str) -> bool:
+        return self.role == ANYBODY.role or action in ROLES[self.role]
+
+    def may_push(self, camera: str) -> bool:
+        return self.may(PUSH) and (not self.cameras or camera in self.cameras)
+
+
+ANYBODY = Caller("anybody")
+caller: ContextVar[Caller] = ContextVar("caller", default=ANYBODY)
+"""Who makes the gRPC call that the current task serves."""
+
+
+class Access(grpc.aio.ServerInterceptor):
+    """Knows callers, and lets a gRPC call pass to its handler only if its caller may make it.
+
+    tokens: token by name of the caller. certificates: whether a certificate's common name counts as well. A
+    wrong token is refused, whatever the certificate says.
+    """
+
+    def __init__(self, tokens: Mapping[str, str], certificates: bool) -> None:
+        self._tokens = [(Caller.named(name), token.encode()) for name, token in tokens.items()]
+        self._certificates = certificates
+
+    @property
+    def open(self) -> bool:
+        """Whether nobody is asked."""
+        return not self._tokens and not self._certificates
+
+    def of_header(self, header: str) -> Caller | None:
+        """The caller of an ``authorization`` header: Bearer TOKEN, or Basic with the token as password."""
+        kind, _, shown = header.partition(" ")
+        token = shown.encode(errors="replace")
+        if kind.lower() == "basic":
+            try:
+                token = base64.b64decode(token, validate=True).partition(b":")[2]
+            except binascii.Error:
+                return None
+        elif kind.lower() != "bearer":
+            return None
+        # All are compared, each in constant time: how long it takes says nothing.
+        found = [known for known, expected in self._tokens if hmac.compare_digest(token, expected)]
+        return found[0] if found else None
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler:
+        method = handler_call_details.method
+        handler = await continuation(handler_call_details)
+        if handler is None or method.startswith(_OPEN):
+            return handler
+        header = dict(handler_call_details.invocation_metadata or ()).get("authorization")
+        serve = handler.unary_unary or handler.unary_stream or handler.stream_unary or handler.stream_stream
+
+        async def admit(request: Any, context: grpc.aio.ServicerContext) -> Any:
+            found = self._of_certificate(context) if header is None else self.of_header(header)
+            action = CALLS.get(method, CHANGE)
+            if found is None:
+                await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no credential, or a wrong one")
+                raise AssertionError("abort raises")
+            if not found.may(action):
+                await context.abort(grpc.StatusCode.PERMISSION_DENIED, f"a {found.role} may not {action}")
+            caller.set(found)
+            answer = serve(request, context)
+            if not inspect.isasyncgen(answer):
+                return await answer
+            async for response in answer:
+                await context.write(response)
+
+        kind = {
+            (False, False): grpc.unary_unary_rpc_method_handler,
+            (False, True): grpc.unary_stream_rpc_method_handler,
+            (True, False): grpc.stream_unary_rpc_method_handler,
+            (True, True): grpc.stream_stream_rpc_method_handler,
+        }[bool(handler.request_streaming), bool(handler.response_streaming)]
+        return kind(admit, handler.request_deserializer, handler.response_serializer)
+
+    def _of_certificate(self, context: grpc.aio.ServicerContext) -> Caller | None:
+        names = context.auth_context().get("x509_common_name", []) if self._certificates else []
+        try:
+            return Caller.named(names[0].decode()) if names else None
+        except ValueError:  # of a certificate that was made for something else
+            return None
+
+
+class HttpRefused(Exception):
+    """status: of the answer; the message is its text."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class HttpDoor:
+    """The same check for an HTTP server.
+
+    access: knows who may log in. On loopback, or if it is open, nobody is asked.
+    listening_on: address or name that the server was told to listen on.
+    """
+
+    def __init__(self, access: Access, listening_on: str) -> None:
+        self.access = None if access.open or is_loopback(listening_on) else access
+        self._names = {"localhost", listening_on.lower(), socket.gethostname().lower()}
+
+    def check_origin(self, host: str | None, origin: str | None) -> None:
+        """Raises HttpRefused for a request that a foreign web site had a browser make: from a page that is
+        not ours (Origin), or under a foreign name that leads to this machine (Host). Where there is a login,
+        a browser keeps it from foreign names. An address is never foreign: it is the one connected to."""
+        name = (host or "").lower()
+        name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
+        if self.access is None and name not in self._names and not _is_address(name):
+            raise HttpRefused(403, "Host is no name of this machine; --page-host takes another one")
+        if origin is not None and origin.partition("://")[2].lower() != (host or "").lower():
+            raise HttpRefused(403, "this request comes from another web site")
+
+    def caller(self, authorization: str | None) -> Caller:
+        """Who shows this header. Raises HttpRefused for somebody who may not look."""
+        if self.access is None:
+            return ANYBODY
+        found = self.access.of_header(authorization or "")
+        if found is None or not found.may(LOOK):
+            raise HttpRefused(401, "log in with the token of a viewer or an operator as password")
+        return found
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that listens on ``host``."""
+    name = host.strip("[]")
+    return name == "localhost" or (_is_address(name) and ipaddress.ip_address(name).is_loopback)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True

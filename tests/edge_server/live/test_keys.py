@@ -1,0 +1,103 @@
+"""The development authority: what it makes lets every process do its own part, and no more."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import stat
+
+import grpc
+import grpc.aio
+import pytest
+
+from edge_server.cli import main
+from edge_server.live.keys import make_keys
+from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
+from tests.deploy.test_healthy import healthy
+from tests.freshfield.test_access import Every
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory):
+    out = tmp_path_factory.mktemp("keys") / "new"
+    assert main(["keys", "tile", "--out", str(out), "--edge", "edge", "--emulator", "192.0.2.7"]) == 0
+    return out
+
+
+def of(folder, *more: str) -> Transport:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    files = ["--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-ca", "ca.pem", *more]
+    return from_arguments(parser.parse_args([w if w[0] == "-" else str(folder / w) for w in files]))
+
+
+def test_a_certificate_lets_its_process_do_its_own_part(keys):
+    push, status = "/freshfield.v1.FrameStreamService/Push", "/freshfield.v1.EdgeService/GetStatus"
+
+    async def scene():
+        edge = of(keys / "edge", "--token-file", "tokens.txt")
+        server = edge.aio_server()
+        server.add_generic_rpc_handlers((Every(),))
+        port = edge.bind(server, "0.0.0.0:0")  # beyond this machine, and nothing is amiss
+        await server.start()
+        found = {}
+        for name in ("cam00", "emulator", "viewer", "edge"):
+            async with of(keys / name).aio_channel(f"localhost:{port}") as channel:
+                try:
+                    await channel.unary_unary(status)(b"", timeout=5)
+                    found[name] = "looks"
+                except grpc.aio.AioRpcError as error:
+                    found[name] = error.code().name
+                if name in ("cam00", "emulator"):
+                    call = channel.stream_stream(push)(timeout=5)
+                    await call.write(b"cam01")
+                    found[name] = (await call.read()).decode()
+        tokens = dict(line.split() for line in (keys / "edge" / "tokens.txt").read_text().splitlines())
+        async with Transport(ca=keys / "edge" / "ca.pem").aio_channel(f"localhost:{port}") as channel:
+            with pytest.raises(grpc.aio.AioRpcError):  # no certificate, no connection
+                await channel.unary_unary(status)(b"", timeout=5)
+        await server.stop(None)
+        return found, tokens
+
+    found, tokens = asyncio.run(scene())
+    assert found == {
+        "cam00": "forbidden_camera", "emulator": "taken", "viewer": "looks", "edge": "UNAUTHENTICATED",
+    }  # fmt: skip
+    assert tokens.keys() == {"operator", "viewer"} and len(set(tokens.values())) == 2
+
+
+def test_a_key_of_another_certificate_is_named(keys):
+    async def scene():
+        mixed = Transport(
+            cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem"
+        )
+        with pytest.raises(TransportError, match=r"cannot use --tls-cert .* with its --tls-key"):
+            mixed.bind(mixed.aio_server(), "127.0.0.1:0")
+
+    asyncio.run(scene())
+
+
+def test_the_health_check_passes_mutual_tls(keys):
+    async def scene():
+        from grpc_health.v1 import health, health_pb2_grpc
+
+        transport = of(keys / "emulator")
+        server = transport.aio_server()
+        health_pb2_grpc.add_HealthServicer_to_server(health.aio.HealthServicer(), server)
+        port = transport.bind(server, "127.0.0.1:0")
+        await server.start()
+        words = [f"--tls-{part}={keys / 'emulator' / file}" for part, file in
+                 (("cert", "cert.pem"), ("key", "key.pem"), ("ca", "ca.pem"))]  # fmt: skip
+        with_it = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}", *words)
+        without = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}")
+        await server.stop(None)
+        return with_it, without
+
+    assert asyncio.run(scene()) == (True, False)
+
+
+def test_keys_are_their_owners_alone_and_never_overwritten(keys, tmp_path, capsys):
+    assert not any(stat.S_IMODE(path.stat().st_mode) & 0o077 for path in [keys, *keys.rglob("*")])
+    assert main(["keys", "tile", "--out", str(keys)]) == 2 and "exists" in capsys.readouterr().err
+    with pytest.raises(TransportError, match="64 characters"):
+        make_keys(tmp_path / "new", ["c" * 60], [], [])

@@ -1,0 +1,330 @@
+"""Who gets to the page and to the metrics, what a visitor may send there, and what one can cost."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import http.client
+import socket
+import ssl
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import websocket
+
+from edge_server.live.keys import make_keys
+from edge_server.live.output.prometheus import serve_metrics
+from edge_server.live.state import EdgeState
+from edge_server.page import Page, door, start_page
+from edge_server.page.door import Door
+from freshfield.limits import MAX_VISITOR_MESSAGE_BYTES
+from freshfield.transport import Transport, TransportError
+from tests.edge_server.page.test_page import bare_state
+from tests.edge_server.page.visitor import Visitor
+from tests.ports import free_port
+from tests.role_table import TOKENS, cells_of
+from tests.waiting import wait_until
+
+# Without TLS the login is the same, and easier to talk to.
+LOGIN = Transport(tokens=TOKENS, insecure=True)
+
+
+@contextlib.contextmanager
+def page_of(state: EdgeState, transport: Transport | None = None, host: str = "127.0.0.1") -> Iterator[Page]:
+    page = start_page(state, host, 0, transport)
+    try:
+        yield page
+    finally:
+        page.stop()
+
+
+def login(who: str) -> dict[str, str]:
+    token = TOKENS.get(who, "no such token")
+    return {"Authorization": "Basic " + base64.b64encode(f"me:{token}".encode()).decode()}
+
+
+def get(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    try:
+        connection.request("GET", path, headers={k.replace("_", "-"): v for k, v in headers.items()})
+        answer = connection.getresponse()
+        answer.read()
+        return answer.status, dict(answer.getheaders())
+    finally:
+        connection.close()
+
+
+def lines(headers: dict[str, str]) -> list[str]:
+    return [f"{name}: {value}" for name, value in headers.items()]
+
+
+def control(page: Page, label: str):
+    return next(h for h in page._server.gui._gui_input_handle_from_uuid.values() if h.label == label)
+
+
+def press(visitor: Visitor, page: Page, button: str) -> None:
+    visitor.send("GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": button})
+
+
+def door_of(page: Page) -> Door:
+    """Of a page with a visitor."""
+    return next(iter(page._server._websock_server._live_connections.values()))._door
+
+
+# --- who -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def guarded() -> Iterator[Page]:
+    with page_of(bare_state(), LOGIN, "0.0.0.0") as page:
+        yield page
+
+
+@pytest.mark.parametrize(("what", "who", "may"), cells_of("page: look"))
+def test_who_may_look(guarded: Page, what: str, who: str, may: bool) -> None:
+    status, headers = get(guarded.port, **login(who))
+    assert status == (200 if may else 401)
+    assert may or headers["WWW-Authenticate"].startswith("Basic")
+    with pytest.raises(websocket.WebSocketBadStatusException) if not may else contextlib.nullcontext():
+        Visitor(guarded.port, headers=lines(login(who))).close()
+    assert get(guarded.port)[0] == 401
+
+
+@pytest.mark.parametrize(("what", "who", "may"), cells_of("page: change"))
+def test_who_may_change(what: str, who: str, may: bool) -> None:
+    state = bare_state()
+    with page_of(state, LOGIN, "0.0.0.0") as page:
+        try:
+            visitor = Visitor(page.port, headers=lines(login(who)))
+        except websocket.WebSocketBadStatusException:
+            assert not may
+            return
+        with visitor:
+            visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
+            press(visitor, page, "pause")
+            if may:
+                visitor.wait_for(lambda: state.controls.paused, "the pause")
+            else:
+                visitor.wait_for(lambda: visitor.counts["NotificationShowMessage"], "a word about it")
+    assert state.controls.paused == may
+
+
+@pytest.mark.parametrize(("what", "who", "may"), cells_of("metrics"))
+def test_who_may_read_metrics(metrics: int, what: str, who: str, may: bool) -> None:
+    assert get(metrics, "/metrics", **login(who))[0] == (200 if may else 401)
+    assert get(metrics, "/metrics", Authorization=f"Bearer {TOKENS.get(who)}")[0] == (200 if may else 401)
+    assert get(metrics, "/metrics")[0] == 401
+
+
+@pytest.fixture(scope="module")
+def metrics() -> int:
+    port = free_port()
+    serve_metrics(bare_state(), INGEST, "0.0.0.0", port, LOGIN)
+    return port
+
+
+POINTS = np.random.default_rng(0).random((300_000, 3), np.float32)  # 4.5 MB to send
+INGEST = SimpleNamespace(rejected={}, check_ms=SimpleNamespace(percentile=lambda percent: None))
+
+
+def test_a_login_lasts_for_the_websocket_and_is_nobody_elses(guarded: Page) -> None:
+    """Browsers do not all send the login again with a websocket."""
+    _, headers = get(guarded.port, **login("viewer"))
+    cookie, *flags = headers["Set-Cookie"].split("; ")
+    assert {"HttpOnly", "SameSite=Strict"} <= set(flags)
+    assert get(guarded.port, Cookie=f"other=1; {cookie}")[0] == 200
+    assert get(guarded.port, Cookie=cookie[:-1] + "0é")[0] == 401
+    assert get(guarded.port, Cookie=cookie, **login("nobody"))[0] == 401
+    Visitor(guarded.port, headers=[f"Cookie: {cookie}"]).close()
+
+
+def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
+    make_keys(tmp_path / "keys", [], ["edge"], [])
+    files = {part: tmp_path / "keys" / "edge" / f"{part}.pem" for part in ("cert", "key")}
+    for half in (Transport(tokens=TOKENS), Transport(**files)):
+        with pytest.raises(TransportError, match="--insecure"):
+            start_page(bare_state(), "0.0.0.0", 0, half)
+        with pytest.raises(TransportError, match="--insecure"):
+            serve_metrics(bare_state(), INGEST, "0.0.0.0", 0, half)
+    port = free_port()
+    serve_metrics(bare_state(), INGEST, "0.0.0.0", port, Transport(**files, tokens=TOKENS))
+    with page_of(bare_state(), Transport(**files, tokens=TOKENS), "0.0.0.0") as page:
+        assert page.url.startswith("https://localhost:")
+        context = ssl.create_default_context(cafile=tmp_path / "keys" / "edge" / "ca.pem")
+        for number, path in ((page.port, "/"), (port, "/metrics")):
+            connection = http.client.HTTPSConnection("localhost", number, timeout=10, context=context)
+            connection.request("GET", path, headers=login("viewer"))
+            answer = connection.getresponse()
+            assert answer.status == 200 and answer.read()
+            assert path != "/" or "Secure" in answer.getheader("Set-Cookie")
+            with pytest.raises((OSError, http.client.HTTPException)):
+                get(number, path)
+    assert "--insecure" not in caplog.text
+
+
+def test_the_page_says_in_words_what_is_open() -> None:
+    state = bare_state()
+    state.warnings = [Transport(insecure=True).guard("0.0.0.0", "page", http=True)]
+    with page_of(state, Transport(insecure=True), "0.0.0.0") as page:
+        assert get(page.port)[0] == 200  # without a login
+        messages = page._server._websock_server._broadcast_buffer.message_from_id.values()
+        texts = [m.props.content for m in messages if type(m).__name__ == "GuiHtmlMessage"]
+    assert any("Insecure: page on 0.0.0.0" in text and "nobody is asked" in text for text in texts)
+
+
+# --- foreign web sites -------------------------------------------------------------------------------
+
+
+def test_a_foreign_web_site_reaches_nothing() -> None:
+    state = bare_state()
+    with page_of(state) as page:
+        own, foreign = f"127.0.0.1:{page.port}", f"evil.example:{page.port}"
+        assert get(page.port, Origin=f"http://{own}")[0] == 200
+        assert get(page.port, Origin="http://evil.example")[0] == 403
+        assert get(page.port, Host=foreign)[0] == 403
+        assert get(page.port, Host=foreign, Origin=f"http://{foreign}")[0] == 403
+        assert "frame-ancestors 'self'" in get(page.port)[1]["Content-Security-Policy"]
+        with pytest.raises(websocket.WebSocketBadStatusException):
+            Visitor(page.port, headers=[f"Host: {foreign}"])
+        with pytest.raises(websocket.WebSocketBadStatusException):
+            websocket.create_connection(f"ws://{own}", origin="http://evil.example", timeout=10)
+    port = free_port()
+    serve_metrics(bare_state(), INGEST, "127.0.0.1", port)
+    assert get(port, "/metrics")[0] == 200 and get(port, "/metrics", Host=foreign)[0] == 403
+
+
+# --- what a visitor may send --------------------------------------------------------------------------
+
+
+def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
+    state = bare_state()
+    with page_of(state) as page, Visitor(page.port) as visitor, Visitor(page.port) as other:
+        other.wait_for(lambda: len(page._server.get_clients()) == 2, "both")
+        time.sleep(0.7)  # a refresh
+        handles = {label: control(page, label) for label in ("field", "view", "occlusion", "value")}
+        before = {label: (h.value, h.visible, h.disabled) for label, h in handles.items()}
+        told = other.counts["GuiUpdateMessage"]
+        for label, updates in (
+            ("field", {"visible": False}), ("field", {"removed": True}), ("field", {"disabled": True}),
+            ("field", {"value": "pause", "visible": False}), ("field", {"value": "format the disk"}),
+            ("field", {"options": []}), ("view", {"value": "<script>"}), ("view", {"value": ["points"]}),
+            ("occlusion", {"value": 7}), ("occlusion", {"value": "yes"}), ("value", {"value": float("nan")}),
+            ("value", {"value": None}), ("field", {}),
+        ):  # fmt: skip
+            visitor.send("GuiUpdateMessage", uuid=handles[label]._impl.uuid, updates=updates)
+            time.sleep(0.06)
+        visitor.send("GuiUpdateMessage", uuid="another", updates={"value": True})
+        for kind in ("GuiRemoveMessage", "RemoveSceneNodeMessage", "ResetGuiMessage", "GuiFormDirtyMessage"):
+            visitor.send(kind, uuid=handles["field"]._impl.uuid, name="/cameras")
+        visitor._socket.send("text")
+        visitor._socket.send_binary(b"\xdd" * 60_000)  # arrays in arrays
+        visitor.send("GuiUpdateMessage", uuid=handles["view"]._impl.uuid, updates={"value": "points"})
+        visitor.wait_for(lambda: handles["view"].value == "points", "what a control offers")
+        after = {label: (h.value, h.visible, h.disabled) for label, h in handles.items()}
+        assert after == before | {"view": ("points", True, False)} and not state.controls.paused
+        assert sum(door_of(page).refused.values()) == 20
+        other.wait_for(lambda: other.counts["GuiUpdateMessage"] > told, "the one change")
+        assert not other.counts["GuiRemoveMessage"]
+
+
+def test_viewpoints_that_nobody_can_have_are_not_rendered() -> None:
+    with page_of(bare_state()) as page, Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
+        (client,) = page._server.get_clients().values()
+        good = {
+            "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1], "fov": 0.9, "near": 0.01, "far": 1e3,
+            "image_height": 600, "image_width": 800, "look_at": [0.0, 0, 0], "up_direction": [0.0, 0, 1],
+        }  # fmt: skip
+        for wrong in (
+            {"image_width": 10**9}, {"image_height": 0}, {"fov": 0.0}, {"fov": 4.0}, {"wxyz": [0.0, 0, 0, 0]},
+            {"position": [float("nan"), 0, 0]}, {"position": [1.0]}, {"more": 1},
+        ):  # fmt: skip
+            visitor.send("ViewerCameraMessage", **(good | wrong))
+        visitor.send("ViewerCameraMessage", **(good | {"position": [0.0, 0, 2]}))
+        wait_until(lambda: client.camera.position[2] == 2, "the good one did not arrive")
+        assert sum(door_of(page).refused.values()) == 8
+
+
+def test_nothing_is_uploaded() -> None:
+    with page_of(bare_state()) as page, Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
+        uuid = control(page, "field")._impl.uuid
+        visitor.send(
+            "FileTransferStartUpload", source_component_uuid=uuid, transfer_uuid="t", filename="f",
+            mime_type="x", part_count=2, size_bytes=3 * 10**8,
+        )  # fmt: skip
+        visitor.send(
+            "FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part=0, content=bytes(1000)
+        )
+        at = door_of(page)
+        wait_until(lambda: sum(at.refused.values()) == 2, "they were not refused")
+        assert not page._server.gui._current_file_upload_states
+        with contextlib.suppress(OSError):
+            visitor._socket.send_binary(bytes(MAX_VISITOR_MESSAGE_BYTES + 1))
+        wait_until(lambda: not at.visitors, "too long a message did not end the visit")
+
+
+# --- what one can cost ---------------------------------------------------------------------------------
+
+
+def test_there_is_a_bound_on_visitors_and_their_places_are_given_again(monkeypatch) -> None:
+    monkeypatch.setattr(door, "MAX_VISITORS", 3)
+    with page_of(bare_state()) as page:
+        visitors = [Visitor(page.port) for _ in range(3)]
+        with pytest.raises(websocket.WebSocketBadStatusException, match="503"):
+            Visitor(page.port)
+        assert get(page.port)[0] == 200
+        at = door_of(page)
+        visitors.pop().close()
+        wait_until(lambda: len(at.visitors) == 2, "the place was kept")
+        for visitor in [*visitors, Visitor(page.port)]:
+            visitor.close()
+
+
+def test_half_requests_end_for_new_ones(monkeypatch) -> None:
+    monkeypatch.setattr(door, "MAX_PAGE_CONNECTIONS", 8)
+    with page_of(bare_state()) as page, Visitor(page.port) as visitor, contextlib.ExitStack() as open_:
+        at = door_of(page)
+        for _ in range(30):
+            half = open_.enter_context(socket.create_connection(("127.0.0.1", page.port)))
+            half.sendall(b"GET / HTTP/1.1\r\n")
+        wait_until(lambda: len(at._connections) <= 8, "they all stay", 3.0)  # alone they end after ten
+        assert get(page.port)[0] == 200
+        visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
+
+
+def test_who_does_not_read_is_sent_away_and_what_was_held_with_them(monkeypatch) -> None:
+    monkeypatch.setattr(door, "VISITOR_TIMEOUT_S", 1.0)
+    with page_of(bare_state()) as page, Visitor(page.port) as reader:
+        reader.wait_for(lambda: page._server.get_clients(), "the visitor")
+        stuck = [Visitor(page.port, reads=False) for _ in range(8)]
+        wait_until(lambda: len(page._server.get_clients()) == 9, "not all came")
+        at = door_of(page)
+        held = []
+        for k in range(40):
+            page._server.scene.add_point_cloud(f"/{k % 4}", POINTS, POINTS)
+            time.sleep(0.05)
+            held.append(sum(each.transport.get_write_buffer_size() for each in at.visitors))
+        assert max(held) > 10**6, "the network held it all, and this test shows nothing"
+        wait_until(lambda: len(at.visitors) == 1, "they stay", 20.0)
+        count = reader.counts["GuiUpdateMessage"]
+        reader.wait_for(lambda: reader.counts["GuiUpdateMessage"] > count, "who reads is served")
+        for visitor in stuck:
+            visitor.close()
+
+
+def test_clicks_come_no_faster_than_a_persons() -> None:
+    with page_of(bare_state()) as page, Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
+        (client,) = page._server.get_clients().values()
+        for _ in range(500):
+            visitor.send(
+                "GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": "snapshot"}
+            )
+        visitor.wait_for(lambda: sum(door_of(page).refused.values()) > 400, "refusals")
+        client.add_notification("last", "one")
+        visitor.wait_for(lambda: visitor.counts["NotificationShowMessage"], "a notification")
+        assert visitor.counts["NotificationShowMessage"] < 100

@@ -1,0 +1,193 @@
+"""Who may do what: names, tokens, certificates, and the role table's cells of gRPC."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+
+import grpc
+import grpc.aio
+import pytest
+
+from freshfield.access import ANYBODY, CALLS, LOOK, Access, Caller, HttpDoor, HttpRefused, caller
+from freshfield.frame import FrameRejected
+from freshfield.streams import ServedCall, SessionStreams
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2, edge_pb2, frames_pb2
+from tests.role_table import TOKENS, cells_of
+
+HEALTH = "/grpc.health.v1.Health/Check"
+STREAMS = ("Push", "WatchDecisions", "ServerReflectionInfo")
+
+
+async def echo(request: bytes, context: grpc.aio.ServicerContext) -> bytes:
+    return b""
+
+
+async def cameras(_: object, context: grpc.aio.ServicerContext) -> None:
+    """As ingest and emulator do: each message is a camera's id, answered by whether it may be pushed."""
+    sessions = SessionStreams(["cam00", "cam01"])
+    async with ServedCall(context) as call:
+        while (message := await context.read()) is not grpc.aio.EOF:
+            try:
+                sessions.claim(message.decode(), "s", call, 0)
+                await context.write(b"taken")
+            except FrameRejected as error:
+                await context.write(error.reason.encode())
+
+
+async def one_answer(_: object, context: grpc.aio.ServicerContext):
+    yield b""
+
+
+class Every(grpc.GenericRpcHandler):
+    """A handler of every method."""
+
+    def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler:
+        if details.method.endswith("Push"):
+            return grpc.stream_stream_rpc_method_handler(cameras)
+        if details.method.endswith(STREAMS):
+            return grpc.stream_stream_rpc_method_handler(one_answer)
+        return grpc.unary_unary_rpc_method_handler(echo)
+
+
+async def outcome(port: int, method: str, token: str | None, message: bytes = b"") -> str:
+    """The status of a call, or the answer to a camera's frame."""
+    metadata = (("authorization", f"Bearer {token}"),) if token else ()
+    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+        try:
+            if not method.endswith(STREAMS):
+                await channel.unary_unary(method)(b"", metadata=metadata, timeout=5)
+                return "OK"
+            call = channel.stream_stream(method)(metadata=metadata, timeout=5)
+            # Nothing is written to a stream that is refused: see ``test_transport.push``.
+            if message and token == TOKENS["camera:cam00"]:
+                await call.write(message)
+                return (await call.read()).decode()
+            await call.read()
+            return "OK"
+        except grpc.aio.AioRpcError as error:
+            return error.code().name
+
+
+def asked(*calls: tuple) -> list[str]:
+    """The outcomes of calls at a server with the tokens of the table."""
+
+    async def scene() -> list[str]:
+        transport = Transport(tokens=TOKENS)
+        server = transport.aio_server()
+        server.add_generic_rpc_handlers((Every(),))
+        port = transport.bind(server, "127.0.0.1:0")
+        await server.start()
+        try:
+            return [await outcome(port, *call) for call in calls]
+        finally:
+            await server.stop(None)
+
+    return asyncio.run(scene())
+
+
+@pytest.mark.parametrize(("what", "who", "may"), cells_of("`/"))
+def test_a_cell_of_the_role_table(what: str, who: str, may: bool) -> None:
+    method, _, camera = what.replace("`", "").partition(" of ")
+    message = {"its own camera": b"cam00", "another camera": b"cam01", "": b""}[camera]
+    (found,) = asked((method, TOKENS.get(who), message))
+    if may:
+        assert found == ("taken" if camera else "OK")
+    elif who == "nobody":
+        assert found == "UNAUTHENTICATED"
+    else:
+        assert found == ("forbidden_camera" if camera and "cam" in who else "PERMISSION_DENIED")
+
+
+def test_every_method_has_its_row() -> None:
+    ours = {
+        f"/{service.full_name}/{method.name}"
+        for module in (frames_pb2, clock_pb2, edge_pb2)
+        for service in module.DESCRIPTOR.services_by_name.values()
+        for method in service.methods
+    }
+    rows = {what.replace("`", "").partition(" of ")[0] for what, *_ in cells_of("`/")}
+    assert ours < CALLS.keys() and rows == {*CALLS, HEALTH}
+
+
+def test_a_method_that_nobody_listed_is_the_operators() -> None:
+    method = "/your.Tracker/Follow"
+    assert asked((method, TOKENS["operator"]), (method, TOKENS["viewer"])) == ["OK", "PERMISSION_DENIED"]
+
+
+def test_a_name_says_role_and_cameras() -> None:
+    assert Caller.named("camera:a,b").may_push("b") and not Caller.named("camera:a,b").may_push("c")
+    assert Caller.named("camera:*").may_push("c") and not Caller.named("camera:*").may(LOOK)
+    assert not Caller.named("operator").may_push("a") and ANYBODY.may_push("a")
+    for wrong in ("", "camera", "camera:", "camera:a,", "camera:../x", "viewer:a", "root", "Operator"):
+        with pytest.raises(ValueError, match="expected operator"):
+            Caller.named(wrong)
+
+
+def test_a_wrong_token_is_not_made_good_by_a_certificate() -> None:
+    """And a call that shows none is its certificate's."""
+
+    class Context:
+        def auth_context(self) -> dict:
+            return {"x509_common_name": [b"operator"]}
+
+        async def abort(self, code: grpc.StatusCode, _: str) -> None:
+            raise PermissionError(code.name)
+
+    class Details:
+        method = "/freshfield.v1.EdgeService/ResetField"
+
+        def __init__(self, *metadata: tuple[str, str]) -> None:
+            self.invocation_metadata = metadata
+
+    async def reset(*metadata: tuple[str, str]) -> str:
+        async def continuation(_: object) -> grpc.RpcMethodHandler:
+            return grpc.unary_unary_rpc_method_handler(who)
+
+        async def who(request: object, context: object) -> str:
+            return caller.get().role
+
+        access = Access({"viewer": "v"}, certificates=True)
+        handler = await access.intercept_service(continuation, Details(*metadata))
+        return await handler.unary_unary(b"", Context())
+
+    assert asyncio.run(reset()) == "operator"
+    for header in ("Bearer x", "Bearer v", "Bearer", "Basic !", ""):
+        with pytest.raises(PermissionError):
+            asyncio.run(reset(("authorization", header)))
+
+
+def test_a_browsers_login_is_the_token_as_password() -> None:
+    access = Access(TOKENS, certificates=False)
+    for name, token in TOKENS.items():
+        basic = base64.b64encode(f"whoever:{token}".encode()).decode()
+        assert access.of_header(f"Basic {basic}") == access.of_header(f"bearer {token}") == Caller.named(name)
+    for wrong in (
+        "Basic é",
+        "Basic ====",
+        "Basic",
+        f"Digest {TOKENS['viewer']}",
+        f"{TOKENS['viewer']}",
+        "Bearer ",
+    ):
+        assert access.of_header(wrong) is None
+
+
+@pytest.mark.parametrize("host", ["localhost", "localhost:9090", "127.0.0.1:1", "[::1]:80", "192.0.2.7"])
+def test_an_own_host_may_be_asked_for(host: str) -> None:
+    door = HttpDoor(Access({}, certificates=False), "127.0.0.1")
+    door.check_origin(host, None)
+    door.check_origin(host, f"http://{host}")
+    for foreign in ("http://evil.example", "null", f"http://{host}.evil.example", f"http://{host}0", ""):
+        with pytest.raises(HttpRefused):
+            door.check_origin(host, foreign)
+
+
+@pytest.mark.parametrize(
+    "host", [None, "", "evil.example:8080", "localhost.evil.example", "127.0.0.1.nip.io"]
+)
+def test_a_foreign_name_for_this_machine_is_refused(host: str | None) -> None:
+    with pytest.raises(HttpRefused, match="Host"):
+        HttpDoor(Access({}, certificates=False), "127.0.0.1").check_origin(host, None)
+    HttpDoor(Access(TOKENS, certificates=False), "0.0.0.0").check_origin(host, None)  # its cookie is not sent
