@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.config import ComputeConfig, EdgeConfig, PolicyConfig, embedding_for, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.common.result_store import processor
 from edge_server.experiments.common.tables import mean_or_none, number
@@ -45,6 +45,7 @@ parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
 _SHOWN_EVERY_MS = 100.0  # where every publication is scored
+_CYCLE_MS = 250.0  # between two decisions
 # Seconds of virtual time between two lines of progress.
 _PROGRESS_EVERY_S = 1.0
 
@@ -60,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             steps=config.steps if args.steps is None else args.steps,
             first_steps=args.first_steps,
             compute=config.compute,
-            epoch_ms=args.epoch_ms,
+            epoch_ms=_epoch_ms(config) if args.epoch_ms is None else args.epoch_ms,
             grace_ms=config.grace_ms,
             score_every_ms=args.score_every_ms,
             shown_every_ms=args.score_every_ms or _SHOWN_EVERY_MS,
@@ -205,6 +206,11 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return dataclasses.replace(scenario, edge=edge)
 
 
+def _epoch_ms(config: EdgeConfig) -> float:
+    """Least time between two decisions: what a live update may spend, where updates follow arrivals."""
+    return config.update_ms if config.updates == "arrivals" else _CYCLE_MS
+
+
 def _compute(text: str) -> ComputeConfig:
     if text == "zero":
         return ComputeConfig()
@@ -227,7 +233,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
     add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
-    add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
+    add("--epoch-ms", type=float, metavar="MS",
+        help=f"between two decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
     add("--score-every-ms", type=float, default=250.0, metavar="MS",
         help="publications (0: all), and what is shown at random instants [%(default)g]")  # fmt: skip
     add_folders(parser)

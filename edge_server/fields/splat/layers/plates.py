@@ -236,8 +236,8 @@ class FinePlate:
     def from_state(view: View, state: Arrays) -> FinePlate:
         """What ``state`` gave. view: the camera's, at the lower resolution. KeyError: it lacks something."""
         height, width = state["frames"].shape
-        fx, fy, cx, cy, *distortion = (float(n) for n in state["lens"])
-        lens = Pinhole(width, height, fx, fy, cx, cy, tuple(distortion))
+        fx, fy, cx, cy, k1, k2, p1, p2 = (float(n) for n in state["lens"])
+        lens = Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
         fine = FinePlate(replace(view, image=np.zeros((height, width, 3), np.uint8), intrinsics=lens))
         fine.color, fine.frames = np.array(state["color"]), np.array(state["frames"])
         fine.count = int(state["count"])
