@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
-from freshfield import payload
+from freshfield import access, payload
 from freshfield.clock import VirtualClock
 from freshfield.frame import FrameRejected, checksum, to_request
 from freshfield.geometry import Pinhole
@@ -134,7 +134,7 @@ def test_replay_and_reversed_time_are_refused_within_a_session_only():
 
 def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
     class Stream:
-        open = True
+        open, caller = True, access.caller.get()
 
     mine, spoofer = Stream(), Stream()
     ingest.streams.use = lambda stream: None
