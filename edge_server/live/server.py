@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,6 +88,7 @@ class EdgeServer:
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
+        self._without_step, self._refused = 0, Counter[str]()
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
@@ -242,6 +244,8 @@ class EdgeServer:
         if self._first_ms is None:
             self._first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
+        self._without_step += publication.steps == 0
+        self._refused.update(publication.refused)
         if self.state.bounds is None:
             self.state.bounds = getattr(self.field, "bounds", None)
         self.state.publish(publication, renderer)
@@ -346,6 +350,8 @@ class EdgeServer:
                 "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
                 "shed": self.buffer.shed,
+                "without_step": self._without_step,
+                "refused": dict(self._refused),
             },
             "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),

@@ -138,7 +138,7 @@ def _fidelity_table(report: Report) -> str:
     elif found["scored_on"]:
         remarks.append(f"Held out: {', '.join(found['scored_on'])}.")
     if found["series"] and not fit:
-        remarks.append(f"{found['scored']} of {len(found['series'])} publications were scored.")
+        remarks.append(f"{found['scored']} of {report['updates']['count']} publications were scored.")
     if found["lpips_missing"]:
         remarks.append(f"LPIPS: {found['lpips_missing']}.")
     return _table(rows) + f"<p class=soft>{escape(' '.join(remarks))}</p>"

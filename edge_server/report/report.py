@@ -97,7 +97,7 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     """Number and duration of updates, from the rows of ``series``.
 
-    edge: the same as counted by the edge, for rows that were not written any more. Returns {count, ms_p50,
+    edge: the same as counted by the edge, for updates that have no row. Returns {count, ms_p50,
     ms_p95, first_ms: from the start of the edge to the first publication, undecodable, shed: frames left out
     for lack of time, without_step: updates without time for an optimizer step, refused: {camera: how often
     the field left its image out}}. Where the scenario sets a deadline, also deadline_ms and met_share: the
@@ -106,6 +106,8 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
     deadline_ms = _number(edge.get("deadline_ms"))
+    without_step = sum(row.get("steps") == 0 for row in series)
+    refused = Counter(c for row in series for c in row.get("refused") or ())
     result = {
         "count": max(len(series), int(_number(edge.get("count")) or 0)),
         "ms_p50": float(np.percentile(spent, 50)) if spent else edge.get("ms_p50"),
@@ -113,8 +115,8 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "first_ms": edge.get("first_ms", first),
         "undecodable": edge.get("undecodable"),
         "shed": edge.get("shed"),
-        "without_step": sum(row.get("steps") == 0 for row in series),
-        "refused": dict(sorted(Counter(c for row in series for c in row.get("refused") or ()).items())),
+        "without_step": max(without_step, int(_number(edge.get("without_step")) or 0)),
+        "refused": dict(sorted((refused | Counter(edge.get("refused") or {})).items())),
     }
     if deadline_ms is not None:
         met = [ms <= deadline_ms for ms in spent]

@@ -1,10 +1,10 @@
 """The files of a run, written as it goes: edge.json, series.jsonl, shown.jsonl, ages.jsonl, poses.jsonl.
 
 edge.json is replaced about twice a second (live tables read it). series.jsonl gets a line for each
-publication, once its scores are final, shown.jsonl a line for each instant at which what was shown is scored.
-ages.jsonl samples every camera's age at a fixed rate, so that its mean is a time average. poses.jsonl gets a
-line for each view that the field was trained on and whose pose differs from its camera's last one: cameras
-that stand still leave one line each.
+publication, once its scores are final; of those without scores, one for LINE_EVERY_S at most. shown.jsonl
+gets a line for each instant at which what was shown is scored. ages.jsonl samples every camera's age at a
+fixed rate, so that its mean is a time average. poses.jsonl gets a line for each view that the field was
+trained on and whose pose differs from its camera's last one: cameras that stand still leave one line each.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,7 @@ log = logging.getLogger(__name__)
 
 # After this many newer publications, one without scores will not get any.
 _FINAL_AFTER = 8
+LINE_EVERY_S = 0.08  # there may be fifty publications a second
 # Some 100 MB: days of an arm that never rests.
 _MOST_POSES = 500_000
 
@@ -50,6 +52,7 @@ class Journal:
         self._shown = Lines(out / "shown.jsonl")
         self._ages = Lines(out / "ages.jsonl")
         self._poses = Lines(out / "poses.jsonl")
+        self._line_s = -math.inf  # publication of the last line of the series
         self._last_pose: dict[str, Pose] = {}
         self._poses_left = _MOST_POSES
         self._status_failed = False
@@ -133,4 +136,7 @@ class Journal:
 
     def _write_oldest(self) -> None:
         _, publication = self._open.popitem(last=False)
+        if publication.psnr_db is None and publication.t_s < self._line_s + LINE_EVERY_S:
+            return
+        self._line_s = publication.t_s
         self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False))

@@ -96,6 +96,8 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
 def test_updates_that_had_no_time_to_learn_are_counted():
     rows = [{"t_s": 0.1 * k, "update_ms": 60.0, "steps": steps} for k, steps in enumerate((0, 3, 0))]
     assert updates(rows, {})["without_step"] == 2
+    counted = updates(rows, {"without_step": 40, "refused": {"cam01": 3}})  # also of updates without a row
+    assert counted["without_step"] == 40 and counted["refused"] == {"cam01": 3}
 
 
 def test_the_report_shows_frames_that_were_left_out(tmp_path):
