@@ -139,7 +139,9 @@ class Door:
         """Of too many connections the oldest ends that is no visitor's."""
         self._connections[connection] = None
         if len(self._connections) > MAX_PAGE_CONNECTIONS:
-            next(c for c in self._connections if c not in self.visitors).transport.abort()
+            oldest = next(c for c in self._connections if c not in self.visitors)
+            del self._connections[oldest]  # at once: many may come before it hears of its end
+            oldest.transport.abort()
 
     def closed(self, connection: VisitorConnection) -> None:
         self._connections.pop(connection, None)
