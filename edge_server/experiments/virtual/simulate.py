@@ -234,7 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
     add("--epoch-ms", type=float, metavar="MS",
-        help=f"between two decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
+        help=f"between decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
     add("--score-every-ms", type=float, default=250.0, metavar="MS",
         help="publications (0: all), and what is shown at random instants [%(default)g]")  # fmt: skip
     add_folders(parser)
