@@ -35,6 +35,7 @@ class FrameBuffer:
     Memory is one encoded frame a camera, whatever arrives; two with ``keep_earlier``, MOST_UNSELECTED more
     with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
+    held_back: newest frames that the last ``take`` had no room for.
     shed: those that were left out for lack of time since the first ``take``, with ``keep_every_frame``.
     """
 
@@ -47,6 +48,7 @@ class FrameBuffer:
         self.arrivals = 0
         self.stale_on_arrival = 0
         self.shed = 0
+        self.held_back = 0
         self._unselected: dict[str, deque[BufferedFrame]] | None = None
         self._takes = 0
         self._last_take = dict.fromkeys(self.cameras, 0)  # that took a frame of a camera
@@ -116,6 +118,7 @@ class FrameBuffer:
         ranked: list[tuple[int, int, int, BufferedFrame]] = []
         with self._arrived:
             if self._unselected is None:
+                self.held_back = 0
                 return tuple(selected), ()
             self._takes += 1
             for camera, waiting in self._unselected.items():
@@ -131,10 +134,12 @@ class FrameBuffer:
             for item in taken:
                 self._last_take[item.frame.camera] = self._takes
             left = ordered[len(taken) :]
+            self.held_back = 0
             for item in left:
                 waiting = self._unselected[item.frame.camera]
                 if item is own[item.frame.camera] and len(waiting) < MOST_UNSELECTED:
                     waiting.appendleft(item)
+                    self.held_back += 1
                 else:
                     self.shed += 1
         others = [item for item in taken if item is not own[item.frame.camera]]

@@ -112,7 +112,7 @@ class FieldUpdater:
         """Keep and decode what the field wants now."""
         self.buffer.keep_every_frame(self.field.frame_s is not None)
         most = self.field.most_pixels
-        self.decoder.most_pixels = None if most is None else most // len(self.buffer.cameras)
+        self.decoder.take_at_most(None if most is None else most // len(self.buffer.cameras))
 
     @property
     def policy(self) -> Policy:
@@ -169,7 +169,8 @@ class FieldUpdater:
         budget: of the fit that follows, which bounds the new frames where it is one of seconds.
         """
         arrivals = self.buffer.arrivals - self._selected_of
-        if now_ns < plan.wait_until_ns or (self.on_arrivals and not arrivals):
+        nothing_new = not arrivals and not self.buffer.held_back
+        if now_ns < plan.wait_until_ns or (self.on_arrivals and nothing_new):
             return None
         self._follow_field()
         newest, earlier = self.buffer.newest_and_earlier()

@@ -244,8 +244,9 @@ class ScoringThread:
         with self._wake:
             if any(isinstance(i, tuple) for i in self._inbox):
                 return  # a newer publication is waiting: this one stays unscored
+        whole = [(v if v.whole is None else v.whole() or v) for v in views]
         renderings = [
-            (v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in views
+            (v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in whole
         ]
         score = self._scorer.score_selected(renderings, publication.published_ns)
         if score is None:

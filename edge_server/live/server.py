@@ -88,7 +88,7 @@ class EdgeServer:
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
-        self._without_step, self._refused = 0, Counter[str]()
+        self._without_step, self._within_deadline, self._refused = 0, 0, Counter[str]()
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
@@ -245,6 +245,7 @@ class EdgeServer:
             self._first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
         self._without_step += publication.steps == 0
+        self._within_deadline += publication.update_ms <= (self.config.deadline_ms or 0.0)
         self._refused.update(publication.refused)
         if self.state.bounds is None:
             self.state.bounds = getattr(self.field, "bounds", None)
@@ -348,6 +349,7 @@ class EdgeServer:
                 "ms_p95": self._update_ms.percentile(95),
                 "first_ms": self._first_ms,
                 "deadline_ms": self.config.deadline_ms,
+                "within_deadline": self._within_deadline,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
                 "shed": self.buffer.shed,
                 "without_step": self._without_step,

@@ -36,6 +36,13 @@ class ViewDecoder:
         self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
 
+    def take_at_most(self, pixels: int | None) -> None:
+        """Set ``most_pixels``. Views of another size are forgotten."""
+        if pixels != self.most_pixels:
+            self.most_pixels = pixels
+            self._views.clear()
+            self._earlier.clear()
+
     def views(self, selected: Iterable[BufferedFrame]) -> list[View]:
         """Views of the selected frames in their order, without those that cannot be decoded."""
         return [view for item in selected if (view := self.view(item)) is not None]

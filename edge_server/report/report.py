@@ -95,9 +95,10 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
-    """Number and duration of updates, from the rows of ``series``.
+    """Number and duration of updates.
 
-    edge: the same as counted by the edge, for updates that have no row. Returns {count, ms_p50,
+    series: rows of updates, for what the edge has not counted: not all have one.
+    edge: what it has counted. Returns {count, ms_p50,
     ms_p95, first_ms: from the start of the edge to the first publication, undecodable, shed: frames left out
     for lack of time, without_step: updates without time for an optimizer step, refused: {camera: how often
     the field left its image out}}. Where the scenario sets a deadline, also deadline_ms and met_share: the
@@ -110,8 +111,10 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     refused = Counter(c for row in series for c in row.get("refused") or ())
     result = {
         "count": max(len(series), int(_number(edge.get("count")) or 0)),
-        "ms_p50": float(np.percentile(spent, 50)) if spent else edge.get("ms_p50"),
-        "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
+        **{
+            name: edge.get(name) or (float(np.percentile(spent, share)) if spent else None)
+            for name, share in (("ms_p50", 50), ("ms_p95", 95))
+        },
         "first_ms": edge.get("first_ms", first),
         "undecodable": edge.get("undecodable"),
         "shed": edge.get("shed"),
@@ -119,8 +122,10 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "refused": dict(sorted((refused | Counter(edge.get("refused") or {})).items())),
     }
     if deadline_ms is not None:
-        met = [ms <= deadline_ms for ms in spent]
-        result |= {"deadline_ms": deadline_ms, "met_share": float(np.mean(met)) if met else None}
+        met = float(np.mean([ms <= deadline_ms for ms in spent])) if spent else None
+        if edge.get("count") and (within := _number(edge.get("within_deadline"))) is not None:
+            met = within / edge["count"]
+        result |= {"deadline_ms": deadline_ms, "met_share": met}
     return result
 
 

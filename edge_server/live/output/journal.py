@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +28,8 @@ log = logging.getLogger(__name__)
 
 # After this many newer publications, one without scores will not get any.
 _FINAL_AFTER = 8
-LINE_EVERY_S = 0.08  # there may be fifty publications a second
+LINE_EVERY_S = 0.08  # on average: there may be fifty publications a second
+_INTERVAL_SHARE = 0.01  # of the newest interval in the usual one
 # Some 100 MB: days of an arm that never rests.
 _MOST_POSES = 500_000
 
@@ -52,7 +52,9 @@ class Journal:
         self._shown = Lines(out / "shown.jsonl")
         self._ages = Lines(out / "ages.jsonl")
         self._poses = Lines(out / "poses.jsonl")
-        self._line_s = -math.inf  # publication of the last line of the series
+        self._last_s: float | None = None  # of the last publication
+        self._usual_s: float | None = None  # from one publication to the next
+        self._without_line = 0  # publications since the last line of the series
         self._last_pose: dict[str, Pose] = {}
         self._poses_left = _MOST_POSES
         self._status_failed = False
@@ -135,8 +137,18 @@ class Journal:
         self.write_status()
 
     def _write_oldest(self) -> None:
+        """A line for the oldest publication, unless it has no scores and is one of many. They are counted: by
+        the time since the last line, those that end a long gap would have one more often than others."""
         _, publication = self._open.popitem(last=False)
-        if publication.psnr_db is None and publication.t_s < self._line_s + LINE_EVERY_S:
+        many = False
+        if self._last_s is not None:
+            interval_s = publication.t_s - self._last_s
+            usual_s = interval_s if self._usual_s is None else self._usual_s
+            many = (self._without_line + 1) * usual_s < LINE_EVERY_S
+            self._usual_s = usual_s + _INTERVAL_SHARE * (interval_s - usual_s)
+        self._last_s = publication.t_s
+        if publication.psnr_db is None and many:
+            self._without_line += 1
             return
-        self._line_s = publication.t_s
+        self._without_line = 0
         self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False))

@@ -125,6 +125,11 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
         u.buffer.put(frame(camera, sequence=50, generated_ns=50 * MS), 50 * MS)
     views, _ = u.fit(u.select(u.plan(60 * MS), 60 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert len(views) == 4 and len(decoded) == 14 and u.buffer.shed == 6  # four newest ones wait
+    u.on_arrivals = True
+    views, _ = u.fit(u.select(u.plan(61 * MS), 61 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
+    assert len(decoded) == 18 and u.buffer.shed == 6  # and are taken although nothing has arrived since
+    assert u.select(u.plan(62 * MS), 62 * MS, Budget(seconds=1e-3)) is None
+    u.on_arrivals = False
     u.field.frame_s = None  # it wants the newest only, from now on
     views, _ = u.fit(u.select(u.plan(70 * MS), 70 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert len(views) == 8

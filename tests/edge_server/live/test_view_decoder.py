@@ -56,6 +56,13 @@ def test_a_damaged_frame_before_is_counted_once_and_is_missing():
     assert decoder.undecodable == 1
 
 
+def test_another_size_is_decoded_anew():
+    decoder, item = ViewDecoder(), BufferedFrame(frame(), 0, 0)
+    assert decoder.view(item).image.shape == (24, 32, 3)
+    decoder.take_at_most(767)
+    assert decoder.view(item).image.shape == (12, 16, 3)
+
+
 def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
     item = BufferedFrame(frame(), 0, 0)  # 32 x 24
     for most, size in ((768, (24, 32)), (767, (12, 16)), (1, (3, 4))):
