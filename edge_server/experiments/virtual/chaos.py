@@ -108,7 +108,7 @@ def _warnings_are_expected() -> Iterator[None]:
     try:
         yield
     finally:
-        for log, level in zip(logs, before):
+        for log, level in zip(logs, before, strict=True):
             log.setLevel(level)
 
 
