@@ -99,8 +99,8 @@ def _run(seed: int, faults: Sequence[Fault]) -> dict[str, Any]:
 
 @contextmanager
 def _warnings_are_expected() -> Iterator[None]:
-    """No warnings of what the faults bring about: files that cannot be written, and nodes whose clocks stepped
-    back, so that their old and new sessions look like two nodes."""
+    """No warnings of what the faults bring about: files that cannot be written, and nodes that look like two
+    of one name, since their clocks have stepped back."""
     logs = [logging.getLogger(name) for name in ("freshfield.files", "edge_server.live.ingest")]
     before = [log.level for log in logs]
     for log in logs:
