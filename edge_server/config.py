@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
@@ -185,6 +187,31 @@ def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
     return make_embedder(embedding)
 
 
+class _Machine(msgspec.Struct):
+    cpu: str
+    cores: int
+
+
+class _OwnSeed(msgspec.Struct):
+    psnr_db: float | None
+    views: float | None
+
+
+class _Policy(msgspec.Struct):
+    own_seed: _OwnSeed
+    psnr_db_over_all: tuple[float | None, float | None, float | None] = (None, None, None)
+
+
+class _Scores(msgspec.Struct):
+    """What the page shows of a scores.json (``page.markup.policy_scores``)."""
+
+    seconds: float
+    seed: int
+    seeds: int
+    machine: _Machine
+    policies: dict[str, _Policy]
+
+
 def read_config(scenario: Scenario) -> EdgeConfig:
     """The edge section of a scenario. Raises ScenarioError."""
     section = dict(scenario.edge)
@@ -201,23 +228,26 @@ def read_config(scenario: Scenario) -> EdgeConfig:
 
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
     if section.get("scores") is not None:
-        section["scores"] = _read_json(scenario, "scores", section["scores"])
-        if not isinstance(section["scores"].get("policies"), dict):
-            raise ScenarioError(f"{scenario.path}: edge.scores: not a scores.json of train-scheduler --hold")
+        section["scores"] = _read_json(scenario, "scores", section["scores"], _Scores)
     config = read_section(EdgeConfig, section, f"{scenario.path}: edge")
     name = resolve_checkpoint(config.policy.name, scenario.path.parent)
     return dataclasses.replace(config, policy=dataclasses.replace(config.policy, name=name))
 
 
-def _read_json(scenario: Scenario, key: str, name: str) -> dict[str, Any]:
-    """An object in a JSON file that the scenario names, relative to it. Raises ScenarioError."""
+def _read_json(scenario: Scenario, key: str, name: str, model: type | None = None) -> dict[str, Any]:
+    """An object in a JSON file that the scenario names, relative to it. Raises ScenarioError.
+
+    model: what it must have at least.
+    """
     if not isinstance(name, str):
         raise ScenarioError(f"{scenario.path}: edge.{key}: expected the name of a file, got {name!r}")
     path = scenario.path.parent / name
     try:
         found = json.loads(path.read_text())
-        if isinstance(found, dict):
-            return found
-        raise ValueError("expected a JSON object")
+        if not isinstance(found, dict):
+            raise ValueError("expected a JSON object")
+        if model is not None:
+            msgspec.convert(found, model)
+        return found
     except (OSError, ValueError) as error:
         raise ScenarioError(f"{scenario.path}: edge.{key}: {path}: {error}") from None

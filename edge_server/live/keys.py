@@ -6,8 +6,10 @@ For development and a bench in one's own network: keys have no password, certifi
 from __future__ import annotations
 
 import argparse
+import errno
 import ipaddress
 import os
+import re
 import secrets
 import subprocess
 import tempfile
@@ -43,23 +45,33 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: Sequence[str]) -> None:
-    """Write ``out``. edge, emulator: their hosts. Raises TransportError where openssl cannot make a
-    certificate, FileExistsError where ``out`` is there already."""
+    """Write ``out``, whole or not at all. edge, emulator: their hosts. Raises TransportError for what is no
+    host, a camera named like another process and where openssl cannot make a certificate, FileExistsError
+    where ``out`` is there already."""
     names = {"edge": "edge", "emulator": "camera:*", "operator": "operator", "viewer": "viewer"}
-    names |= {camera: f"camera:{camera}" for camera in cameras if camera not in names}
+    if doubled := names.keys() & set(cameras):
+        raise TransportError(f"keys: a camera cannot be called {' or '.join(sorted(doubled))}: rename it")
+    names |= {camera: f"camera:{camera}" for camera in cameras}
     hosts = {"edge": edge, "emulator": emulator}
+    alternatives = {p: [_alternative(host) for host in (*hosts.get(p, ()), *_HERE)] for p in names}
+    if out.exists():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(out))
     before = os.umask(0o077)
     try:
-        out.mkdir(parents=True)
-        _certify(out, "freshfield development", ["basicConstraints=critical,CA:TRUE"])
-        for process, name in names.items():
-            folder = out / process
-            folder.mkdir()
-            alternatives = [_alternative(host) for host in (*hosts.get(process, ()), *_HERE)]
-            _certify(folder, name, [f"subjectAltName={','.join(alternatives)}"], authority=out)
-            (folder / "ca.pem").write_bytes((out / "cert.pem").read_bytes())
-        lines = [f"{name} {secrets.token_urlsafe(24)}\n" for name in ("operator", "viewer")]
-        (out / "edge" / "tokens.txt").write_text("".join(lines))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".keys-", dir=out.parent) as unfinished:
+            whole = Path(unfinished) / "keys"
+            whole.mkdir()
+            _certify(whole, "freshfield development", ["basicConstraints=critical,CA:TRUE"])
+            for process, name in names.items():
+                folder = whole / process
+                folder.mkdir()
+                extension = f"subjectAltName={','.join(alternatives[process])}"
+                _certify(folder, name, [extension], authority=whole)
+                (folder / "ca.pem").write_bytes((whole / "cert.pem").read_bytes())
+            lines = [f"{name} {secrets.token_urlsafe(24)}\n" for name in ("operator", "viewer")]
+            (whole / "edge" / "tokens.txt").write_text("".join(lines))
+            whole.rename(out)
     finally:
         os.umask(before)
 
@@ -92,4 +104,6 @@ def _alternative(host: str) -> str:
     try:
         return f"IP:{ipaddress.ip_address(host)}"
     except ValueError:
+        if not re.fullmatch(r"[A-Za-z0-9_.-]+", host):
+            raise TransportError(f"keys: expected the name or address of a host, got {host!r}") from None
         return f"DNS:{host}"

@@ -32,6 +32,7 @@ from freshfield.limits import (
     MAX_VIEW_SIDE_PX,
     MAX_VISITOR_MESSAGE_BYTES,
     MAX_VISITORS,
+    TLS_HANDSHAKE_TIMEOUT_S,
     VISITOR_TIMEOUT_S,
 )
 
@@ -127,6 +128,8 @@ class Door:
                 "process_request": lambda connection, request: self._answer(connection, request, process),
                 "create_connection": lambda *words, **more: VisitorConnection(self, *words, **more),
             }
+            if self._tls is not None:
+                options["ssl_handshake_timeout"] = TLS_HANDSHAKE_TIMEOUT_S
             return serve(handler, host, port, **options)
 
         websockets.asyncio.server.serve = through_the_door  # type: ignore[assignment, misc]

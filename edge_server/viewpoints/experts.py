@@ -85,10 +85,6 @@ class SimulatedExpert:
         self.asked.append(Answer(first, second, prefers))
         return self.asked[-1]
 
-    def agreement_with_itself(self) -> float:
-        """The probability that it gives the same answer twice, where it looks at both of a pair."""
-        return 0.5 if self.contradicts else 1.0 - 2.0 * self.wrong * (1.0 - self.wrong)
-
 
 def judge(taste: str, renderings: Sequence[NDArray[Any]], truths: Sequence[NDArray[Any]]) -> float:
     """The score of one reconstruction, seen from several viewpoints: (H, W, 3) in [0, 1] each. Raises

@@ -88,6 +88,10 @@ class Access(grpc.aio.ServerInterceptor):
         """Whether nobody is asked."""
         return not self._tokens and not self._certificates
 
+    @property
+    def has_tokens(self) -> bool:
+        return bool(self._tokens)
+
     def of_header(self, header: str) -> Caller | None:
         """The caller of an ``authorization`` header: Bearer TOKEN, or Basic with the token as password."""
         kind, _, shown = header.partition(" ")
@@ -157,12 +161,13 @@ class HttpRefused(Exception):
 class HttpDoor:
     """The same check for an HTTP server.
 
-    access: knows who may log in. On loopback, or if it is open, nobody is asked.
+    access: knows who may log in. If it is open, or on loopback has no tokens, nobody is asked.
     listening_on: address or name that the server was told to listen on.
     """
 
     def __init__(self, access: Access, listening_on: str) -> None:
-        self.access = None if access.open or is_loopback(listening_on) else access
+        asks = access.has_tokens or not (access.open or is_loopback(listening_on))
+        self.access = access if asks else None
         self._names = {"localhost", listening_on.lower(), socket.gethostname().lower()}
 
     def check_origin(self, host: str | None, origin: str | None) -> None:

@@ -126,10 +126,11 @@ class Transport:
 
         http: callers can show tokens only.
         """
-        asked = not self.access.open and bool(self.tokens or not http)
         missing = [] if self.cert else ["nothing is encrypted (--tls-cert, --tls-key)"]
-        if not asked:
+        if self.access.open:
             missing.append(f"nobody is asked who they are (--token-file{'' if http else ' or --tls-ca'})")
+        elif http and not self.tokens:
+            missing.append("nobody can log in (--token-file)")
         if is_loopback(host) or not missing:
             return ""
         words = f"{what} on {host} can be reached from other machines, and {' and '.join(missing)}"
@@ -251,9 +252,12 @@ def _tokens(path: Path) -> dict[str, str]:
     if (
         any(len(words) > 2 for words in lines)
         or len(tokens) < len(lines)
+        or len(set(tokens.values())) < len(tokens)
         or ("" in tokens and len(lines) > 1)
     ):
-        raise TransportError(f"{path}: expected lines NAME TOKEN with different names, or one token alone")
+        raise TransportError(
+            f"{path}: expected lines NAME TOKEN, names and tokens all different, or one token alone"
+        )
     return tokens
 
 

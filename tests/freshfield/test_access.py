@@ -174,6 +174,16 @@ def test_a_browsers_login_is_the_token_as_password() -> None:
         assert access.of_header(wrong) is None
 
 
+def test_who_gives_tokens_has_everybody_asked_on_loopback_too() -> None:
+    """An authority alone lets nobody log in: a browser shows no certificate."""
+    with pytest.raises(HttpRefused, match="log in"):
+        HttpDoor(Access(TOKENS, certificates=True), "127.0.0.1").caller(None)
+    for certificates in (False, True):
+        assert HttpDoor(Access({}, certificates), "127.0.0.1").caller(None) == ANYBODY
+    with pytest.raises(HttpRefused, match="log in"):
+        HttpDoor(Access({}, certificates=True), "0.0.0.0").caller(None)
+
+
 @pytest.mark.parametrize("host", ["localhost", "localhost:9090", "127.0.0.1:1", "[::1]:80", "192.0.2.7"])
 def test_an_own_host_may_be_asked_for(host: str) -> None:
     door = HttpDoor(Access({}, certificates=False), "127.0.0.1")

@@ -240,7 +240,7 @@ def test_what_protects_a_port_beyond_this_machine():
     tls = {"cert": Path("c"), "key": Path("k")}
     assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
     assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
-    with pytest.raises(TransportError, match="--token-file"):  # a browser has no certificate
+    with pytest.raises(TransportError, match="machines, and nobody can log in"):
         Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "page", http=True)
     for host in ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost"):
         assert Transport().guard(host, "page") == ""
@@ -271,7 +271,7 @@ def test_options_become_a_transport(tmp_path):
     assert parsed() == Transport()
     token.write_text("camera:cam00 one\n\noperator two\n")
     assert parsed("--token-file", str(token)).tokens == {"camera:cam00": "one", "operator": "two"}
-    for wrong in ("viewer a\nviewer b", "a\nb", "viewer a b"):
+    for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b"):
         token.write_text(wrong)
         with pytest.raises(TransportError, match="NAME TOKEN"):
             parsed("--token-file", str(token))

@@ -23,7 +23,7 @@ from freshfield.files import write_json, write_text
 DESCRIPTION = """\
 Measure this machine. Figures are medians; outside_cores says how many cores others kept busy meanwhile.
 
-  edge-server bench                       # everything but peer, hours
+  edge-server bench                       # all parts but those marked below, hours
   edge-server bench field --quick
   edge-server bench track --scene room --field ngp --update-s 0.5
   edge-server bench field track options --json docs/results/field.json

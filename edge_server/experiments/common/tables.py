@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from freshfield.files import write_csv as write_csv
-
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A Markdown table.

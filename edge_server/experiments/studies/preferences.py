@@ -10,7 +10,7 @@ import numpy as np
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import interval, paired
-from edge_server.experiments.common.tables import markdown_table, write_csv
+from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.studies.trial import Row
@@ -25,7 +25,7 @@ from edge_server.viewpoints.plan import Budget, Plan, plan_capture
 from edge_server.viewpoints.policy import PolicyConfig, train_policy
 from edge_server.viewpoints.reward import RewardModel, fit_reward, next_pair
 from edge_server.viewpoints.selector import make_selector
-from freshfield.files import write_text
+from freshfield.files import write_csv, write_text
 
 ASKED = (10, 20, 40, 60)
 HABITS: dict[str, dict[str, float | bool]] = {

@@ -12,7 +12,7 @@ from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import Interval, interval, negated, paired
-from edge_server.experiments.common.tables import markdown_table, number, write_csv
+from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.studies.drawing import Image, draw_curve, draw_images
 from edge_server.experiments.studies.study import (
     METRICS,
@@ -33,7 +33,7 @@ from edge_server.live.scoring_thread import to_bytes
 from edge_server.report.style import figure, label_lines
 from edge_server.viewpoints.plan import Budget, Plan, plan_capture
 from edge_server.viewpoints.selector import make_selector
-from freshfield.files import write_text
+from freshfield.files import write_csv, write_text
 
 # label -> (selector, weight of the way)
 ARMS = {

@@ -99,5 +99,20 @@ def test_the_health_check_passes_mutual_tls(keys):
 def test_keys_are_their_owners_alone_and_never_overwritten(keys, tmp_path, capsys):
     assert not any(stat.S_IMODE(path.stat().st_mode) & 0o077 for path in [keys, *keys.rglob("*")])
     assert main(["keys", "tile", "--out", str(keys)]) == 2 and "exists" in capsys.readouterr().err
-    with pytest.raises(TransportError, match="64 characters"):
-        make_keys(tmp_path / "new", ["c" * 60], [], [])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "hosts", "why"),
+    [
+        (["c" * 60], [], "64 characters"),
+        (["cam00", "viewer"], [], "camera .*viewer"),
+        ([], ["a b,c"], "'a b,c'"),
+        ([], ["edge,IP:192.0.2.1"], "'edge,IP:192.0.2.1'"),
+        ([], ["edge:7000"], "'edge:7000'"),
+        ([], [""], "''"),
+    ],
+)
+def test_what_cannot_be_certified_is_named_and_leaves_nothing(tmp_path, cameras, hosts, why):
+    with pytest.raises(TransportError, match=why) as error:
+        make_keys(tmp_path / "new", cameras, hosts, [])
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())

@@ -127,7 +127,9 @@ def metrics() -> int:
 
 
 POINTS = np.random.default_rng(0).random((300_000, 3), np.float32)  # 4.5 MB to send
-INGEST = SimpleNamespace(rejected={}, check_ms=SimpleNamespace(percentile=lambda percent: None))
+INGEST = SimpleNamespace(
+    rejected={}, buffer=SimpleNamespace(shed=0), check_ms=SimpleNamespace(percentile=lambda percent: None)
+)
 
 
 def test_a_login_lasts_for_the_websocket_and_is_nobody_elses(guarded: Page) -> None:
@@ -304,6 +306,17 @@ def test_half_requests_end_for_new_ones(monkeypatch) -> None:
         wait_until(lambda: sum(map(ended, halves)) >= 23, "they all stay", 4.0)
         assert get(page.port)[0] == 200
         visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
+
+
+def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(door, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
+    make_keys(tmp_path / "keys", [], [], [])
+    files = {part: tmp_path / "keys" / "edge" / f"{part}.pem" for part in ("cert", "key")}
+    with (
+        page_of(bare_state(), Transport(**files, tokens=TOKENS), "0.0.0.0") as page,
+        socket.create_connection(("127.0.0.1", page.port), timeout=4.0) as silent,
+    ):
+        assert silent.recv(1) == b""
 
 
 def test_who_does_not_read_is_sent_away_and_what_was_held_with_them(monkeypatch) -> None:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
+import pytest
+
+from edge_server.config import read_config
 from edge_server.live.state import CameraView
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css
+from freshfield.scenario import ScenarioError, parse
 
 
 def summary(**changes) -> markup.Summary:
@@ -72,6 +78,32 @@ def test_the_scores_of_policies_say_where_they_are_from():
     for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learnt&gt;"):
         assert part in html
     assert html.count("-0.03 [-0.11, +0.05]") == 1, "all is not compared with itself"
+
+
+ROW = {"own_seed": {"psnr_db": None, "views": 12.0}}
+SCORES = {"policies": {"all": ROW}, "seconds": 8.0, "seed": 7, "seeds": 12,
+          "machine": {"cpu": "a machine", "cores": 2}}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({}, ""),
+        ({"policies": {}, "seconds": None}, "seconds"),
+        ({"policies": {"all": 3}}, "policies"),
+        ({"policies": {"learnt": {**ROW, "psnr_db_over_all": [0.1]}}}, "psnr_db_over_all"),
+        ({"machine": {}}, "machine"),
+    ],
+)
+def test_scores_that_the_page_cannot_show_are_refused_when_read(tmp_path, change, where) -> None:
+    (tmp_path / "scores.json").write_text(json.dumps(SCORES | change))
+    scenario = parse({"cameras": {"count": 2}, "edge": {"scores": "scores.json"}}, tmp_path / "x.yaml")
+    if not where:
+        assert "&ndash;" in markup.policy_scores(read_config(scenario).scores)
+        return
+    with pytest.raises(ScenarioError, match=rf"edge\.scores: .*scores\.json: .*{where}") as error:
+        read_config(scenario)
+    assert "\n" not in str(error.value)
 
 
 def test_the_channel_line_shows_only_what_the_emulator_reports():

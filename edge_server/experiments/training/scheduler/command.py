@@ -20,7 +20,6 @@ from edge_server.experiments.common.arguments import (
 )
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import Maker
 from edge_server.experiments.training.scheduler.contest import LEARNT, contest
 from edge_server.experiments.training.scheduler.evaluation import (
@@ -44,7 +43,7 @@ from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
 from edge_server.scheduler.learned.rewards import REWARDS
-from freshfield.files import write_json
+from freshfield.files import write_csv, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 

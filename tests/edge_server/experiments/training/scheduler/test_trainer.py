@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from edge_server.experiments.common.statistics import paired
-from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler import command, contest
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
@@ -46,6 +45,7 @@ from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.scheduler.online.online_trainer import choose_reward
+from freshfield.files import write_csv
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
 
 REWARD = make_reward("set", distance=0.0)
