@@ -33,6 +33,7 @@ from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
 from edge_server.live.update_budget import open_budget
+from edge_server.scheduler import short_name
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
@@ -329,7 +330,7 @@ class EdgeServer:
             "started_ns": self.start_ns,
             "uptime_s": self.state.now_s(),
             "field": self.config.field,
-            "policy": self.state.controls.policy,
+            "policy": short_name(self.state.controls.policy),
             "value": self.state.controls.value,
             "paused": self.state.controls.paused,
             "doing": self.state.status_line,

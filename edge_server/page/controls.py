@@ -17,7 +17,7 @@ import viser
 
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import note
-from edge_server.scheduler import make_policy, policy_help
+from edge_server.scheduler import make_policy, policy_help, short_name
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +33,13 @@ class ControlPanel:
         self._state = state
         self._lock = threading.Lock()
         self._parameter: dict[str, str | None] = {}
-        names = state.policies or (state.controls.policy,)
-        current = state.controls.policy if state.controls.policy in names else names[0]
+        self._names = {short_name(name): name for name in state.policies or (state.controls.policy,)}
+        names, current = tuple(self._names), short_name(state.controls.policy)
         self.policy: Any = gui.add_dropdown(
-            "policy", names, initial_value=current, hint="Which of the newest views an update uses."
+            "policy",
+            names,
+            initial_value=current if current in names else names[0],
+            hint="Which of the newest views an update uses.",
         )
         self.value: Any = gui.add_number("value", _finite_or_zero(state.controls.value), min=0.0, step=1.0)
         self.help = gui.add_html("")
@@ -59,8 +62,9 @@ class ControlPanel:
         """Show the values in force."""
         controls = self._state.controls
         with self._lock:
-            if controls.policy in self.policy.options and self.policy.value != controls.policy:
-                self.policy.value = controls.policy
+            shown = short_name(controls.policy)
+            if shown in self.policy.options and self.policy.value != shown:
+                self.policy.value = shown
             parameter = self._parameter_of(controls.policy)
             self.value.visible = parameter is not None
             self.value.label = _label(parameter)
@@ -77,8 +81,9 @@ class ControlPanel:
     def _policy_chosen(self, event: Any) -> None:
         if event.client is None:  # set by refresh, not by a visitor
             return
-        name = event.target.value
-        self._attempt(event.client, f"policy {name}", lambda: self._state.set_policy(name, None))
+        shown = event.target.value
+        name = self._names.get(shown, shown)
+        self._attempt(event.client, f"policy {shown}", lambda: self._state.set_policy(name, None))
 
     def _value_entered(self, event: Any) -> None:
         entered, name = event.target.value, self._state.controls.policy

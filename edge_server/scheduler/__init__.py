@@ -17,6 +17,7 @@ from edge_server.scheduler.registry import (
     policy_help,
     policy_label,
     resolve_checkpoint,
+    short_name,
 )
 
 __all__ = [
@@ -36,4 +37,5 @@ __all__ = [
     "policy_help",
     "policy_label",
     "resolve_checkpoint",
+    "short_name",
 ]

@@ -111,6 +111,11 @@ def policy_label(policy: Policy) -> str:
     return f"{policy.name}:{policy.value:g}"
 
 
+def short_name(name: str) -> str:
+    """A policy's name for people to read: of a checkpoint only the file's name, not its folder."""
+    return BANDIT + Path(name.removeprefix(BANDIT)).name if name.startswith(BANDIT) else name
+
+
 def resolve_checkpoint(name: str, folder: Path) -> str:
     """``bandit:FILE`` with FILE, relative to ``folder``, made absolute; any other policy's name as it is."""
     if not name.startswith(BANDIT):

@@ -26,7 +26,7 @@ from edge_server.fidelity.scorer import SHOWN, Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
-from edge_server.scheduler import parse_policy
+from edge_server.scheduler import parse_policy, short_name
 from freshfield.files import write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -159,7 +159,7 @@ def show(found: dict[str, Any]) -> str:
     cost_text = charged if any(cost.values()) else "free of charge"
     lines = [
         f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
-        f"{found['policy']}{value}",
+        f"{short_name(found['policy'])}{value}",
         f"  updates     {found['updates']} of {found['steps']} steps, {cost_text}",
         f"  views       {number(found['views'], 1)} an update",
         "  last fifth  "

@@ -94,8 +94,14 @@ def open_online_trainer(
     out: Path,
 ) -> OnlineTrainer:
     """Trainer of the learner in ``path``. reward, fallback: as in ``config.LearnConfig``. ValueError for an
-    unknown reward or policy, or a file that holds no learner."""
+    unknown reward or policy, a file that holds no learner, or a learner whose decisions hold for several
+    updates."""
     learner = Learner.load(path)
+    if learner.spec.hold_ms:
+        raise ValueError(
+            f"{path}: its decisions hold for {learner.spec.hold_ms:g} ms (--hold), and what several updates "
+            "share cannot be learned live: run it without learning, or train one without --hold"
+        )
     name, _, value = (fallback or training_summary(path).get("best_fixed") or _DEFAULT_FALLBACK).partition(
         ":"
     )

@@ -46,6 +46,7 @@ def test_it_decides_learns_and_leaves_what_it_learned(tmp_path, policy, monkeypa
     port = free_port()
     edge = server(tmp_path, f"bandit:{policy}", port=port, learn=LearnConfig("set", "threshold:200"))
     assert edge.state.policies[0] == f"bandit:{policy}" == edge.state.controls.policy
+    assert edge.status()["policy"] == "bandit:policy.npz"
     thread = threading.Thread(target=edge.run, daemon=True)
     thread.start()
     feed = Feed(port, edge.scenario.cameras, ("cam00",))

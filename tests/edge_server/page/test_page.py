@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
 from edge_server.page import Page, PageError, page_url, start_page
+from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.preview import BallScene, Preview
 from edge_server.page.rendering import DEPTH_ROWS, FAR_M, browser_images
@@ -117,6 +119,23 @@ def test_truth_and_rendering_of_any_size_fit_side_by_side():
         pair = side_by_side(image, image[: shape[0] // 2 + 1])
         assert pair.shape[1] == PAIR_WIDTH and pair.dtype == np.uint8
         assert (pair[:, :100] == 200).all() and (pair[:, -100:] == 200).all()
+
+
+def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
+    chosen = []
+    path = "bandit:/far/away/p.npz"
+    state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
+    gui = MagicMock()
+    gui.add_dropdown.side_effect = lambda _, options, initial_value=None, **more: MagicMock(
+        options=options, value=initial_value
+    )
+    panel = ControlPanel(MagicMock(gui=gui), state)
+    assert panel.policy.options == ("bandit:p.npz", "all") and panel.policy.value == "all"
+    panel._policy_chosen(MagicMock(target=MagicMock(value="bandit:p.npz")))
+    assert chosen == [(path, None)]
+    state.controls.policy = path
+    panel.refresh()
+    assert panel.policy.value == "bandit:p.npz"
 
 
 # --- the port ----------------------------------------------------------------------------------

@@ -2,8 +2,8 @@
 
 ``layers`` is the splat field in layers on arrivals, a decision each 20 ms; ``before`` the same field without
 layers, in cycles of 250 ms. Computing is charged as measured on one core: an update of layers by the part
-times of the run in which nothing is late, the static field's training left out, which another core does; a
-cycle by what docs/studies.md charges.
+times of the run in which nothing is late, without the training and the renderings of the static field, which
+another core does; a cycle by what docs/studies.md charges.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.bench.shown.rows import FIRST_SEED, Row, find
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.common.tables import number
+from edge_server.experiments.virtual.costs import beside_s
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
@@ -33,7 +34,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 SECONDS, QUICK_SECONDS = 12.0, 8.0
 SHOWN_EVERY_MS = 50.0
-_OFF_THE_WAY = ("static field", "static renders")  # parts of an update that another core does
 _CYCLE = Compute(ms_per_step=3.0, ms_per_update=70.0)
 _LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
 _CYCLE_RUN = replace(_LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
@@ -140,7 +140,7 @@ class UpdateCosts:
     def published(self, updates: FieldUpdater, counts: bool) -> None:
         """Take an update in. counts: or leave it out."""
         parts: dict[str, float] = getattr(updates.field, "part_s", {})
-        spent_s = sum(s for part, s in parts.items() if part not in _OFF_THE_WAY)
+        spent_s = sum(parts.values()) - beside_s(updates.field)
         if counts:
             self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
         self._seen, self._spent_s = updates.buffer.arrivals, spent_s

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import Interval, interval, paired
+from edge_server.experiments.common.tables import number
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.report.machine import machine
@@ -47,7 +49,8 @@ def contest(
     for name in CONTESTANTS:
         who = learnt if name == LEARNT else name
         found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
-        say(f"{name}: {found[name]['own_seed']['psnr_db']:.2f} dB shown with seed {setting.scenario.seed}")
+        shown = number(found[name]["own_seed"]["psnr_db"])
+        say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}")
     runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
             for who in (REFERENCE, LEARNT)}  # fmt: skip
     for who, of in runs.items():
@@ -69,15 +72,13 @@ def _runs(
     setting: Setting, pool: WorkerPool, seeds: range, who: str | Actor, weights: str, known: Path
 ) -> list[dict[str, Any]]:
     """``WorkerPool.judge`` of each seed; those in ``known`` are not run again."""
-    store = ResultStore.in_lines(known)
     name = weights if isinstance(who, Actor) else who
     keys = {seed: content_key([source_digest(), setting.key, name, seed], 32) for seed in seeds}
-    missing = [seed for seed in seeds if keys[seed] not in store.results]
-    for seed, run in zip(missing, pool.judge(setting, missing, who)):
-        store.put(keys[seed], result=run)
-    found = [store.results[keys[seed]] for seed in seeds]
-    store.close()
-    return found
+    with closing(ResultStore.in_lines(known)) as store:
+        missing = [seed for seed in seeds if keys[seed] not in store.results]
+        for seed, run in zip(missing, pool.judge(setting, missing, who)):
+            store.put(keys[seed], result=run)
+        return [store.results[keys[seed]] for seed in seeds]
 
 
 def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:

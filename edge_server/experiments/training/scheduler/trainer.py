@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments.common import tables
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import choice_of_action
 from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
@@ -149,7 +150,7 @@ def _train_batch(
     reward."""
     episode_seeds = config.seeds(number)
     if config.spec.hold_ms:
-        return _train_deployed_batch(setting, config, pool, learner, episode_seeds)
+        return _train_deployed_batch(setting, config, pool, learner, number)
     moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
     pool.forget(setting, episode_seeds)
     # The tries of one decision stand together.
@@ -186,7 +187,8 @@ def _row(
         "batch": (episode_seeds[0] - first) // config.batch, "episodes": episode_seeds[-1] + 1 - first,
         "reward": _mean([_complete(r) for r in found]),
     }  # fmt: skip
-    row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
+    terms = found[0].terms if found else ()
+    row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
     if config.spec.action != "select":
         row["omega_ms"] = _mean([config.spec.omegas_ms[int(a)] for a in actions])
@@ -194,9 +196,11 @@ def _row(
 
 
 def _train_deployed_batch(
-    setting: Setting, config: TrainingConfig, pool: WorkerPool, learner: Learner, episode_seeds: range
+    setting: Setting, config: TrainingConfig, pool: WorkerPool, learner: Learner, number: int
 ) -> Row:
-    """``_train_batch`` where the learner decides in the running deployment (``deployed``)."""
+    """``_train_batch`` where the learner decides in the running deployment (``deployed``). A later batch
+    without a decision or a reward changes no weights."""
+    episode_seeds = config.seeds(number)
     each: list[Decided] = []
     advantages: list[NDArray[np.float64]] = []
     for tries in pool.play(setting, episode_seeds, learner.actor, config.tries):
@@ -204,14 +208,16 @@ def _train_deployed_batch(
         advantages += sibling_advantages(tries, config.spec.hold_ms, rewards)
         each += [d for one in tries for d in one]
     found = [config.reward.of(d.outcome) for d in each]
-    if not any(r.complete for r in found):
+    if number == 0 and not any(r.complete for r in found):
         raise TrainingError(_missing_reward_reason([d.outcome for d in each], found))
     decisions = [d.decision for d in each]
+    row = _row(config, episode_seeds, found, [d.outcome for d in each], [d.action for d in decisions])
+    if not each:  # nothing arrived in any of its episodes
+        return row | {"decisions": 0}
     batch = learner.batch(
         [d.state for d in decisions], np.array([d.action for d in decisions]),
         np.array([d.logp for d in decisions]), np.concatenate(advantages),
     )  # fmt: skip
-    row = _row(config, episode_seeds, found, [d.outcome for d in each], [d.action for d in decisions])
     update = dataclasses.asdict(learner.update(batch))
     return row | {"decisions": len(each)} | {k: v for k, v in update.items() if k != "reward"}
 
@@ -334,8 +340,8 @@ def _settings_key(setting: Setting, config: TrainingConfig) -> str:
 
 def _progress_text(config: TrainingConfig, row: Row) -> str:
     omega = f", omega {row['omega_ms']:.0f} ms" if row.get("omega_ms") is not None else ""
-    reward = "-" if row["reward"] is None else f"{row['reward']:.4f}"
-    return f"{row['episodes']}/{config.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"
+    reward, views = tables.number(row["reward"], 4), tables.number(row["views"], 1)
+    return f"{row['episodes']}/{config.episodes} episodes: reward {reward}, {views} views{omega}"
 
 
 def _mean(values: Any) -> float | None:

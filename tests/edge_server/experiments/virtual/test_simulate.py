@@ -11,10 +11,12 @@ import pytest
 import yaml
 
 from edge_server.config import ComputeConfig, read_config
+from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.costs import fitted
 from edge_server.experiments.virtual.costs import main as costs_main
-from edge_server.experiments.virtual.from_scenario import training_cameras
+from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate import main
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -127,6 +129,24 @@ def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, 
     for wrong in ("missing.json", 3):
         with pytest.raises(ScenarioError, match=r"edge\.compute"):
             read_config(load(write(tmp_path, compute=wrong)))
+
+
+@pytest.mark.parametrize("part", ["static field", "static renders"])
+def test_what_is_done_beside_an_update_live_is_not_charged(part: str, tmp_path: Path, monkeypatch):
+    def build(*given: Any, **more: Any) -> VirtualDeployment:
+        deployment = build_deployment(*given, **more)
+        field = deployment.updates.field
+        fit, field.part_s = field.fit, {part: 0.0}
+
+        def slow(*given: Any) -> Any:
+            field.part_s[part] += 100.0  # says so, and does not take it
+            return fit(*given)
+
+        field.fit = slow
+        return deployment
+
+    monkeypatch.setattr(costs, "build_deployment", build)
+    assert costs.measure(load(write(tmp_path, steps=2)), 0.6)["median_ms"] < -90_000.0
 
 
 def test_costs_are_told_apart():

@@ -261,6 +261,9 @@ def test_reward_and_fallback_default_to_those_of_the_training(tmp_path: Path):
     for bad, said in ((("nonsense", ""), "nonsense"), (("set", "threshold:x"), "fallback: ")):
         with pytest.raises(ValueError, match=said):
             open_online_trainer(tmp_path / "policy.npz", *bad, rng(), None, tmp_path)
+    Learner(replace(SPEC, hold_ms=200.0)).save(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match=r"its decisions hold for 200 ms .*without --hold"):
+        open_online_trainer(tmp_path / "policy.npz", "", "", rng(), None, tmp_path)
 
 
 class Score:

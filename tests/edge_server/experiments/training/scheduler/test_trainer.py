@@ -17,7 +17,7 @@ from edge_server.experiments.training.scheduler import command, contest
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
 from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
-from edge_server.experiments.training.scheduler.episode import Choice
+from edge_server.experiments.training.scheduler.episode import Choice, Outcome
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     baseline_policies,
@@ -263,6 +263,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
 
 
+@pytest.mark.slow  # some 6 s of virtual deployments
 def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored_beside_fixed_ones(
     tmp_path: Path, capsys, monkeypatch
 ):
@@ -312,6 +313,52 @@ def test_tries_are_compared_with_the_others_that_decided_at_the_same_time():
     assert np.allclose(found[1], [0.0, np.nan], equal_nan=True)
     assert np.allclose(found[2], [4.5, 2.0])
     assert sibling_advantages(tries[:1], 100.0, rewards[:1])[0].tolist() == [1.0, 2.0, 3.0]
+
+
+class Played:
+    """Plays given decisions, an episode a call."""
+
+    def __init__(self, *episodes: list[Decided]) -> None:
+        self.episodes = iter(episodes)
+
+    def play(self, setting, seeds, actor, tries):
+        return [[next(self.episodes)] for _ in seeds]
+
+
+def test_only_a_first_batch_without_a_reward_ends_a_training_in_the_deployment(tmp_path: Path):
+    spec = Spec("threshold", StateLayout(("age",)), (50.0, 200.0), hidden=16, hold_ms=200.0)
+    config = TrainingConfig(spec, REWARD, episodes=4, batch=1, tries=1)
+    state = State(np.ones(2), np.zeros((2, 6)), None, np.ones(2, bool))
+
+    def decided(psnr_db: float | None) -> list[Decided]:
+        outcome = Outcome(psnr_db, None, 0.5, None, None, None, 2.0, 0.0)
+        return [Decided(Decision(0, 0, state, np.array(k), -0.7, None), outcome, "") for k in (0, 1)]  # type: ignore[arg-type]
+
+    def trained(out: Path, *episodes: list[Decided]) -> list[dict]:
+        train(setting(), config, Played(*episodes), out, quiet)  # type: ignore[arg-type]
+        return read_log(out)
+
+    rows = trained(tmp_path / "a", decided(20.0), [], decided(None), decided(22.0))
+    assert [row["decisions"] for row in rows] == [2, 0, 2, 2]
+    assert [row["reward"] is None for row in rows] == [False, True, True, False]
+    assert Learner.load(tmp_path / "a/policy.npz").updates == 2
+    for first, said in (([], "nothing had arrived"), (decided(None), "it lacks psnr")):
+        with pytest.raises(TrainingError, match=said):
+            trained(tmp_path / "b", first)
+
+
+def test_a_policy_may_show_nothing_in_the_span(tmp_path: Path):
+    shown = {"psnr_db": None, "psnr_moving_db": None, "ssim": None, "views": 0.0, "aaoi_ms": None}
+    said: list[str] = []
+
+    class Judge:
+        def judge(self, setting, seeds, who):
+            return [shown for _ in seeds]
+
+    actor = Learner(CONFIG.spec, 0).actor
+    found = contest.contest(setting(), Judge(), range(2), actor, "", tmp_path / "known", said.append)  # type: ignore[arg-type]
+    assert said[0] == "all: - dB shown with seed 3"
+    assert found["policies"]["learnt"]["psnr_db_over_all"] == [None] * 3
 
 
 def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path, pool: WorkerPool):
