@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -56,10 +56,12 @@ class Summary:
     reporting: int
     cameras: int
     t_s: float
+    age_parts_ms: Mapping[str, float] = field(default_factory=dict)
+    """What the age of what is shown consists of, by name; empty before there is anything to show."""
 
 
 def status(s: Summary) -> str:
-    """Status line and six tiles."""
+    """Status line, six tiles, and the parts of the age of what is shown."""
     dot = css(scale_color(0.0 if s.condition == "live" else 0.5))
     head = (
         f'<div style="padding:.45em .9em;font-size:.85em"><span style="color:{dot}">&#9679;</span> '
@@ -80,7 +82,25 @@ def status(s: Summary) -> str:
     )
     cells = "".join(_tile(*tile) for tile in tiles)
     grid = "display:grid;grid-template-columns:repeat(3,1fr);gap:.4em;padding:0 .9em .5em"
-    return f'{head}<div style="{grid}">{cells}</div>'
+    return f'{head}<div style="{grid}">{cells}</div>{_age_parts(s.age_parts_ms)}'
+
+
+def _age_parts(parts_ms: Mapping[str, float]) -> str:
+    """A bar whose pieces are as long as the parts of the age, and their names and milliseconds."""
+    if not parts_ms:
+        return ""
+    total_ms = max(sum(parts_ms.values()), 1e-3)
+    pieces, words = [], []
+    for k, (name, ms) in enumerate(parts_ms.items()):
+        color = css(scale_color(k / max(len(parts_ms) - 1, 1)))
+        pieces.append(f'<div style="width:{100 * ms / total_ms:.1f}%;background:{color}"></div>')
+        words.append(f'<span style="color:{color}">&#9632;</span> {escape(name)} {number(ms)}')
+    return (
+        '<div style="padding:0 .9em .5em;font-size:.75em">'
+        f'<span style="{_DIM}">age of what is shown, {number(total_ms)} ms</span>'
+        f'<div style="display:flex;height:7px;border-radius:4px;overflow:hidden">{"".join(pieces)}</div>'
+        f"<div>{' '.join(words)}</div></div>"
+    )
 
 
 def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:

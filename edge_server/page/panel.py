@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ SIDE_WIDTH = 356
 # Width of two images and the gap between them, in pixels.
 PAIR_WIDTH = 640
 GAP = 8
+AGE_PARTS_OF = 50  # publications
 PANEL_COLOR = (36, 36, 36)
 
 
@@ -123,7 +125,28 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         reporting=sum(c.age_ms is not None for c in cameras),
         cameras=len(cameras),
         t_s=state.now_s(),
+        age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:]),
     )
+
+
+def age_parts_ms(publications: Sequence[Publication]) -> dict[str, float]:
+    """The parts of the age of what is shown at a random instant, milliseconds, means over some publications:
+    network (capture to arrival), waiting (to the decision), computing (to publication), and display (since
+    publication; an instant meets long gaps more often). Empty for fewer than two publications, or where no
+    network time is known.
+
+    publications: in a row.
+    """
+    known = [p for p in publications if p.network_ms is not None]
+    if len(publications) < 2 or not known:
+        return {}
+    gap_ms = 1e3 * np.diff([p.t_s for p in publications])
+    network, computing, age = np.mean([(p.network_ms, p.update_ms, p.aaoi_ms) for p in known], axis=0)
+    parts = {
+        "network": network, "waiting": age - network - computing, "computing": computing,
+        "display": np.sum(gap_ms**2) / max(2.0 * np.sum(gap_ms), 1e-3),
+    }  # fmt: skip
+    return {name: max(float(ms), 0.0) for name, ms in parts.items()}
 
 
 def side_by_side(truth: NDArray[np.uint8], rendered: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -7,9 +7,10 @@ import json
 import pytest
 
 from edge_server.config import read_config
-from edge_server.live.state import CameraView
+from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css
+from edge_server.page.panel import age_parts_ms
 from freshfield.scenario import ScenarioError, parse
 
 
@@ -25,6 +26,21 @@ def test_the_status_shows_every_value():
     values = ("room", "ngp", "live", "1:15", "fitting", "25.3", "cam00", ">41<", ">812<", ">130<", "12/13")
     for part in values:
         assert part in html
+
+
+def test_the_age_of_what_is_shown_is_split_into_its_parts():
+    def publication(t_s: float, network_ms: float | None) -> Publication:
+        return Publication(0, t_s, 0, None, ("cam01",), (100.0,), 100.0, 20.0, network_ms=network_ms)
+
+    parts = age_parts_ms([publication(t_s, 50.0) for t_s in (0.0, 0.02, 0.08)])
+    # A random instant lies in the long gap three times out of four, and then 30 ms after its begin.
+    assert parts == pytest.approx({"network": 50.0, "waiting": 30.0, "computing": 20.0, "display": 25.0})
+    html = markup.status(summary(age_parts_ms=parts))
+    assert "125 ms" in html and "width:40.0%" in html
+    assert (
+        age_parts_ms([publication(0.0, 50.0)]) == age_parts_ms([publication(t, None) for t in (0, 1)]) == {}
+    )
+    assert "age of what is shown" not in markup.status(summary())
 
 
 def test_unknown_values_are_dashes():
