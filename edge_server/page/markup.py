@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,7 @@ class Summary:
     reporting: int
     cameras: int
     t_s: float
-    age_parts_ms: Mapping[str, float] = field(default_factory=dict)
+    age_parts_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """What the age of what is shown consists of, by name; empty before there is anything to show."""
 
 

@@ -137,11 +137,11 @@ def age_parts_ms(publications: Sequence[Publication]) -> dict[str, float]:
 
     publications: in a row.
     """
-    known = [p for p in publications if p.network_ms is not None]
+    known = [(p.network_ms, p.update_ms, p.aaoi_ms) for p in publications if p.network_ms is not None]
     if len(publications) < 2 or not known:
         return {}
     gap_ms = 1e3 * np.diff([p.t_s for p in publications])
-    network, computing, age = np.mean([(p.network_ms, p.update_ms, p.aaoi_ms) for p in known], axis=0)
+    network, computing, age = np.mean(known, axis=0)
     parts = {
         "network": network, "waiting": age - network - computing, "computing": computing,
         "display": np.sum(gap_ms**2) / max(2.0 * np.sum(gap_ms), 1e-3),
