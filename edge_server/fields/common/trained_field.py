@@ -9,6 +9,7 @@ A subclass makes, grows and differentiates its encoding, and has kernels for it 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -147,9 +148,9 @@ class TrainedField(SteppedField[RaySnapshot]):
 
     # --- what a representation is -------------------------------------------------------------
 
+    @abstractmethod
     def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:
         """A fresh encoding and network for ``self.view_store.box`` (None: no scene yet)."""
-        raise NotImplementedError
 
     def _tiny(self) -> Any:
         return replace(self.settings, **TINY)
@@ -171,12 +172,12 @@ class TrainedField(SteppedField[RaySnapshot]):
             train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch
         )
 
+    @abstractmethod
     def _gather(self, levels: int, scale: float) -> None:
         """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``.
 
         scale: by which Adam will multiply it.
         """
-        raise NotImplementedError
 
     def _add_depth_guide(
         self, views: Sequence[View], data: Views, box: SceneBox, step_budget: StepBudget, fresh: bool
