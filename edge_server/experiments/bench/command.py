@@ -41,8 +41,8 @@ embed      ms to embed a frame, beside ONNX Runtime alone, by the shipped detect
            the extra embed; not part of all
 foreground masks of lego against its alpha: IoU and ms by options, what detectors find (--model FILE: another
            one), and dB that a field gains; needs FRESHFIELD_DATA; not part of all
-peer       seconds to 20 and 25 dB on lego and kitchen, beside nerfstudio's nerfacto where it is installed and
-           the same field in plain torch; needs FRESHFIELD_DATA; not part of all
+peer       seconds to 20 and 25 dB on lego and kitchen, beside ngp in plain torch and, where installed
+           (docs/fields.md), nerfstudio's nerfacto and OpenSplat; needs FRESHFIELD_DATA; not part of all
 shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
            perfect field would show, and where the decibels go; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
@@ -56,11 +56,11 @@ PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "
 # Not part of "all": they need an extra, or recorded data and patience.
 MORE = ("embed", "foreground", "peer", "shown", "surface")
 # Parts that store each figure as it comes, and skip what is known.
-_RESUMABLE = ("field", "track", "drift", "options", "shown", "surface")
+_RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "surface")
 _FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
 # Flags of some parts only.
 _ONLY_OF = {
-    "field": tuple(part for part in _RESUMABLE if part != "shown"), "resume": (*PARTS, *MORE),
+    "field": tuple(part for part in _RESUMABLE if part not in ("peer", "shown")), "resume": (*PARTS, *MORE),
     "only": ("options",), "scene": (*_FOLLOWING, "shown"),
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
     "option": _FOLLOWING, "model": ("embed", "foreground"),

@@ -9,8 +9,9 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import field as bench_field
-from edge_server.experiments.bench import ingest, peer
+from edge_server.experiments.bench import ingest
 from edge_server.experiments.bench.ingest import CAMERAS, TARGET_P99_MS
+from edge_server.experiments.bench.peer import race
 from edge_server.fields.ngp import settings
 from tests.conftest import data_dir
 
@@ -183,11 +184,15 @@ def test_limits(tmp_path):
 @pytest.mark.slow
 def test_peers_are_raced_on_recorded_data(tmp_path, monkeypatch):
     monkeypatch.setenv("FRESHFIELD_DATA", str(data_dir("lego_synthetic").parent))
-    monkeypatch.setattr(peer, "QUICK_S", 5.0)
-    monkeypatch.setattr(peer, "SCALES", {"lego": 8.0})
+    monkeypatch.setenv("PATH", "")  # a program opensplat would be raced too
+    monkeypatch.setattr(race, "QUICK", (5.0, 2))
+    monkeypatch.setattr(race, "SCALES", {"lego": 8.0, "kitchen": 4.0})
     found = bench("peer", tmp_path / "bench.json")
-    assert found["lego"]["ngp"]["20_db_s"] < 5.0
-    assert found["lego"]["plain_torch"]["20_db_ratio"] > 1.0
+    assert found["missing"]["opensplat"] == "no program opensplat on the PATH"
+    ours = [found["lego"]["ngp"][seed]["seconds_to"]["20"] for seed in "01"]
+    theirs = found["lego"]["ngp in plain torch"]["0"]
+    assert max(ours) < 5.0 and (theirs["seconds_to"]["20"] or 5.0) > max(ours)
+    assert "opensplat`: left out" in (tmp_path / "bench.md").read_text()
 
 
 @pytest.mark.slow
