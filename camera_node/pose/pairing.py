@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import PairedPose, PoseGapError, sample_at
+from camera_node.pose.providers import PoseGapError, sample_at
 from freshfield.geometry import Pose, cross_matrix, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
@@ -25,11 +25,6 @@ Interpolate = Callable[[T, T, float], T]
 Joints = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-4
-
-
-def interpolate_linear(a: Pose, b: Pose, fraction: float) -> Pose:
-    """Slerp and a straight line between the two origins."""
-    return a.interpolate(b, fraction)
 
 
 def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
@@ -40,12 +35,12 @@ def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
     omega = so3_log(step[:3, :3])
     out = np.eye(4)
     out[:3, :3] = so3_exp(fraction * omega)
-    velocity = np.linalg.solve(_left_jacobian(omega), step[:3, 3])
-    out[:3, 3] = fraction * _left_jacobian(fraction * omega) @ velocity
+    velocity = np.linalg.solve(left_jacobian(omega), step[:3, 3])
+    out[:3, 3] = fraction * left_jacobian(fraction * omega) @ velocity
     return Pose.from_matrix(start @ out)
 
 
-def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
+def left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3): translation of exp((omega, v)) over v; Barfoot, State Estimation for Robotics, (7.37)."""
     angle = float(np.linalg.norm(omega))
     if angle < _SMALL_ANGLE:
@@ -78,14 +73,6 @@ class PairingCounts:
     restarts: int = 0
     paired: int = 0
     refused: int = 0
-
-
-@dataclass(frozen=True)
-class PairedSample(Generic[T]):
-    """A sample for an instant, and the time (ns) from that instant to the nearest sample used."""
-
-    sample: T
-    gap_ns: int
 
 
 class SampleBuffer(Generic[T]):
@@ -133,8 +120,8 @@ class SampleBuffer(Generic[T]):
             self._prune()
             return True
 
-    def at(self, t_ns: int) -> PairedSample[T]:
-        """The sample for an instant. Raises PoseGapError where none is near enough."""
+    def at(self, t_ns: int) -> tuple[T, int]:
+        """See ``PoseProvider``, of whatever samples these are."""
         with self._lock:
             try:
                 found = sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
@@ -142,7 +129,7 @@ class SampleBuffer(Generic[T]):
                 self.counts.refused += 1
                 raise
             self.counts.paired += 1
-            return PairedSample(*found)
+            return found
 
     def ready(self, t_ns: int) -> bool:
         """Whether a sample as new as the instant has come; until then the newest one would be repeated."""
@@ -167,22 +154,6 @@ class SampleBuffer(Generic[T]):
         if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
             first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
             del self._times[:first], self._samples[:first]
-
-
-class PoseBuffer(SampleBuffer[Pose]):
-    """Poses of an arm as they come in, as a ``PoseProvider``."""
-
-    def __init__(
-        self,
-        interpolate: Interpolate[Pose] | None = interpolate_screw,
-        max_gap_ns: int = 50_000_000,
-        keep_ns: int = 2_000_000_000,
-    ) -> None:
-        super().__init__(interpolate, max_gap_ns, keep_ns)
-
-    def at(self, t_ns: int) -> PairedPose:  # type: ignore[override]
-        found = super().at(t_ns)
-        return PairedPose(found.sample, found.gap_ns)
 
 
 def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], PairingCounts]:

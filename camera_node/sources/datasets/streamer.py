@@ -133,8 +133,8 @@ class VideoSource(Source):
 
     def read(self, content: int) -> Shot:
         fps = self._playback.recorded_fps
-        paired = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
-        return Shot(self._image(content), paired.pose, self.intrinsics, paired.gap_ns)
+        pose, gap_ns = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
+        return Shot(self._image(content), pose, self.intrinsics, gap_ns)
 
     def release(self) -> None:
         if self._clip is not None:

@@ -114,8 +114,8 @@ class LiveSource(Source):
             assert self._newest is not None
             captured_ns, image = self._newest
             self._newest = None
-        paired = self._poses.at(captured_ns)
-        return Shot(image, paired.pose, self.intrinsics, paired.gap_ns, captured_ns)
+        pose, gap_ns = self._poses.at(captured_ns)
+        return Shot(image, pose, self.intrinsics, gap_ns, captured_ns)
 
     def close(self) -> None:
         """End the thread, which closes the camera."""

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.bounds import Bounded
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, read_section
 
@@ -56,24 +57,11 @@ class EffectError(ScenarioError):
     """An effect that cannot be applied as listed; the message says what is valid."""
 
 
-def bounded(default: float, lowest: float, highest: float) -> Any:
-    """Field of EffectParameters with a default and a range."""
-    return field(default=default, metadata={"range": (lowest, highest)})
-
-
 @dataclass(frozen=True)
-class EffectParameters:
-    """in_truth: whether the effect applies to held-out cameras as well. Raises ValueError, in one line, for a
-    value outside the range of its field."""
+class EffectParameters(Bounded):
+    """in_truth: whether the effect applies to held-out cameras as well."""
 
     in_truth: bool = field(default=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        for parameter in fields(self):
-            lowest, highest = parameter.metadata.get("range", (None, None))
-            value = getattr(self, parameter.name)
-            if lowest is not None and not lowest <= value <= highest:  # refuses NaN, too
-                raise ValueError(f"{parameter.name} must be within {lowest:g} to {highest:g}, got {value}")
 
 
 def effect_class(name: str) -> Any:

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 import cv2
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import phase_of
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, frame_rng
 
 if TYPE_CHECKING:
     from camera_node.synthetic.render import Image

@@ -12,7 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectError, EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectError, EffectParameters
 from freshfield.geometry import Pinhole, invertible
 
 

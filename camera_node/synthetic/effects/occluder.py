@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import PERIOD_UNIT_S, bone_frames, phase_of
 from camera_node.synthetic.placement import MovingBody, Part
 from camera_node.synthetic.shapes import capsule

@@ -10,7 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, frame_rng
 from freshfield.geometry import Array, Pose, so3_exp
 
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.lighting import Light, SpecularReflection, SurfacePoints, direct_light
 from camera_node.synthetic.placement import PlacedParts, place_parts
 from camera_node.synthetic.render import blocked

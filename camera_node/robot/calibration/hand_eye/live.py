@@ -177,7 +177,7 @@ def guide(
         if t_ns is None:
             t_ns = round(tick * 10**9 / source.fps)
         try:
-            hand = shot.pose if hands is None else hands.at(t_ns - begin_ns).pose
+            hand = shot.pose if hands is None else hands.at(t_ns - begin_ns)[0]
         except ValueError as error:
             live_camera.report_skipped(error)
             continue
