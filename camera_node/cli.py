@@ -129,7 +129,7 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
 
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
     """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
-    from camera_node.build import build_cameras
+    from camera_node.capture import build_cameras
     from camera_node.config import source_config
 
     level = logging.WARNING if args.quiet else logging.INFO
@@ -147,7 +147,7 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Cam
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from camera_node.prepare import prepare
+    from camera_node.capture import prepare
 
     _, cameras = _open(args, DEFAULT_CACHE_MB)
     prepare(cameras, lambda: False)

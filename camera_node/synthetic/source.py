@@ -10,19 +10,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from camera_node.config import SourceConfig, WorldConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.playback import rate
 from camera_node.synthetic import Scene, make_scene
-from camera_node.synthetic.effects import NO_EFFECTS, EffectError
+from camera_node.synthetic.effects import NO_EFFECTS, EffectError, Effects
 from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Effects
 
 log = logging.getLogger("camera-node")
 

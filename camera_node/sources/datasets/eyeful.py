@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import EyefulConfig
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
 from camera_node.sources.datasets.records import (
@@ -46,17 +45,6 @@ class _Entry:
     name: str
     lens: Lens
     camera_to_world: np.ndarray
-
-
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    data = read_json(file) if file.suffix == ".json" else None
-    return isinstance(data, dict) and "KRT" in data
-
-
-def from_config(path: Path, config: EyefulConfig) -> Dataset:
-    """See ``formats.Reader``."""
-    return load_dataset(path, ImageOptions(config.scale), config.images)
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:

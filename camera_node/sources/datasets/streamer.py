@@ -16,7 +16,7 @@ from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, fi
 from camera_node.pose.providers import FixedPose, PoseProvider, TrajectoryError, read_tum
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source
-from camera_node.sources.datasets.formats import reader
+from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage
 from camera_node.sources.datasets.video import VideoRig, open_clip
@@ -38,7 +38,7 @@ def open_recorded(
 ) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``."""
     path = find_data(config.data, scenario, data)
-    found = reader(config.kind).from_config(path, config)
+    found = open_configured(path, config)
     if isinstance(found, VideoRig):
         return _video_sources(scenario, config, cameras, found, path)
     if found.moving or found.per_camera:

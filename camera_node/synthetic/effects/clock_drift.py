@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class ClockDrift:
     microsecond. offset_ns, drift_ppb: of this camera.
     """
 
-    kind: ClassVar[str] = "clock"
+    kind = "clock"
     Parameters = ClockDriftParameters
 
     def __init__(self, parameters: ClockDriftParameters, rng: np.random.Generator) -> None:

@@ -10,17 +10,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
+from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class FogParameters(EffectParameters):
 class Fog:
     """Rendered ahead; free while streaming. A scene's background is all fog."""
 
-    kind: ClassVar[str] = "world"
+    kind = "world"
     Parameters = FogParameters
 
     def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:

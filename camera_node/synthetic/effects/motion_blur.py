@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from camera_node.bounds import bounded
-from camera_node.synthetic.effects import EffectParameters
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Renderer
-    from camera_node.synthetic.render import Image, Rows
+from camera_node.synthetic.effects import EffectParameters, Renderer
+from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
@@ -27,7 +23,7 @@ class MotionBlur:
     """The time stamp is the middle of the exposure, so that blur adds no age. Displayed values are averaged,
     as everywhere in this world. Costs ``samples`` renderings a frame, ahead; free while streaming."""
 
-    kind: ClassVar[str] = "exposure"
+    kind = "exposure"
     Parameters = MotionBlurParameters
 
     def __init__(self, parameters: MotionBlurParameters, rng: np.random.Generator) -> None:

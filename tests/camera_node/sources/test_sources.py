@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras, prepare
 from camera_node.config import source_config
-from camera_node.prepare import prepare
 from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene
 from freshfield import payload

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
-from camera_node.capture import Camera
+from camera_node.capture import Camera, build_cameras
 from camera_node.config import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES

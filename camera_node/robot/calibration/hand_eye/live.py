@@ -9,14 +9,17 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import sort_samples
 from camera_node.pose.providers import PoseProvider, Trajectory, TrajectoryError, read_samples
+from camera_node.robot.arm.camera_poses import base_matrix
+from camera_node.robot.arm.drive import stop_signals
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
+from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.calibration import ArmStopped, CalibrationError, live_camera
 from camera_node.robot.calibration.files import pairs_json, read_pairs
+from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, HandEyeSession, HandEyeStep, preview
@@ -25,9 +28,6 @@ from camera_node.robot.calibration.targets import Target
 from camera_node.sources.base import Source
 from freshfield import files, scenario
 from freshfield.geometry import Pinhole, se3_inverse
-
-if TYPE_CHECKING:
-    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
 
 def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
@@ -118,10 +118,6 @@ def _create_writable(folder: Path) -> None:
 def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
     """Connect to the arm. From now on a termination signal stops a move first. Raises CalibrationError and
     ScenarioError."""
-    from camera_node.robot.arm.drive import stop_signals
-    from camera_node.robot.arm.joint_states import ArmError
-    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
-
     try:
         mover = ArmMover(loaded, arm, agreed_to)
     except ArmError as error:
@@ -135,8 +131,6 @@ def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Arm
 def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
     """Base-from-world (4, 4), because the arm's poses are in the world and the calibration needs them in its
     base. Raises CalibrationError."""
-    from camera_node.robot.arm.camera_poses import base_matrix
-
     if camera not in arm.cameras or arm.cameras[camera] is not None:
         raise CalibrationError(
             f"{loaded.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from camera_node.config import ArmConfig
 from camera_node.pose.pairing import sort_samples
+from camera_node.robot.arm.camera_poses import arm_model
+from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, HandEyeStep
 from freshfield import files
+from freshfield.clock import WallClock
 from freshfield.geometry import Pose
-
-if TYPE_CHECKING:
-    from camera_node.config import ArmConfig
-    from camera_node.robot.arm.joint_states import ArmStream
-    from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario
 
 HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
 # Motion with the target in sight. The offset's deviation falls with the square root of its duration.
@@ -88,9 +87,6 @@ class StreamRecorder:
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
     Raises CalibrationError."""
-    from camera_node.robot.arm.camera_poses import arm_model
-    from camera_node.robot.arm.joint_states import ArmStream
-    from freshfield.clock import WallClock
 
     def add_hand(t_ns: int, joints: Array) -> None:
         tracks.add_hand(t_ns, model.forward(joints))

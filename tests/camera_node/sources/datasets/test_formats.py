@@ -110,7 +110,7 @@ def test_dynerf_damage_is_named(tmp_path):
 
 def test_zju_sees_points_where_they_are(tmp_path):
     cameras = sets.rig(3, BENT)
-    dataset = zju.load_dataset(sets.write_zju(tmp_path, cameras), fps=10.0)
+    dataset = zju.load_dataset(sets.write_zju(tmp_path, cameras), recorded_fps=10.0)
     assert dataset.moving and dataset.cameras == ("Camera_B1", "Camera_B2", "Camera_B3")
     first = [dataset.of(name)[0] for name in dataset.cameras]
     agree(first, cameras)
