@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from camera_node.config import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
-from camera_node.sources.playback import rate
+from camera_node.sources.base import rate
 from freshfield import transport
 from freshfield.clock import OffsetEstimator, WallClock
 from freshfield.scenario import Scenario, load

@@ -15,7 +15,7 @@ from freshfield.scenario import load
 read_config(load("room"))
 """
 NODE = """
-import camera_node.node, camera_node.build, camera_node.cli
+import camera_node.node, camera_node.capture, camera_node.cli
 import camera_node.robot.arm.hand_eye_mount, camera_node.pose.pairing
 """
 NODE_WITHOUT_ARM = """

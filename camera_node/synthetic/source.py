@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import cast
 
 from camera_node.config import SourceConfig, WorldConfig
-from camera_node.sources.base import Shot, Source
-from camera_node.sources.playback import rate
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, EffectError, Effects
 from camera_node.synthetic.frame_cache import FrameCache

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.pose.pairing import Interpolate, PairingCounts, SampleBuffer, interpolate_screw
+from camera_node.pose.pairing import Interpolate, SampleBuffer, interpolate_screw
 from camera_node.robot import figures
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
@@ -208,10 +208,7 @@ def streams(
     targets = simulated.add_noise(targets, rng, _DETECTION_RAD, _DETECTION_M)
     hand_ns = np.round((hand_s + offset_s) * 1e9).astype(np.int64)
     seen_ns = np.round(seen_s * 1e9).astype(np.int64)
-    return (
-        Track(hand_ns, hands, PairingCounts(samples=len(hand_s))),
-        Track(seen_ns, targets, PairingCounts(samples=len(seen_s))),
-    )
+    return Track(hand_ns, hands), Track(seen_ns, targets)
 
 
 def format_table(name: str, rows: Rows) -> str:

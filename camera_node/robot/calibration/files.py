@@ -6,7 +6,7 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -40,7 +40,16 @@ class Track:
 
     times_ns: NDArray[np.int64]
     poses: Array
-    counts: PairingCounts
+    counts: PairingCounts = field(default_factory=PairingCounts)
+
+
+def sorted_track(times_ns: Sequence[int], poses: Sequence[Array], what: str) -> Track:
+    """The track of poses (4, 4) as they came. what: they are, for messages. Raises CalibrationError for fewer
+    than two."""
+    times_ns, poses, counts = sort_samples(times_ns, poses)
+    if len(times_ns) < 2:
+        raise CalibrationError(f"{len(times_ns)} {what}: a time offset needs many of a moving hand")
+    return Track(np.array(times_ns, dtype=np.int64), np.array(poses), counts)
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
@@ -79,10 +88,7 @@ def read_track(file: Path) -> Track:
         times, poses = read_samples(file)
     except TrajectoryError as error:
         raise CalibrationError(str(error)) from None
-    times, poses, counts = sort_samples(times, poses)
-    if len(times) < 2:
-        raise CalibrationError(f"{file}: {len(times)} poses; a moving hand needs many")
-    return Track(np.array(times, dtype=np.int64), np.array([p.matrix() for p in poses]), counts)
+    return sorted_track(times, [pose.matrix() for pose in poses], f"poses in {file}")
 
 
 def read_visp_pose(file: Path) -> Array:

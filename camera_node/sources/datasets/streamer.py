@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, find_data
 from camera_node.pose.providers import FixedPose, PoseProvider, TrajectoryError, read_tum
 from camera_node.sources.assignment import assign_cameras
-from camera_node.sources.base import Shot, Source
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage
 from camera_node.sources.datasets.video import VideoRig, open_clip
 from camera_node.sources.datasets.video_clip import Clip
-from camera_node.sources.playback import Playback, rate
 from freshfield import payload
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
@@ -31,6 +31,28 @@ PHOTO_FPS = 10.0
 # Videos only decode forwards: on the way back, this many (shrunk) frames are decoded at once.
 _BLOCK = 12
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Which frame a tick shows: ``count`` of them, recorded at ``recorded_fps`` and captured at ``fps``.
+
+    back_and_forth: 0 1 2 3 2 1 0 1 ..., so that motion never jumps; otherwise 0 1 2 3 0 1 ...
+    """
+
+    count: int
+    fps: Fraction
+    recorded_fps: Fraction
+    back_and_forth: bool = True
+
+    def frame(self, tick: int) -> int:
+        """The frame nearest to the tick's instant."""
+        position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
+        if not self.back_and_forth:
+            return int(position % self.count)
+        period = max(1, 2 * (self.count - 1))
+        place = int(position % period)
+        return place if place < self.count else period - place
 
 
 def open_recorded(

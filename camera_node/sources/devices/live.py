@@ -18,9 +18,8 @@ from typing import Any
 
 from camera_node.config import LiveConfig
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.sources.base import Shot, Source
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
-from camera_node.sources.playback import rate
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.clock import Clock, WallClock
 from freshfield.geometry import Pinhole

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from camera_node.config import ArmConfig
-from camera_node.pose.pairing import sort_samples
 from camera_node.robot.arm.camera_poses import arm_model
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.files import Track, sorted_track
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, HandEyeStep
 from freshfield import files
@@ -68,11 +65,11 @@ class StreamRecorder:
 
     def hand(self) -> Track:
         """The hand's stream. Raises CalibrationError for fewer than two poses."""
-        return _track(list(self._hands), "joint states")
+        return sorted_track(*_columns(self._hands), "joint states")
 
     def target(self) -> Track:
         """The target's stream. Raises CalibrationError for fewer than two poses."""
-        return _track(self._targets, "sightings of the target")
+        return sorted_track(*_columns(self._targets), "sightings of the target")
 
     def write(self, folder: Path) -> None:
         """Write ``hand.csv`` and ``target.csv``. Raises CalibrationError."""
@@ -100,11 +97,8 @@ def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) ->
     return stream
 
 
-def _track(rows: list[tuple[int, Array]], what: str) -> Track:
-    times, poses, counts = sort_samples([t for t, _ in rows], [pose for _, pose in rows])
-    if len(times) < 2:
-        raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving hand")
-    return Track(np.array(times, dtype=np.int64), np.array(poses), counts)
+def _columns(rows: list[tuple[int, Array]]) -> tuple[list[int], list[Array]]:
+    return [t_ns for t_ns, _ in list(rows)], [pose for _, pose in list(rows)]
 
 
 def _line(t_ns: int, pose: Array) -> str:

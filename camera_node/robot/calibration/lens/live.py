@@ -13,9 +13,9 @@ from camera_node.robot.calibration import CalibrationError, live_camera
 from camera_node.robot.calibration.lens.session import LensSession
 from camera_node.robot.calibration.lens.solve import LensCalibration
 from camera_node.robot.calibration.targets import Target
+from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import as_camera_error
 from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
-from camera_node.sources.playback import rate
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
