@@ -129,10 +129,7 @@ def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypat
         assert one.payload != later.payload
 
 
-def test_effects_that_need_a_world_are_refused_elsewhere(tmp_path):
-    scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={"motion_blur": None})
-    with pytest.raises(ScenarioError, match="need source kind world"):
-        build_cameras(scenario, source_config(scenario), scenario.cameras)
+def test_an_unknown_effect_is_named(tmp_path):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={"sensor_nois": None})
     with pytest.raises(ScenarioError, match=r"source.effects.*sensor_nois"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)

@@ -178,3 +178,15 @@ def test_each_effect_has_its_own_random_stream():
     alone = fx.load_effects({"sensor_noise": {}}, rng_for)
     among = fx.load_effects({"clock_drift": {}, "motion_blur": {}, "sensor_noise": {}}, rng_for)
     assert np.array_equal(alone.apply(image, 0, 0.0), among.apply(image, 0, 0.0))
+
+
+@pytest.mark.parametrize("name", ["fog", "lens_distortion", "occluder", "shadows", "specular"])
+def test_an_effect_leaves_the_original_scene_as_it_is(name):
+    scene = make_scene("room", {"width": 32, "height": 32, "supersample": 1})
+    world, cameras, before = scene.world, scene.cameras, scene.render("cam01", 0.4)
+    listed = {name: {"visibility_m": 1.0} if name == "fog" else {}}
+    changed = fx.load_effects(listed, lambda _: np.random.default_rng(0)).extend(scene)
+    assert not np.array_equal(changed.render("cam01", 0.4), before)
+    assert scene.world is world and scene.cameras is cameras and len(world.moving_bodies) == 1
+    assert np.array_equal(scene.render("cam01", 0.4), before)
+    assert np.array_equal(scene.view(*cameras["cam01"]).image(0.4), before)
