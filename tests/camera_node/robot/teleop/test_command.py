@@ -19,12 +19,7 @@ from camera_node.robot.teleop import sinks
 from camera_node.robot.teleop.network_stylus import encode
 from camera_node.robot.teleop.teleoperator import Command
 from freshfield.clock import WallClock
-from tests.camera_node.robot.arm.simulated import (
-    simulated_arm,
-    start_cli,
-    wait_until_moving,
-    write_cell,
-)
+from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 from tests.camera_node.robot.teleop.checks import HOME, sample
 
 
