@@ -83,17 +83,14 @@ class StreamRecorder:
 
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
-    Raises CalibrationError."""
+    Raises ScenarioError and ArmError."""
 
     def add_hand(t_ns: int, joints: Array) -> None:
         tracks.add_hand(t_ns, model.forward(joints))
 
-    try:
-        model = arm_model(scenario, config)
-        stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=add_hand)
-        stream.start()
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
+    model = arm_model(scenario, config)
+    stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=add_hand)
+    stream.start()
     return stream
 
 
