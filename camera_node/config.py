@@ -6,8 +6,10 @@ needs the data itself (does the folder hold this camera?) is checked when the so
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -285,6 +287,15 @@ MODELS: dict[str, type[SourceConfig]] = {
     "oak": OakConfig,
     "realsense": RealsenseConfig,
 }
+
+
+@contextlib.contextmanager
+def errors_of(where: str) -> Iterator[None]:
+    """A ValueError within becomes a ScenarioError that begins with ``where``: the file and key it is about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {error}") from None
 
 
 def source_config(scenario: Scenario) -> SourceConfig:

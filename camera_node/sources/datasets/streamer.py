@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, find_data
-from camera_node.pose.providers import FixedPose, PoseProvider, TrajectoryError, read_tum
+from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
+from camera_node.pose.providers import FixedPose, PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.datasets.formats import open_configured
@@ -212,20 +212,16 @@ def _video_sources(
 
 def _trajectory_poses(config: TrajectoryConfig, camera: str, base: Path, where: str) -> PoseProvider:
     """Poses of one camera in the clip's time, from the TUM file that the scenario names."""
-    try:
+    with errors_of(f"{where}.files.{camera}"):
         poses = read_tum(
             base / config.files[camera],
             config.pairing == "interpolated",
             round(config.max_gap_ms * 1e6),
             round(config.start_s * 1e9),
         )
-    except TrajectoryError as error:
-        raise ScenarioError(f"{where}.files.{camera}: {error}") from None
     if not config.hand_eye:
         return poses
-    from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
+    from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 
-    try:
+    with errors_of(f"{where}.hand_eye"):
         return read_hand_eye(base / config.hand_eye).camera_poses(poses)
-    except HandEyeError as error:
-        raise ScenarioError(f"{where}.hand_eye: {error}") from None
