@@ -291,7 +291,7 @@ MODELS: dict[str, type[SourceConfig]] = {
 
 @contextlib.contextmanager
 def errors_of(where: str) -> Iterator[None]:
-    """A ValueError within becomes a ScenarioError that begins with ``where``: the file and key it is about."""
+    """A ValueError within becomes a ScenarioError that begins with ``where``: file and key."""
     try:
         yield
     except ValueError as error:
