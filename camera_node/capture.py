@@ -1,17 +1,24 @@
-"""Shots as they are sent: compressed once, cached while there is room."""
+"""Cameras of a scenario and their shots as they are sent: compressed once, cached while there is room."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
 from camera_node.config import SourceConfig
 from camera_node.sources.base import Source
+from camera_node.sources.registry import open_sources
+from camera_node.sources.with_effects import camera_effects
 from freshfield import payload
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole, Pose
+from freshfield.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -121,3 +128,52 @@ class Camera:
             data = payload.encode(data, self.codec, self._quality)
         payload.check(data, self.codec, shot.intrinsics.width, shot.intrinsics.height)
         return EncodedShot(data, shot.pose, shot.intrinsics, shot.pose_gap_ns, shot.captured_ns)
+
+
+def build_cameras(
+    scenario: Scenario,
+    config: SourceConfig,
+    cameras: Sequence[str],
+    data: Path | None = None,
+    cache_bytes: int = 64 * 2**20,
+) -> list[Camera]:
+    """Open the sources of ``cameras``, in the scenario's order, with one cache for all.
+
+    data: folder of the data sets, else $FRESHFIELD_DATA.
+    cache_bytes: bound on compressed shots kept.
+
+    Raises ScenarioError, DatasetError, CameraError or ArmError, each with one line for a person.
+    """
+    effects = {camera: camera_effects(scenario, config, camera) for camera in cameras}
+    sources = open_sources(scenario, config, cameras, data, effects)
+    cache = ShotCache(cache_bytes)
+    clock_errors = {c: made for c, made in effects.items() if made is not None and made.clock}
+    return [Camera(sources[c], config, cache, clock_errors.get(c)) for c in scenario.cameras if c in sources]
+
+
+def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
+    """Fill the cache with the shots of each camera whose shots all fit, and free what made them.
+
+    Shots that do not all fit are made as they are captured: making a part of them now would delay the first
+    frame and save little.
+    """
+    for camera in cameras:
+        camera.source.prepare(stopped)
+        contents = camera.source.contents
+        if contents is None or not camera.fits():
+            continue
+        for content in range(contents):
+            if stopped():
+                return
+            try:
+                camera.shot(content)
+            except (ValueError, OSError):
+                continue  # counted when the capture is due
+        camera.source.release()
+    return_memory()
+
+
+def return_memory() -> None:
+    """Hand freed memory back to the system where the C library can (glibc keeps it otherwise)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -56,11 +56,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     _add_cameras(prepare)
     prepare.add_argument("-q", "--quiet", action="store_true", help="only warnings")
+    prepare.set_defaults(run=_prepare)
     calibrate.add_arguments(
         commands.add_parser("calibrate", help="hand-eye, intrinsics, and what they are worth")
     )
-    commands.add_parser("sources", help="list kinds of sources and the keys they take")
-    commands.add_parser("effects", help="list effects and their parameters")
+    sources = commands.add_parser("sources", help="list kinds of sources and the keys they take")
+    effects = commands.add_parser("effects", help="list effects and their parameters")
+    for each in (sources, effects):
+        each.set_defaults(run=_print_list)
     arm_cli.add_commands(commands)
     _add_doctor(commands.add_parser(
         "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
@@ -69,22 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     ))  # fmt: skip
     args = parser.parse_args(arguments)
     try:
-        if args.command == "run":
-            return _run(args)
-        if args.command == "prepare":
-            return _prepare(args)
-        if args.command in arm_cli.COMMANDS:
-            return arm_cli.run(args)
-        if args.command == "calibrate":
-            return calibrate.run(args)
-        if args.command == "doctor":
-            from camera_node import doctor
-
-            return doctor.run(args)
-        from camera_node import listing
-
-        print(listing.sources() if args.command == "sources" else listing.effects())
-        return 0
+        return int(args.run(args))
     except (UsageError, CalibrationError, ScenarioError, transport.TransportError) as error:
         print(f"camera-node: {error}", file=sys.stderr)
         return 2
@@ -100,6 +88,7 @@ def _add_cameras(command: argparse.ArgumentParser) -> None:
 
 
 def _add_run(run: argparse.ArgumentParser) -> None:
+    run.set_defaults(run=_run)
     _add_cameras(run)
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="channel emulator or edge server")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder for the ledger and the status file")
@@ -117,6 +106,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 
 
 def _add_doctor(doctor: argparse.ArgumentParser) -> None:
+    doctor.set_defaults(run=_doctor)
     doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
     doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
     doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
@@ -129,13 +119,10 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
 
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
     """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
-    from camera_node.build import build_cameras
+    from camera_node.capture import build_cameras
     from camera_node.config import source_config
 
-    level = logging.WARNING if args.quiet else logging.INFO
-    logging.basicConfig(
-        level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
-    )
+    arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
     scenario = load(args.scenario, args.seed)
     try:
         cameras = build_cameras(
@@ -146,8 +133,21 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Cam
     return scenario, cameras
 
 
+def _print_list(args: argparse.Namespace) -> int:
+    from camera_node import listing
+
+    print(listing.sources() if args.command == "sources" else listing.effects())
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from camera_node import doctor
+
+    return doctor.run(args)
+
+
 def _prepare(args: argparse.Namespace) -> int:
-    from camera_node.prepare import prepare
+    from camera_node.capture import prepare
 
     _, cameras = _open(args, DEFAULT_CACHE_MB)
     prepare(cameras, lambda: False)

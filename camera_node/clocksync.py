@@ -24,7 +24,6 @@ class ClockSync:
         self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock
     ) -> None:
         self._channel = channel
-        self._stub = rpc.ClockServiceStub(channel)
         self._metadata = metadata
         self._clock = clock
         self._estimator = OffsetEstimator()  # the first one is used from its first exchange on
@@ -38,7 +37,11 @@ class ClockSync:
         while True:
             # A call made while the connection is being set up would count that as a round trip.
             await self._channel.channel_ready()
-            if await self._exchange(fresh):
+            try:
+                answered = await exchange(self._channel, self._metadata, self._clock, fresh, PERIOD_S)
+            except (grpc.RpcError, grpc.aio.BaseError):
+                answered = False  # the senders log what is wrong with the peer
+            if answered:
                 exchanges += 1
             else:
                 # After a silence the peer may be another process with another clock: start afresh, but
@@ -48,15 +51,20 @@ class ClockSync:
                 self._estimator = fresh
             await asyncio.sleep(_FIRST_PERIOD_S if 0 < exchanges < _FIRST else PERIOD_S)
 
-    async def _exchange(self, estimator: OffsetEstimator) -> bool:
-        sent = self._clock.now_ns()
-        try:
-            answer = await self._stub.Exchange(
-                pb.ExchangeRequest(client_sent_ns=sent), timeout=PERIOD_S, metadata=self._metadata
-            )
-        except (grpc.RpcError, grpc.aio.BaseError):
-            return False  # the senders log what is wrong with the peer
-        if answer is None or answer.client_sent_ns != sent:
-            return False
-        estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, self._clock.now_ns())
-        return True
+
+async def exchange(
+    channel: grpc.aio.Channel,
+    metadata: tuple[tuple[str, str], ...],
+    clock: Clock,
+    estimator: OffsetEstimator,
+    timeout_s: float,
+) -> bool:
+    """Ask the peer for its time once; whether it answered. Raises grpc.RpcError, and grpc.aio.BaseError."""
+    sent = clock.now_ns()
+    answer = await rpc.ClockServiceStub(channel).Exchange(
+        pb.ExchangeRequest(client_sent_ns=sent), timeout=timeout_s, metadata=metadata
+    )
+    if answer is None or answer.client_sent_ns != sent:
+        return False
+    estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, clock.now_ns())
+    return True

@@ -6,12 +6,15 @@ needs the data itself (does the folder hold this camera?) is checked when the so
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from camera_node.bounds import Bounded, bounded, one_of
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.payload import CODECS
 from freshfield.scenario import Scenario, ScenarioError, read_section
@@ -23,20 +26,8 @@ BACKGROUNDS = ("white", "black", "keep")
 ROBOTS = ("ur3e",)
 
 
-def _check(config: Any, **allowed: tuple[Any, Any] | tuple[str, ...]) -> None:
-    """ValueError unless each of these keys has one of the names, or a number within the two bounds, that are
-    allowed; None is not checked."""
-    for key, values in allowed.items():
-        value = getattr(config, key)
-        if isinstance(values[0], str):
-            if value not in values:
-                raise ValueError(f"{key} is {value!r}, expected one of {', '.join(values)}")
-        elif value is not None and not values[0] <= value <= values[1]:
-            raise ValueError(f"{key} is {value:.10g}, expected {values[0]:.10g} to {values[1]:.10g}")
-
-
 @dataclass(frozen=True)
-class SourceConfig:
+class SourceConfig(Bounded):
     """Keys of every kind.
 
     fps: captures a second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
@@ -45,17 +36,14 @@ class SourceConfig:
     """
 
     kind: str
-    fps: float | None = None
-    codec: str = "jpeg"
-    quality: int = 92
+    fps: float | None = bounded(None, 0.01, 1000)
+    codec: str = one_of("jpeg", CODECS)
+    quality: int = bounded(92, 1, 100)
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        _check(self, fps=(0.01, 1000), codec=CODECS, quality=(1, 100))
 
 
 @dataclass(frozen=True)
-class PathConfig:
+class PathConfig(Bounded):
     """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
 
     target_m: in the world. radius_m: camera to target. elevations_deg: of the rings. azimuths_deg:
@@ -66,28 +54,18 @@ class PathConfig:
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    radius_m: float = 0.35
-    elevations_deg: tuple[float, ...] = (45.0, 65.0)
+    radius_m: float = bounded(0.35, 1e-3, math.inf)
+    elevations_deg: tuple[float, ...] = bounded((45.0, 65.0), -89.0, 89.0)
     azimuths_deg: tuple[float, float] = (-90.0, 90.0)
-    step_deg: float = 15.0
-    rolls_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
-    speed_rad_s: float = 0.5
-    acceleration_rad_s2: float = 1.0
+    step_deg: float = bounded(15.0, 1.0, 120.0)
+    rolls_deg: tuple[float, ...] = bounded((0.0, 90.0, 180.0, 270.0), -360.0, 360.0)
+    speed_rad_s: float = bounded(0.5, 1e-4, 3.14)
+    acceleration_rad_s2: float = bounded(1.0, 1e-4, 40.0)
     floor_m: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not self.elevations_deg or not all(-89.0 <= e <= 89.0 for e in self.elevations_deg):
-            raise ValueError("elevations_deg: expected one or more from -89 to 89")
-        if not self.radius_m > 0 or not 1.0 <= self.step_deg <= 120.0:
-            raise ValueError("expected radius_m above 0 and step_deg from 1 to 120")
-        if not self.rolls_deg or not all(-360.0 <= turn <= 360.0 for turn in self.rolls_deg):
-            raise ValueError("rolls_deg: expected one or more from -360 to 360")
-        if not 0 < self.speed_rad_s <= 3.14 or not 0 < self.acceleration_rad_s2 <= 40.0:
-            raise ValueError("expected speed_rad_s from 0 to 3.14 and acceleration_rad_s2 from 0 to 40")
 
 
 @dataclass(frozen=True)
-class ArmConfig:
+class ArmConfig(Bounded):
     """An arm whose joint states give cameras their poses (extra ``ur``).
 
     host: the controller's address. robot: ur3e. cameras: camera -> its hand-eye calibration, a file of
@@ -102,21 +80,19 @@ class ArmConfig:
 
     host: str
     cameras: dict[str, str | None]
-    robot: str = "ur3e"
+    robot: str = one_of("ur3e", ROBOTS)
     calibration: str | None = None
     base_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     base_yaw_deg: float = 0.0
-    frequency_hz: float = 125.0
-    pairing: str = "interpolated"
-    max_gap_ms: float = 20.0
+    frequency_hz: float = bounded(125.0, 10, 500)
+    pairing: str = one_of("interpolated", PAIRINGS)
+    max_gap_ms: float = bounded(20.0, 0, math.inf)
     path: PathConfig | None = None
     simulated: bool = False
     teleop: dict[str, Any] | None = None  # read by the command alone: a node that streams needs none of it
 
     def __post_init__(self) -> None:
-        _check(
-            self, robot=ROBOTS, frequency_hz=(10, 500), pairing=PAIRINGS, max_gap_ms=(0, math.inf)
-        )  # fmt: skip
+        super().__post_init__()
         if not self.cameras:
             raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
         # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
@@ -150,7 +126,7 @@ class WorldConfig(SourceConfig):
 
 
 @dataclass(frozen=True)
-class TrajectoryConfig:
+class TrajectoryConfig(Bounded):
     """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's.
 
     files: camera -> file. pairing: nearest or interpolated. max_gap_ms: a frame further than this from its
@@ -159,13 +135,10 @@ class TrajectoryConfig:
     """
 
     files: dict[str, str]
-    pairing: str = "interpolated"
-    max_gap_ms: float = 50.0
+    pairing: str = one_of("interpolated", PAIRINGS)
+    max_gap_ms: float = bounded(50.0, 0, math.inf)
     start_s: float = 0.0
     hand_eye: str = ""
-
-    def __post_init__(self) -> None:
-        _check(self, pairing=PAIRINGS, max_gap_ms=(0, math.inf))
 
 
 @dataclass(frozen=True)
@@ -175,21 +148,16 @@ class RecordedConfig(SourceConfig):
     camera -> the data set's camera, where the names differ."""
 
     data: str = ""
-    scale: float = 1.0
-    loop: str = "back-and-forth"
+    scale: float = bounded(1.0, 1, math.inf)
+    loop: str = one_of("back-and-forth", LOOPS)
     assignment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.data:
             raise ValueError("data: missing: the data set's folder or JSON file")
-        if self.scale < 1:
-            raise ValueError(f"scale is {self.scale:g}, expected 1 or more (2 halves the images)")
-        _check(self, loop=LOOPS)
-        if hasattr(self, "background"):
-            _check(self, background=BACKGROUNDS)
-            if self.background == "keep" and self.codec != "png":
-                raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
+        if getattr(self, "background", None) == "keep" and self.codec != "png":
+            raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
 
 
 @dataclass(frozen=True)
@@ -197,7 +165,7 @@ class TransformsConfig(RecordedConfig):
     """nerfstudio, instant-ngp, NeRF-synthetic. background: what goes under RGBA images;
     ``keep`` sends alpha and needs the codec png."""
 
-    background: str = "white"
+    background: str = one_of("white", BACKGROUNDS)
 
 
 @dataclass(frozen=True)
@@ -219,17 +187,12 @@ class LiveConfig(SourceConfig):
     until its first frame."""
 
     devices: dict[str, str] = field(default_factory=dict)
-    width: int = 640
-    height: int = 400
-    exposure_us: int | None = None
+    width: int = bounded(640, 8, MAX_IMAGE_SIDE_PX)
+    height: int = bounded(400, 8, MAX_IMAGE_SIDE_PX)
+    exposure_us: int | None = bounded(None, 1, 10**6)
     calibration: str | None = None
     arm: ArmConfig | None = None
-    first_frame_s: float = 3.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        side = (8, MAX_IMAGE_SIDE_PX)
-        _check(self, width=side, height=side, exposure_us=(1, 10**6), first_frame_s=(0.1, 60))
+    first_frame_s: float = bounded(3.0, 0.1, 60)
 
 
 @dataclass(frozen=True)
@@ -248,12 +211,8 @@ class OakConfig(LiveConfig):
     well as four coefficients describe it."""
 
     socket: str = "CAM_A"
-    iso: int = 400
+    iso: int = bounded(400, 100, 1600)
     rectify: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check(self, iso=(100, 1600))
 
 
 @dataclass(frozen=True)
@@ -272,13 +231,9 @@ class ZjuConfig(RecordedConfig):
     the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
     background: what goes behind the person."""
 
-    recorded_fps: float = 50.0
+    recorded_fps: float = bounded(50.0, 0.01, 1000)
     masks: str | None = None
-    background: str = "black"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check(self, recorded_fps=(0.01, 1000))
+    background: str = one_of("black", BACKGROUNDS)
 
 
 @dataclass(frozen=True)
@@ -296,7 +251,7 @@ class ColmapConfig(RecordedConfig):
     folder of images (default ``images``). background: what goes under transparent ones."""
 
     images: str | None = None
-    background: str = "white"
+    background: str = one_of("white", BACKGROUNDS)
 
 
 @dataclass(frozen=True)
@@ -307,14 +262,13 @@ class McapConfig(SourceConfig):
     recording's, where the names differ. fps, codec and quality are the recording's own."""
 
     file: str = ""
-    loop: str = "once"
+    loop: str = one_of("once", REPLAYS)
     assignment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.file:
             raise ValueError("file: missing: the recording")
-        _check(self, loop=REPLAYS)
         if self.effects:
             raise ValueError("effects: a recording is replayed as it was; leave them out")
 
@@ -333,6 +287,15 @@ MODELS: dict[str, type[SourceConfig]] = {
     "oak": OakConfig,
     "realsense": RealsenseConfig,
 }
+
+
+@contextlib.contextmanager
+def errors_of(where: str) -> Iterator[None]:
+    """A ValueError within becomes a ScenarioError that begins with ``where``: file and key."""
+    try:
+        yield
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {error}") from None
 
 
 def source_config(scenario: Scenario) -> SourceConfig:

@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from camera_node.config import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
-from camera_node.sources.playback import rate
+from camera_node.sources.base import rate
 from freshfield import transport
 from freshfield.clock import OffsetEstimator, WallClock
 from freshfield.scenario import Scenario, load
@@ -195,26 +195,21 @@ async def _exchange(target: str, security: transport.Transport) -> tuple[float, 
     import grpc
     import grpc.aio
 
-    from freshfield.v1 import clock_pb2, clock_pb2_grpc
+    from camera_node.clocksync import exchange
 
     estimator, clock = OffsetEstimator(), WallClock()
     async with security.aio_channel(target) as channel:
-        stub = clock_pb2_grpc.ClockServiceStub(channel)
         try:
             for _ in range(_EXCHANGES):
-                sent = clock.now_ns()
-                answer = await stub.Exchange(
-                    clock_pb2.ExchangeRequest(client_sent_ns=sent), timeout=_ANSWER_S,
-                    metadata=security.metadata(),
-                )  # fmt: skip
-                estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, clock.now_ns())
+                await exchange(channel, security.metadata(), clock, estimator, _ANSWER_S)
         except grpc.RpcError as error:
             raise CheckFailed(
                 f"{target} takes connections but does not speak with us ({error.code().name.lower()}): "  # type: ignore[attr-defined]
                 "is it an emulator or an edge server, and does it ask for --tls-* or --token-file?"
             ) from None
     found = estimator.estimate(clock.now_ns())
-    assert found is not None
+    if found is None:
+        raise CheckFailed(f"{target} does not tell its time: is it an emulator or an edge server?")
     return found.offset_ns / 1e6, found.uncertainty_ns / 1e6
 
 

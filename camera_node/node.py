@@ -16,11 +16,10 @@ from typing import Any
 
 import grpc.aio
 
-from camera_node.capture import Camera, EncodedShot
+from camera_node.capture import Camera, EncodedShot, prepare
 from camera_node.clocks import NodeClock
 from camera_node.clocksync import ClockSync
 from camera_node.outbox import Outbox
-from camera_node.prepare import prepare
 from camera_node.sender import Sender
 from freshfield.clock import Clock, WallClock
 from freshfield.files import write_json

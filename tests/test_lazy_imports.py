@@ -15,11 +15,11 @@ from freshfield.scenario import load
 read_config(load("room"))
 """
 NODE = """
-import camera_node.node, camera_node.build, camera_node.cli
+import camera_node.node, camera_node.capture, camera_node.cli
 import camera_node.robot.arm.hand_eye_mount, camera_node.pose.pairing
 """
 NODE_WITHOUT_ARM = """
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from freshfield.scenario import load
 build_cameras(load("tile"), source_config(load("tile")), ["cam00"])

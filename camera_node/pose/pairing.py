@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import PairedPose, PoseGapError, sample_at
+from camera_node.pose.providers import sample_at
 from freshfield.geometry import Pose, cross_matrix, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
@@ -25,11 +25,6 @@ Interpolate = Callable[[T, T, float], T]
 Joints = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-4
-
-
-def interpolate_linear(a: Pose, b: Pose, fraction: float) -> Pose:
-    """Slerp and a straight line between the two origins."""
-    return a.interpolate(b, fraction)
 
 
 def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
@@ -40,12 +35,12 @@ def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
     omega = so3_log(step[:3, :3])
     out = np.eye(4)
     out[:3, :3] = so3_exp(fraction * omega)
-    velocity = np.linalg.solve(_left_jacobian(omega), step[:3, 3])
-    out[:3, 3] = fraction * _left_jacobian(fraction * omega) @ velocity
+    velocity = np.linalg.solve(left_jacobian(omega), step[:3, 3])
+    out[:3, 3] = fraction * left_jacobian(fraction * omega) @ velocity
     return Pose.from_matrix(start @ out)
 
 
-def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
+def left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3): translation of exp((omega, v)) over v; Barfoot, State Estimation for Robotics, (7.37)."""
     angle = float(np.linalg.norm(omega))
     if angle < _SMALL_ANGLE:
@@ -63,36 +58,23 @@ def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
 
 @dataclass
 class PairingCounts:
-    """Samples and requests of a buffer.
+    """Samples of a buffer or recording.
 
-    duplicates: samples with a known stamp (the first is kept); conflicting: those of them with another value.
-    reordered: samples older than the newest, inserted at their place. stale: samples too old to be kept.
-    restarts: how often the sender's clock was seen to be set back. paired, refused: instants asked for.
+    duplicates: those with a known stamp (the first is kept). reordered: those older than the newest, inserted
+    at their place. restarts: how often the sender's clock was seen to be set back.
     """
 
     samples: int = 0
     duplicates: int = 0
-    conflicting: int = 0
     reordered: int = 0
-    stale: int = 0
     restarts: int = 0
-    paired: int = 0
-    refused: int = 0
-
-
-@dataclass(frozen=True)
-class PairedSample(Generic[T]):
-    """A sample for an instant, and the time (ns) from that instant to the nearest sample used."""
-
-    sample: T
-    gap_ns: int
 
 
 class SampleBuffer(Generic[T]):
     """The last ``keep_ns`` of a stream of samples, sorted by stamp. Thread-safe: one thread adds, others ask.
 
     interpolate: makes a sample between two; None takes the nearest.
-    max_gap_ns: an instant farther than this from every sample is refused and counted.
+    max_gap_ns: an instant farther than this from every sample is refused.
     keep_ns: samples this much older than the newest are dropped.
     restart_after: so many stale samples in a row, each newer than the one before, mean that the sender's
         clock was set back or that a wrong stamp had emptied the buffer; they then replace its contents.
@@ -124,7 +106,6 @@ class SampleBuffer(Generic[T]):
             at = bisect.bisect_left(self._times, t_ns)
             if at < len(self._times) and self._times[at] == t_ns:
                 self.counts.duplicates += 1
-                self.counts.conflicting += not np.array_equal(_as_array(self._samples[at]), _as_array(sample))
                 return False
             self.counts.reordered += at < len(self._times)
             self._old.clear()
@@ -133,16 +114,10 @@ class SampleBuffer(Generic[T]):
             self._prune()
             return True
 
-    def at(self, t_ns: int) -> PairedSample[T]:
-        """The sample for an instant. Raises PoseGapError where none is near enough."""
+    def at(self, t_ns: int) -> tuple[T, int]:
+        """See ``PoseProvider``, of whatever samples these are."""
         with self._lock:
-            try:
-                found = sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
-            except PoseGapError:
-                self.counts.refused += 1
-                raise
-            self.counts.paired += 1
-            return PairedSample(*found)
+            return sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
 
     def ready(self, t_ns: int) -> bool:
         """Whether a sample as new as the instant has come; until then the newest one would be repeated."""
@@ -150,7 +125,6 @@ class SampleBuffer(Generic[T]):
             return bool(self._times) and self._times[-1] >= t_ns
 
     def _add_stale(self, t_ns: int, sample: T) -> bool:
-        self.counts.stale += 1
         if self._old and t_ns <= self._old[-1][0]:
             self._old.clear()
         self._old.append((t_ns, sample))
@@ -169,22 +143,6 @@ class SampleBuffer(Generic[T]):
             del self._times[:first], self._samples[:first]
 
 
-class PoseBuffer(SampleBuffer[Pose]):
-    """Poses of an arm as they come in, as a ``PoseProvider``."""
-
-    def __init__(
-        self,
-        interpolate: Interpolate[Pose] | None = interpolate_screw,
-        max_gap_ns: int = 50_000_000,
-        keep_ns: int = 2_000_000_000,
-    ) -> None:
-        super().__init__(interpolate, max_gap_ns, keep_ns)
-
-    def at(self, t_ns: int) -> PairedPose:  # type: ignore[override]
-        found = super().at(t_ns)
-        return PairedPose(found.sample, found.gap_ns)
-
-
 def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], PairingCounts]:
     """A recording sorted by stamp, each stamp once (the first that came), and what was corrected."""
     counts = PairingCounts(samples=len(times_ns))
@@ -193,16 +151,9 @@ def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[in
     for t_ns, sample in zip(times_ns, samples):
         if t_ns in kept:
             counts.duplicates += 1
-            counts.conflicting += not np.array_equal(_as_array(kept[t_ns]), _as_array(sample))
             continue
         counts.reordered += newest is not None and t_ns < newest
         newest = t_ns if newest is None else max(newest, t_ns)
         kept[t_ns] = sample
     order = sorted(kept)
     return order, [kept[t] for t in order], counts
-
-
-def _as_array(sample: object) -> NDArray[np.float64]:
-    if isinstance(sample, Pose):
-        return np.array([*sample.quaternion, *sample.translation_m])
-    return np.asarray(sample, dtype=np.float64)

@@ -30,17 +30,10 @@ class PoseGapError(ValueError):
     """No pose sample is near enough to the asked instant."""
 
 
-@dataclass(frozen=True)
-class PairedPose:
-    """A pose for an instant, and the time (ns) from that instant to the nearest sample used."""
-
-    pose: Pose
-    gap_ns: int
-
-
 class PoseProvider(Protocol):
-    def at(self, t_ns: int) -> PairedPose:
-        """Raises PoseGapError where no sample is near enough."""
+    def at(self, t_ns: int) -> tuple[Pose, int]:
+        """The pose for an instant, and the time (ns) from that instant to the nearest sample used. Raises
+        PoseGapError where no sample is near enough."""
         ...
 
 
@@ -57,8 +50,8 @@ class FixedPose:
 
     pose: Pose
 
-    def at(self, t_ns: int) -> PairedPose:
-        return PairedPose(self.pose, 0)
+    def at(self, t_ns: int) -> tuple[Pose, int]:
+        return self.pose, 0
 
 
 class Trajectory:
@@ -81,9 +74,9 @@ class Trajectory:
         self._interpolate = interpolate
         self._max_gap_ns = max_gap_ns
 
-    def at(self, t_ns: int) -> PairedPose:
+    def at(self, t_ns: int) -> tuple[Pose, int]:
         interpolate = Pose.interpolate if self._interpolate else None
-        return PairedPose(*sample_at(self._times, self._poses, t_ns, self._max_gap_ns, interpolate))
+        return sample_at(self._times, self._poses, t_ns, self._max_gap_ns, interpolate)
 
 
 def sample_at(

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from camera_node.config import ROBOTS
 
-COMMANDS = ("simulate-arm", "drive-arm", "teleop")
-
 
 def add_commands(commands: Any) -> None:
-    """Add the parsers of ``COMMANDS`` to the sub-commands ``commands``."""
+    """Add their parsers to the sub-commands ``commands``."""
     simulate = commands.add_parser(
         "simulate-arm", help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
@@ -23,6 +23,7 @@ def add_commands(commands: Any) -> None:
         "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",
     )  # fmt: skip
+    simulate.set_defaults(run=partial(_run, "simulated_controller.command"))
     add = simulate.add_argument
     add("scenario", nargs="?", help="take address, robot and calibration from this scenario's source.arm")
     add(
@@ -42,6 +43,7 @@ def add_commands(commands: Any) -> None:
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
         "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
     )  # fmt: skip
+    drive.set_defaults(run=partial(_run, "arm.drive"))
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
     add("--rounds", type=int, default=0, metavar="N", help="number of tours (default 0: without end)")
@@ -79,6 +81,7 @@ def _add_teleop(commands: Any) -> None:
         "teleop", help="move an arm by keyboard, gamepad or a stylus on the network", description=TELEOP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
+    teleop.set_defaults(run=partial(_run, "teleop.command"))
     add = teleop.add_argument
     add("scenario", help="a scenario with a source.arm")
     add(
@@ -91,24 +94,17 @@ def _add_teleop(commands: Any) -> None:
     add("--json", action="store_true", help="counts at the end as one JSON object")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run one of ``COMMANDS`` and return its exit status. Raises ScenarioError."""
+def log_to_stderr(level: int = logging.INFO) -> None:
+    logging.basicConfig(
+        level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
+    )
+
+
+def _run(module: str, args: argparse.Namespace) -> int:
+    """Run the command of a module and return its exit status. Raises ScenarioError."""
+    log_to_stderr()
     try:
-        if args.command == "simulate-arm":
-            from camera_node.robot.simulated_controller import command
-
-            return command.run(args)
-        logging.basicConfig(
-            level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
-            datefmt="%H:%M:%S",
-        )  # fmt: skip
-        if args.command == "drive-arm":
-            from camera_node.robot.arm import drive
-
-            return drive.run(args)
-        from camera_node.robot.teleop import command as teleop
-
-        return teleop.run(args)
+        return int(importlib.import_module(f"camera_node.robot.{module}").run(args))
     except ValueError as error:  # an error of an arm or a file, in one line
         print(f"camera-node: {error}", file=sys.stderr)
         return 2

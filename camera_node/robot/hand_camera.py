@@ -102,13 +102,12 @@ class HandCamera(Source):
         """Render the image at the tick's instant. Raises PoseGapError."""
         t_ns = content * 10**9 * self.fps.denominator // self.fps.numerator
         true_pose = self._base @ self._arm.forward(self._truth.joints(t_ns)) @ self._mount
-        paired = self._poses.at(t_ns)
+        pose, gap_ns = self._poses.at(t_ns)
         view = self._scene.view(self._lens, true_pose)
         image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
         if self._effects.image:
             image = self._effects.apply(image, content, t_ns * 1e-9)
-        pose = self._effects.reported_pose(paired.pose, content)
-        return Shot(image, pose, self.intrinsics, paired.gap_ns)
+        return Shot(image, self._effects.reported_pose(pose, content), self.intrinsics, gap_ns)
 
     def close(self) -> None:
         """Disconnect from the arm."""

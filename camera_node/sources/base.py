@@ -30,6 +30,11 @@ class Shot:
     captured_ns: int | None = None
 
 
+def rate(fps: float) -> Fraction:
+    """A frame rate as an exact fraction: 29.97 is 2997/100, 33.3333 is 100/3."""
+    return Fraction(fps).limit_denominator(1001)
+
+
 class Source(ABC):
     """One camera. Tick k is the instant k / fps since the epoch, and phase_ns later, so that cameras in
     different processes look at the same world.

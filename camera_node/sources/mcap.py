@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera_node.capture_schedule import CaptureSchedule, LoopSchedule, OnceSchedule
-from camera_node.config import McapConfig, find_data
+from camera_node.config import McapConfig, errors_of, find_data
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.frame import CODEC_NAMES, pose_and_lens
 from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario, ScenarioError
-from freshfield.session import SessionError
+from freshfield.scenario import Scenario
 
 if TYPE_CHECKING:
     from freshfield.session.reader import Session, SessionFrame
@@ -77,12 +76,10 @@ def open_replay(
     path = Path(config.file).expanduser()
     if not path.is_file():
         path = find_data(config.file, scenario, data, key="file")
-    try:
+    with errors_of(f"{scenario.path}: source.file"):
         from freshfield.session.reader import Session
 
         session = Session(path)
-    except SessionError as error:
-        raise ScenarioError(f"{scenario.path}: source.file: {error}") from None
     if session.cut is not None:
         log.warning("%s", session.cut)
     if not session.frames:

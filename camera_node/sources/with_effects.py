@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from camera_node.config import SourceConfig
+from camera_node.config import SourceConfig, errors_of
 from camera_node.sources.base import Shot, Source
 from freshfield import payload
 from freshfield.scenario import Scenario, ScenarioError
@@ -20,16 +20,14 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
     ScenarioError."""
     if not config.effects:
         return None
-    from camera_node.synthetic.effects import EffectError, load_effects
+    from camera_node.synthetic.effects import load_effects
 
-    try:
+    with errors_of(f"{scenario.path}: source.effects"):
         effects = load_effects(
             config.effects,
             lambda name: scenario.rng(f"effect {name}", camera),
             held_out=camera in scenario.held_out,
         )
-    except EffectError as error:
-        raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
     if config.kind != "world" and (effects.world or effects.lens or effects.exposure):
         raise ScenarioError(
             f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need "

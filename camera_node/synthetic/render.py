@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.contact_shadows import contact_shadow
 from camera_node.synthetic.lighting import (
     Light,
     Medium,
     ShadowModel,
     SpecularReflection,
     SurfacePoints,
+    contact_shadow,
     shade_diffuse,
     specular_light,
 )

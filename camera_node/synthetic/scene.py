@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from camera_node.bounds import Bounded, bounded
 from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
 from camera_node.synthetic.render import CameraRenderer, Image, World
@@ -21,13 +23,7 @@ from freshfield.scenario import ScenarioError, read_section
 SCENES = ("room", "tile", "tower")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
-_RANGES = (
-    ("count", 1, MAX_CAMERAS),
-    ("width", 8, MAX_IMAGE_SIDE_PX),
-    ("height", 8, MAX_IMAGE_SIDE_PX),
-    ("horizontal_fov_deg", 5.0, 150.0),
-    ("supersample", 1, 8),
-)
+FOV_DEG = (5.0, 150.0)
 # Parameters that do not change static parts.
 _MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "course", "people")
 # Renderers kept to be shared by scenes with the same static parts: of two sets of cameras.
@@ -40,25 +36,19 @@ class SceneError(ScenarioError):
 
 
 @dataclass(frozen=True)
-class BaseParams:
+class BaseParams(Bounded):
     """Parameters every scene has.
 
     count: cameras including the held-out one, 1 to 19. width, height: pixels. supersample: rays per
     pixel side. distortion: OpenCV's (k1, k2, p1, p2) of every camera's lens.
     """
 
-    count: int = 13
-    width: int = 128
-    height: int = 128
-    horizontal_fov_deg: float = 60.0
-    supersample: int = 2
+    count: int = bounded(13, 1, MAX_CAMERAS)
+    width: int = bounded(128, 8, MAX_IMAGE_SIDE_PX)
+    height: int = bounded(128, 8, MAX_IMAGE_SIDE_PX)
+    horizontal_fov_deg: float = bounded(60.0, *FOV_DEG)
+    supersample: int = bounded(2, 1, 8)
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for key, low, high in _RANGES:
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise ValueError(f"{key} must be within {low} to {high}, got {value}")
 
 
 @dataclass(frozen=True)
@@ -67,14 +57,12 @@ class MovingParams(BaseParams):
     and speed (from 0.7 to 1.4 times the one given); None: the scene's own motion."""
 
     speed_m_per_s: float = 1.0
-    motion_seed: int | None = None
+    motion_seed: int | None = bounded(None, 0, math.inf)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= MAX_SPEED_M_PER_S:
             raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
-        if self.motion_seed is not None and self.motion_seed < 0:
-            raise ValueError(f"motion_seed must be 0 or more, got {self.motion_seed}")
 
 
 @dataclass(frozen=True)

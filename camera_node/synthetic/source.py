@@ -10,19 +10,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
-from camera_node.config import SourceConfig, WorldConfig
-from camera_node.sources.base import Shot, Source
-from camera_node.sources.playback import rate
+from camera_node.config import SourceConfig, WorldConfig, errors_of
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.synthetic import Scene, make_scene
-from camera_node.synthetic.effects import NO_EFFECTS, EffectError
+from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Effects
 
 log = logging.getLogger("camera-node")
 
@@ -107,12 +103,10 @@ def frame_caches(
     scenario: Scenario, config: WorldConfig, cameras: Sequence[str], effects: Mapping[str, Effects | None]
 ) -> dict[str, FrameCache]:
     """The frames of each camera, none rendered yet. Raises ScenarioError."""
-    try:
+    with errors_of(f"{scenario.path}: source"):
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
-    except ValueError as error:
-        raise ScenarioError(f"{scenario.path}: source: {error}") from None
     names = _scene_cameras(scenario, scene)
-    try:
+    with errors_of(f"{scenario.path}: source.effects"):  # of one that does not fit this scene
         return {
             camera: FrameCache(
                 scene,
@@ -127,8 +121,6 @@ def frame_caches(
             )
             for camera in cameras
         }
-    except EffectError as error:  # an effect that does not fit this scene
-        raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:

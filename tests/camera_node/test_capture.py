@@ -6,11 +6,9 @@ import asyncio
 
 import pytest
 
-from camera_node.build import build_cameras
-from camera_node.capture import EncodedShot, ShotCache
+from camera_node.capture import EncodedShot, ShotCache, build_cameras, prepare
 from camera_node.config import source_config
 from camera_node.outbox import Outbox
-from camera_node.prepare import prepare
 from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame

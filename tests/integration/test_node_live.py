@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import json
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
 from freshfield.clock import WallClock

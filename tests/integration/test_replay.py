@@ -14,7 +14,7 @@ from subprocess import run
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
 from edge_server.config import read_config

@@ -9,16 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.config import ArmConfig
+from camera_node.config import ArmConfig, errors_of
 from camera_node.pose.providers import FixedPose, PoseProvider
-from camera_node.robot.arm.hand_eye_mount import (
-    EYE_IN_HAND,
-    EYE_TO_HAND,
-    HandEye,
-    HandEyeError,
-    read_hand_eye,
-)
-from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, apply_calibration
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, read_hand_eye
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
@@ -31,10 +25,8 @@ def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
     model = MODELS[config.robot]
     if config.calibration is None:
         return model
-    try:
+    with errors_of(f"{scenario.path}: source.arm.calibration"):
         return apply_calibration(model, _resolve_path(scenario, config.calibration))
-    except KinematicsError as error:
-        raise ScenarioError(f"{scenario.path}: source.arm.calibration: {error}") from None
 
 
 def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
@@ -61,10 +53,8 @@ def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]
         if file is None:
             found[camera] = HandEye(EYE_IN_HAND, np.eye(4))
             continue
-        try:
+        with errors_of(f"{where}.{camera}"):
             found[camera] = read_hand_eye(_resolve_path(scenario, file))
-        except HandEyeError as error:
-            raise ScenarioError(f"{where}.{camera}: {error}") from None
     return found
 
 

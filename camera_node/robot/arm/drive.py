@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import ArmConfig, PathConfig
+from camera_node.config import ArmConfig, PathConfig, errors_of
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_hand
 from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream, probe
 from camera_node.robot.arm.roadmap import FARTHEST_RAD
-from camera_node.robot.arm.viewpoint_tour import PathError, Tour, plan_tour
+from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
 from camera_node.robot.simulated_controller.command import read_joints, require_arm
 from freshfield.clock import WallClock
 from freshfield.scenario import ScenarioError, load
@@ -55,10 +55,8 @@ def run(args: argparse.Namespace) -> int:
     stream = open_stream(config)
     try:
         start = _start(args, stream)
-        try:
+        with errors_of(f"{scenario.path}: source.arm.path"):
             tour = plan_tour(model, base, mount, config.path, start)
-        except PathError as error:
-            raise ScenarioError(f"{scenario.path}: source.arm.path: {error}") from None
         _print_tour(tour, start)
         if args.show:
             return 0

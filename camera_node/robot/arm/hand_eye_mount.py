@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import Closable, FixedPose, PairedPose, PoseProvider
+from camera_node.pose.providers import Closable, FixedPose, PoseProvider
 from freshfield.geometry import GeometryError, Pose
 from freshfield.untrusted import UntrustedError, read_yaml
 
@@ -61,10 +61,10 @@ class MountedCameraPoses:
         self._transform = calibration.transform
         self._offset_ns = round(calibration.time_offset_s * 1e9)
 
-    def at(self, t_ns: int) -> PairedPose:
+    def at(self, t_ns: int) -> tuple[Pose, int]:
         """Pose of the camera at its stamp ``t_ns``. Raises PoseGapError."""
-        paired = self._hand.at(t_ns + self._offset_ns)
-        return PairedPose(Pose.from_matrix(paired.pose.matrix() @ self._transform), paired.gap_ns)
+        hand, gap_ns = self._hand.at(t_ns + self._offset_ns)
+        return Pose.from_matrix(hand.matrix() @ self._transform), gap_ns
 
     def close(self) -> None:
         """Close the provider of the hand's poses."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.pairing import SampleBuffer, interpolate_joints
-from camera_node.pose.providers import PairedPose, PoseGapError
+from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
 from freshfield.clock import Clock
@@ -156,10 +156,9 @@ class ArmStream:
             if self._stop.wait(0.001):
                 break
         try:
-            match = self._samples.at(t_ns)
+            return self._samples.at(t_ns)
         except PoseGapError as error:
             raise PoseGapError(self.trouble or f"arm at {self.host}: {error}") from None
-        return match.sample, match.gap_ns
 
     def now(self) -> Joints:
         """Current joint angles (6,). Raises ArmError if there is no state that is new enough."""
@@ -268,10 +267,10 @@ class HandPoses:
     ) -> None:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 
-    def at(self, t_ns: int) -> PairedPose:
+    def at(self, t_ns: int) -> tuple[Pose, int]:
         """Raises PoseGapError where no sample is near enough."""
         joints, gap_ns = self._stream.at(t_ns, self._wait_s)
-        return PairedPose(Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns)
+        return Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns
 
     def close(self) -> None:
         """Disconnect from the arm."""

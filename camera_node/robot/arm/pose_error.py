@@ -90,13 +90,13 @@ def measure(scenario: str, seconds: float) -> list[PoseError]:
                 speed = float(np.linalg.norm(true[:3, 3] - before[:3, 3])) / (_SPEED_OVER_NS * 1e-9)
                 for (pairing, rate), stream in streams.items():
                     try:
-                        claimed = HandPoses(stream, model, base, 0.0).at(t_ns)
+                        pose, gap_ns = HandPoses(stream, model, base, 0.0).at(t_ns)
                     except PoseGapError:
                         continue  # a node would not send this frame
-                    pose = claimed.pose.matrix()
-                    mm = 1e3 * float(np.linalg.norm(true[:3, 3] - pose[:3, 3]))
-                    deg = float(np.rad2deg(np.linalg.norm(so3_log(true[:3, :3].T @ pose[:3, :3]))))
-                    errors.append(PoseError(pairing, rate, claimed.gap_ns / 1e6, speed, mm, deg))
+                    claimed = pose.matrix()
+                    mm = 1e3 * float(np.linalg.norm(true[:3, 3] - claimed[:3, 3]))
+                    deg = float(np.rad2deg(np.linalg.norm(so3_log(true[:3, :3].T @ claimed[:3, :3]))))
+                    errors.append(PoseError(pairing, rate, gap_ns / 1e6, speed, mm, deg))
     finally:
         for stream in streams.values():
             stream.stop()

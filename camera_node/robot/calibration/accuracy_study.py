@@ -21,13 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.pose.pairing import (
-    Interpolate,
-    PairingCounts,
-    PoseBuffer,
-    interpolate_linear,
-    interpolate_screw,
-)
+from camera_node.pose.pairing import Interpolate, SampleBuffer, interpolate_screw
 from camera_node.robot import figures
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
@@ -45,7 +39,7 @@ Rows = list[dict[str, Any]]
 
 INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {
     "nearest": None,
-    "line": interpolate_linear,
+    "line": Pose.interpolate,
     "screw": interpolate_screw,
 }
 PERIODS_MS = (2.0, 8.0, 20.0, 50.0, 100.0, 200.0)
@@ -81,19 +75,19 @@ def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, 
             times_s = np.arange(0.0, seconds + 2.0, period_ms / 1e3)
             hands = [Pose.from_matrix(h) for h in sweep.hands(times_s)]
             for name, interpolate in INTERPOLATIONS.items():
-                hand = PoseBuffer(interpolate, max_gap_ns=10**9, keep_ns=10**12)
+                hand = SampleBuffer(interpolate, max_gap_ns=10**9, keep_ns=10**12)
                 for t_s, pose in zip(times_s, hands):
                     hand.add(round(t_s * 1e9), pose)
                 camera = mount.camera_poses(hand)
                 begun = time.process_time()
                 paired = [camera.at(round(t_s * 1e9)) for t_s in frames_s]
                 spent = time.process_time() - begun
-                found = [p.pose.matrix() for p in paired]
+                found = [pose.matrix() for pose, _ in paired]
                 mm = np.array([distance_mm(a, b) for a, b in zip(found, truth)])
                 deg = np.array([angle_deg(a, b) for a, b in zip(found, truth)])
                 rows.append({
                     "speed_m_per_s": speed, "arm_period_ms": period_ms, "pairing": name,
-                    "gap_ms_mean": float(np.mean([p.gap_ns for p in paired])) / 1e6,
+                    "gap_ms_mean": float(np.mean([gap_ns for _, gap_ns in paired])) / 1e6,
                     "mm_p50": float(np.median(mm)), "mm_p95": float(np.quantile(mm, 0.95)),
                     "deg_p50": float(np.median(deg)), "deg_p95": float(np.quantile(deg, 0.95)),
                     "us_a_pair": spent / len(frames_s) * 1e6,
@@ -214,10 +208,7 @@ def streams(
     targets = simulated.add_noise(targets, rng, _DETECTION_RAD, _DETECTION_M)
     hand_ns = np.round((hand_s + offset_s) * 1e9).astype(np.int64)
     seen_ns = np.round(seen_s * 1e9).astype(np.int64)
-    return (
-        Track(hand_ns, hands, PairingCounts(samples=len(hand_s))),
-        Track(seen_ns, targets, PairingCounts(samples=len(seen_s))),
-    )
+    return Track(hand_ns, hands), Track(seen_ns, targets)
 
 
 def format_table(name: str, rows: Rows) -> str:

@@ -57,6 +57,7 @@ _INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENAR
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill in ``camera-node calibrate``."""
+    parser.set_defaults(run=run)
     what = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raw = argparse.RawDescriptionHelpFormatter
     _add_hand_eye(what.add_parser("hand-eye", help="where the camera sits on the hand", description=HAND_EYE,
@@ -160,6 +161,8 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+    except (ValueError, OSError) as error:  # of a scenario, a file, a camera or an arm, in one line
+        raise CalibrationError(str(error)) from None
 
 
 def _hand_eye(args: argparse.Namespace) -> int:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -14,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.pairing import PairingCounts, sort_samples
-from camera_node.pose.providers import TrajectoryError, read_samples
+from camera_node.pose.providers import read_samples
 from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose
-from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.records import read_json
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
 from freshfield.untrusted import read_yaml
@@ -40,18 +39,22 @@ class Track:
 
     times_ns: NDArray[np.int64]
     poses: Array
-    counts: PairingCounts
+    counts: PairingCounts = field(default_factory=PairingCounts)
+
+
+def sorted_track(times_ns: Sequence[int], poses: Sequence[Array], what: str) -> Track:
+    """The track of poses (4, 4) as they came. what: they are, for messages. Raises CalibrationError for fewer
+    than two."""
+    times_ns, poses, counts = sort_samples(times_ns, poses)
+    if len(times_ns) < 2:
+        raise CalibrationError(f"{len(times_ns)} {what}: a time offset needs many of a moving hand")
+    return Track(np.array(times_ns, dtype=np.int64), np.array(poses), counts)
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
     """Samples from a JSON list of [end-effector in base, target in camera], each 4 x 4. Raises
-    CalibrationError."""
-    try:
-        data = json.loads(file.read_text())
-    except OSError as error:
-        raise CalibrationError(f"{file}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise CalibrationError(f"{file}: cannot be read as JSON: {error}") from None
+    DatasetError and CalibrationError."""
+    data = read_json(file)
     if not isinstance(data, list):
         raise CalibrationError(f"{file}: expected a list of pairs of 4 x 4 matrices")
     hands, targets = [], []
@@ -74,15 +77,9 @@ def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
 
 def read_track(file: Path) -> Track:
     """Read poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), with or without a header, and sort them by stamp.
-    Raises CalibrationError."""
-    try:
-        times, poses = read_samples(file)
-    except TrajectoryError as error:
-        raise CalibrationError(str(error)) from None
-    times, poses, counts = sort_samples(times, poses)
-    if len(times) < 2:
-        raise CalibrationError(f"{file}: {len(times)} poses; a moving hand needs many")
-    return Track(np.array(times, dtype=np.int64), np.array([p.matrix() for p in poses]), counts)
+    Raises TrajectoryError and CalibrationError."""
+    times, poses = read_samples(file)
+    return sorted_track(times, [pose.matrix() for pose in poses], f"poses in {file}")
 
 
 def read_visp_pose(file: Path) -> Array:
@@ -105,12 +102,9 @@ def read_visp_pose(file: Path) -> Array:
 
 def read_lens(file: Path) -> Pinhole:
     """Read a lens from a calibration JSON of one camera (``camera-node calibrate intrinsics``) or from ViSP's
-    camera XML. Raises CalibrationError."""
+    camera XML. Raises DatasetError and CalibrationError."""
     if file.suffix.lower() != ".xml":
-        try:
-            cameras = load_calibration(file)
-        except DatasetError as error:
-            raise CalibrationError(str(error)) from None
+        cameras = load_calibration(file)
         if len(cameras) != 1:
             raise CalibrationError(f"{file}: has {len(cameras)} cameras, expected one")
         return next(iter(cameras.values())).intrinsics

@@ -34,11 +34,8 @@ def load_scenario(args: argparse.Namespace) -> scenario.Scenario:
 
 
 def open_source(loaded: scenario.Scenario, config: SourceConfig, args: argparse.Namespace) -> Source:
-    """The source of ``--camera``. Raises CalibrationError."""
-    try:
-        return open_sources(loaded, config, [args.camera], args.data)[args.camera]
-    except (ValueError, OSError) as error:
-        raise CalibrationError(str(error)) from None
+    """The source of ``--camera``. Raises as ``open_sources``."""
+    return open_sources(loaded, config, [args.camera], args.data)[args.camera]
 
 
 def first_tick(source: Source) -> int:

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.pose.pairing import left_jacobian
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.square_corners import square_corners
 from freshfield.geometry import Pinhole
@@ -113,9 +114,8 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> TargetPose:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     # OpenCV differentiates by the rotation vector; convert to rotations about the target's own axes.
-    slopes = np.concatenate(
-        [slopes[:, :3] @ _inverse_right_jacobian(np.ravel(turn).astype(np.float64)), slopes[:, 3:6]], axis=1
-    )
+    right_jacobian = left_jacobian(-np.ravel(turn).astype(np.float64))
+    slopes = np.concatenate([slopes[:, :3] @ np.linalg.inv(right_jacobian), slopes[:, 3:6]], axis=1)
     error_px = float(np.sqrt(np.mean((off**2).sum(axis=1))))
     return TargetPose(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
 
@@ -132,15 +132,6 @@ def to_gray(image: NDArray[np.uint8]) -> GrayImage:
         return image
     code = cv2.COLOR_RGBA2GRAY if image.shape[2] == 4 else cv2.COLOR_RGB2GRAY
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
-
-
-def _inverse_right_jacobian(vector: Array) -> Array:
-    """Inverse right Jacobian (3, 3) of SO(3): the derivative of a rotation vector by rotations about the
-    body's own axes. The tangent of the half angle keeps it exact at half a turn, where targets often are."""
-    angle = float(np.linalg.norm(vector))
-    k = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
-    factor = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2)) if angle > 1e-4 else 1 / 12
-    return np.asarray(np.eye(3) + k / 2 + factor * k @ k)
 
 
 def _charuco(

@@ -10,9 +10,9 @@ import sys
 
 import numpy as np
 
-from camera_node.config import ArmConfig, source_config
+from camera_node.config import ArmConfig, errors_of, source_config
 from camera_node.robot.arm.camera_poses import arm_model
-from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, apply_calibration
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
 from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
 from camera_node.robot.simulated_controller.server import ControllerServer
 from freshfield.clock import WallClock
@@ -24,10 +24,8 @@ def run(args: argparse.Namespace) -> int:
     host, arm = _host_and_model(args)
     joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
-    try:
+    with errors_of("--noise-rad"):
         controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm, args.noise_rad, args.seed)
-    except ValueError as error:
-        raise ScenarioError(f"--noise-rad: {error}") from None
     server = ControllerServer(controller, host, clock)
 
     async def serve() -> None:
@@ -75,8 +73,6 @@ def _host_and_model(args: argparse.Namespace) -> tuple[str, ArmModel]:
         config = require_arm(scenario)
         return args.host or config.host, arm_model(scenario, config)
     model = MODELS[args.robot]
-    try:
+    with errors_of("--calibration"):
         model = model if args.calibration is None else apply_calibration(model, args.calibration)
-    except KinematicsError as error:
-        raise ScenarioError(f"--calibration: {error}") from None
     return args.host or "127.0.0.2", model

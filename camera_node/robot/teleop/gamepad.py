@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.pose_integrator import PoseIntegrator
-from camera_node.robot.teleop.stylus import StylusSample
+from camera_node.robot.teleop.stylus import PoseIntegrator, StylusSample
 
 log = logging.getLogger("camera-node.teleop")
 

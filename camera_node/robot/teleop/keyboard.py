@@ -16,8 +16,7 @@ import tty
 import numpy as np
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.pose_integrator import PoseIntegrator
-from camera_node.robot.teleop.stylus import StylusSample
+from camera_node.robot.teleop.stylus import PoseIntegrator, StylusSample
 
 KEYS = """\
   w s   forwards, back (x)       i k   tip up, down

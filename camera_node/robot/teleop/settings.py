@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from camera_node.bounds import Bounded, bounded, one_of
+
 Vector3 = tuple[float, float, float]
 
 SOLVERS = ("auto", "pink", "dls")
 
 
 @dataclass(frozen=True)
-class TeleopConfig:
+class TeleopConfig(Bounded):
     """How a stylus moves the arm. Positions are those of the flange, in the axes of the arm's base.
 
     scale: S of (4.1): metres of the arm per metre of the stylus, along each axis of the base.
@@ -37,44 +39,31 @@ class TeleopConfig:
     scale: Vector3 = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     orientation: bool = True
-    rate_hz: float = 125.0
-    gain_per_s: float = 5.0
-    filter_hz: float = 2.0
-    filter_hz_s_m: float = 20.0
-    watchdog_ms: float = 200.0
-    jump_m: float = 0.05
-    jump_rad: float = 0.5
+    rate_hz: float = bounded(125.0, 20.0, 500.0)
+    gain_per_s: float = bounded(5.0, 0.1, 20.0)
+    filter_hz: float = bounded(2.0, 0.01, 1000.0)
+    filter_hz_s_m: float = bounded(20.0, 0.0, 1e4)
+    watchdog_ms: float = bounded(200.0, 10.0, 5000.0)
+    jump_m: float = bounded(0.05, 1e-3, 1.0)
+    jump_rad: float = bounded(0.5, 1e-2, 3.14)
     workspace_low_m: Vector3 = (-0.45, -0.45, 0.05)
     workspace_high_m: Vector3 = (0.45, 0.45, 0.60)
-    joint_margin_rad: float = 0.05
-    speed_rad_s: float = 0.8
-    acceleration_rad_s2: float = 2.0
-    speed_m_s: float = 0.25
-    margin_m: float = 0.02
-    floor_m: float = 0.0
-    tool_m: float = 0.08
-    tool_radius_m: float = 0.04
-    solver: str = "auto"
+    joint_margin_rad: float = bounded(0.05, 0.0, 3.0)
+    speed_rad_s: float = bounded(0.8, 1e-3, 6.28)
+    acceleration_rad_s2: float = bounded(2.0, 0.05, 40.0)
+    speed_m_s: float = bounded(0.25, 1e-3, 1.5)
+    margin_m: float = bounded(0.02, 0.0, 0.2)
+    floor_m: float = bounded(0.0, -2.0, 1.0)
+    tool_m: float = bounded(0.08, 0.0, 0.5)
+    tool_radius_m: float = bounded(0.04, 1e-3, 0.2)
+    solver: str = one_of("auto", SOLVERS)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not all(0.0 < abs(s) <= 100.0 for s in self.scale):
             raise ValueError("scale: expected three numbers within 100 that are not 0")
-        if not 20.0 <= self.rate_hz <= 500.0:
-            raise ValueError(f"rate_hz: expected 20 to 500, got {self.rate_hz:g}")
         if not all(low < high for low, high in zip(self.workspace_low_m, self.workspace_high_m)):
             raise ValueError("workspace_low_m must be below workspace_high_m along every axis")
-        ranges = {
-            "gain_per_s": (0.1, 20.0), "filter_hz": (0.01, 1000.0), "filter_hz_s_m": (0.0, 1e4),
-            "watchdog_ms": (10.0, 5000.0), "jump_m": (1e-3, 1.0), "jump_rad": (1e-2, 3.14),
-            "joint_margin_rad": (0.0, 3.0), "speed_rad_s": (1e-3, 6.28), "acceleration_rad_s2": (0.05, 40.0),
-            "speed_m_s": (1e-3, 1.5), "margin_m": (0.0, 0.2), "floor_m": (-2.0, 1.0), "tool_m": (0.0, 0.5),
-            "tool_radius_m": (1e-3, 0.2),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name):g}")
         # The limiter checks every tick of a stop in advance, so stops must be short.
         if self.speed_rad_s / self.acceleration_rad_s2 > 2.0:
             raise ValueError("acceleration_rad_s2: too low to come to rest from speed_rad_s within 2 s")
-        if self.solver not in SOLVERS:
-            raise ValueError(f"solver: expected one of {', '.join(SOLVERS)}, got {self.solver!r}")

@@ -11,7 +11,6 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_node.config import ColmapConfig
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
 from camera_node.sources.datasets.records import (
@@ -46,16 +45,6 @@ class _Image:
     name: str
     camera: int
     pose: tuple[float, ...]
-
-
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    return file.suffix in (".bin", ".txt")
-
-
-def from_config(path: Path, config: ColmapConfig) -> Dataset:
-    """See ``formats.Reader``."""
-    return load_dataset(path, ImageOptions(config.scale, config.background), config.images)
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:

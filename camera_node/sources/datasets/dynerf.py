@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.config import DynerfConfig
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at
 from camera_node.sources.datasets.video import VideoRig, rig_dataset
@@ -24,16 +23,6 @@ POSES = "poses_bounds.npy"
 FILES = (POSES,)
 # Of a video's shape against that of the images its focal length was found on: both are rounded to pixels.
 _SAME_SHAPE = 0.02
-
-
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    return file.name == POSES
-
-
-def from_config(path: Path, config: DynerfConfig) -> VideoRig:
-    """See ``formats.Reader``."""
-    return load_rig(path)
 
 
 def load_rig(path: Path) -> VideoRig:

@@ -12,13 +12,11 @@ testing. The set's ``cameras.xml``, Metashape's own, holds nothing more and is n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from camera_node.config import EyefulConfig
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
 from camera_node.sources.datasets.records import (
@@ -39,26 +37,6 @@ FOLDERS = ("images-jpeg-1k", "images-jpeg-2k", "images-jpeg-4k", "images-jpeg")
 _UPRIGHT = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """One image: its name ("10/10_DSC0001"), lens at full size, camera-to-world in the set's own axes."""
-
-    name: str
-    lens: Lens
-    camera_to_world: np.ndarray
-
-
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    data = read_json(file) if file.suffix == ".json" else None
-    return isinstance(data, dict) and "KRT" in data
-
-
-def from_config(path: Path, config: EyefulConfig) -> Dataset:
-    """See ``formats.Reader``."""
-    return load_dataset(path, ImageOptions(config.scale), config.images)
-
-
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:
     """The images that have a file; cameras are named by their folders ("10").
 
@@ -76,19 +54,16 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     lenses: dict[Lens, Lens] = {}
     found: list[PosedImage] = []
     missing = 0
-    for entry in entries:
-        image = next(
-            (f for s in (".jpg", ".jpeg", ".png") if (f := pictures / f"{entry.name}{s}").is_file()), None
-        )
+    for name, lens, camera_to_world in entries:
+        image = next((f for s in (".jpg", ".jpeg", ".png") if (f := pictures / f"{name}{s}").is_file()), None)
         if image is None:
             missing += 1
             continue
-        where = f"{file}: {entry.name}"
-        if entry.lens not in lenses:
-            lenses[entry.lens] = lens_for_image(entry.lens, image, where)
-        photo = Photo(image, lenses[entry.lens], options)
-        pose = _UPRIGHT @ entry.camera_to_world
-        found.append(posed_photo(photo, entry.name, pose, where, entry.name.split("/")[0]))
+        where = f"{file}: {name}"
+        if lens not in lenses:
+            lenses[lens] = lens_for_image(lens, image, where)
+        photo = Photo(image, lenses[lens], options)
+        found.append(posed_photo(photo, name, _UPRIGHT @ camera_to_world, where, name.split("/")[0]))
     if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {pictures}")
     held_out &= {image.name for image in found}
@@ -113,7 +88,7 @@ def _held_out(file: Path) -> frozenset[str]:
     return frozenset(str(name) for name in test)
 
 
-def _entries(file: Path) -> list[_Entry]:
+def _entries(file: Path) -> list[tuple[str, Lens, np.ndarray]]:
     data = read_json(file)
     krt = data.get("KRT") if isinstance(data, dict) else None
     if not isinstance(krt, list) or not krt or not all(isinstance(entry, dict) for entry in krt):
@@ -121,7 +96,8 @@ def _entries(file: Path) -> list[_Entry]:
     return [_entry(entry, f"{file}: KRT[{k}]") for k, entry in enumerate(krt)]
 
 
-def _entry(entry: dict[str, Any], where: str) -> _Entry:
+def _entry(entry: dict[str, Any], where: str) -> tuple[str, Lens, np.ndarray]:
+    """An image's name ("10/10_DSC0001"), lens at full size, and camera-to-world in the set's own axes."""
     name = entry.get("cameraId")
     with errors_at(where):
         parts = path_within(name).parts if isinstance(name, str) else ()
@@ -148,4 +124,4 @@ def _entry(entry: dict[str, Any], where: str) -> _Entry:
         lens = Lens(
             width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
         )
-    return _Entry(name, lens, se3_inverse(transform))
+    return name, lens, se3_inverse(transform)

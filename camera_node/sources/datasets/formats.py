@@ -1,18 +1,19 @@
 """Formats of data sets, one reader module each, and which of them a folder or file is of.
 
 The formats are the kinds of ``camera_node.config`` whose keys are a ``RecordedConfig``: a new one is a reader
-module here, called as the kind, and its keys there.
+module here, called as the kind, and its keys there, which are the reader's arguments.
 """
 
 from __future__ import annotations
 
 import importlib
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 from camera_node.config import MODELS, RecordedConfig
 from camera_node.sources.datasets.photo import ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, find_files
+from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
 from camera_node.sources.datasets.video import VideoRig
 
 # In this order: where several fit, the one that says most about its images comes first.
@@ -25,19 +26,43 @@ class Reader(Protocol):
 
     FILES: tuple[str, ...]
 
-    def describes(self, file: Path) -> bool:
-        """Whether a file describes a data set of this format. Raises DatasetError for a damaged one."""
-
-    def load_dataset(self, path: Path, options: ImageOptions) -> Dataset:
+    def load_dataset(self, path: Path, options: ImageOptions, **keys: Any) -> Dataset:
         """The posed images of a folder or describing file. Raises DatasetError."""
 
-    def from_config(self, path: Path, config: Any) -> Dataset | VideoRig:
-        """What a scenario's section, whose ``data`` is at ``path``, asks for. Raises DatasetError."""
+
+@runtime_checkable
+class RigReader(Protocol):
+    """What the module of a format of synchronized videos offers besides."""
+
+    def load_rig(self, path: Path, **keys: Any) -> VideoRig:
+        """The rig of a folder or describing file. Raises DatasetError."""
 
 
 def reader(name: str) -> Reader:
     """The reader of one of ``FORMATS``; only its module is imported."""
     return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{name}"))
+
+
+def open_configured(path: Path, config: RecordedConfig) -> Dataset | VideoRig:
+    """What a scenario's section, whose ``data`` is at ``path``, asks for. Raises DatasetError."""
+    shared = {*(each.name for each in fields(RecordedConfig)), "background", "trajectory"}
+    keys = {each.name: getattr(config, each.name) for each in fields(config) if each.name not in shared}
+    found = reader(config.kind)
+    if isinstance(found, RigReader):
+        return found.load_rig(path, **keys)
+    options = ImageOptions(config.scale, getattr(config, "background", "keep"))
+    return found.load_dataset(path, options, **keys)
+
+
+def recognize(file: Path) -> str:
+    """The format of a describing file, by its name or the contents of its JSON; ``transforms``, whose reader
+    says what is missing, where nothing tells. Raises DatasetError for a damaged file."""
+    if file.suffix in (".bin", ".txt"):
+        return "colmap"
+    data = read_json(file) if file.suffix == ".json" else None
+    if isinstance(data, dict):
+        return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
+    return next((name for name in ("dynerf", "zju") if file.name in reader(name).FILES), "transforms")
 
 
 def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tuple[Path, Dataset]:
@@ -51,9 +76,7 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
         raise DatasetError(f"format {name!r}: expected one of {', '.join(FORMATS)}")
     options = ImageOptions(scale)
     if path.is_file():
-        # What no other format claims is taken for a transforms JSON, whose reader says what is missing.
-        found = (key for key in FORMATS if reader(key).describes(path))
-        return path, reader(name or next(found, "transforms")).load_dataset(path, options)
+        return path, reader(name or recognize(path)).load_dataset(path, options)
     if not path.is_dir():
         raise DatasetError(f"{path}: no such file or folder")
     errors: list[str] = []

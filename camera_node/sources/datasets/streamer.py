@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, find_data
-from camera_node.pose.providers import FixedPose, PoseProvider, TrajectoryError, read_tum
+from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
+from camera_node.pose.providers import FixedPose, PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
-from camera_node.sources.base import Shot, Source
-from camera_node.sources.datasets.formats import reader
+from camera_node.sources.base import Shot, Source, rate
+from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage
 from camera_node.sources.datasets.video import VideoRig, open_clip
 from camera_node.sources.datasets.video_clip import Clip
-from camera_node.sources.playback import Playback, rate
 from freshfield import payload
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
@@ -33,12 +33,34 @@ _BLOCK = 12
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
+@dataclass(frozen=True)
+class Playback:
+    """Which frame a tick shows: ``count`` of them, recorded at ``recorded_fps`` and captured at ``fps``.
+
+    back_and_forth: 0 1 2 3 2 1 0 1 ..., so that motion never jumps; otherwise 0 1 2 3 0 1 ...
+    """
+
+    count: int
+    fps: Fraction
+    recorded_fps: Fraction
+    back_and_forth: bool = True
+
+    def frame(self, tick: int) -> int:
+        """The frame nearest to the tick's instant."""
+        position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
+        if not self.back_and_forth:
+            return int(position % self.count)
+        period = max(1, 2 * (self.count - 1))
+        place = int(position % period)
+        return place if place < self.count else period - place
+
+
 def open_recorded(
     scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], data: Path | None
 ) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``."""
     path = find_data(config.data, scenario, data)
-    found = reader(config.kind).from_config(path, config)
+    found = open_configured(path, config)
     if isinstance(found, VideoRig):
         return _video_sources(scenario, config, cameras, found, path)
     if found.moving or found.per_camera:
@@ -133,8 +155,8 @@ class VideoSource(Source):
 
     def read(self, content: int) -> Shot:
         fps = self._playback.recorded_fps
-        paired = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
-        return Shot(self._image(content), paired.pose, self.intrinsics, paired.gap_ns)
+        pose, gap_ns = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
+        return Shot(self._image(content), pose, self.intrinsics, gap_ns)
 
     def release(self) -> None:
         if self._clip is not None:
@@ -190,20 +212,16 @@ def _video_sources(
 
 def _trajectory_poses(config: TrajectoryConfig, camera: str, base: Path, where: str) -> PoseProvider:
     """Poses of one camera in the clip's time, from the TUM file that the scenario names."""
-    try:
+    with errors_of(f"{where}.files.{camera}"):
         poses = read_tum(
             base / config.files[camera],
             config.pairing == "interpolated",
             round(config.max_gap_ms * 1e6),
             round(config.start_s * 1e9),
         )
-    except TrajectoryError as error:
-        raise ScenarioError(f"{where}.files.{camera}: {error}") from None
     if not config.hand_eye:
         return poses
-    from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
+    from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 
-    try:
+    with errors_of(f"{where}.hand_eye"):
         return read_hand_eye(base / config.hand_eye).camera_poses(poses)
-    except HandEyeError as error:
-        raise ScenarioError(f"{where}.hand_eye: {error}") from None

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import BACKGROUNDS, TransformsConfig
+from camera_node.config import BACKGROUNDS
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
@@ -32,17 +32,6 @@ from freshfield.geometry import OPENGL_TO_OPENCV
 FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
 _EXTENSIONS = ("", ".png", ".jpg", ".jpeg")
 _FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
-
-
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    data = read_json(file) if file.suffix == ".json" else None
-    return isinstance(data, dict) and "frames" in data
-
-
-def from_config(path: Path, config: TransformsConfig) -> Dataset:
-    """See ``formats.Reader``."""
-    return load_dataset(path, ImageOptions(config.scale, config.background))
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from camera_node.config import VideoConfig
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import (
@@ -17,7 +16,6 @@ from camera_node.sources.datasets.records import (
     errors_at,
     find_files,
     path_within,
-    read_json,
 )
 from camera_node.sources.datasets.video_clip import Clip
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
@@ -35,24 +33,13 @@ class VideoRig:
     files: dict[str, Path]
 
 
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    data = read_json(file) if file.suffix == ".json" else None
-    return isinstance(data, dict) and not {"frames", "KRT"} & set(data)
-
-
-def from_config(path: Path, config: VideoConfig) -> VideoRig:
-    """See ``formats.Reader``."""
-    return load_rig(path, config.files)
-
-
-def load_rig(path: Path, files: Mapping[str, str]) -> VideoRig:
+def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
     """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
 
     files: camera -> video, relative to the JSON, where it is at none of ``_PLACES``. Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
-    cameras = load_calibration(calibration)
+    cameras, files = load_calibration(calibration), files or {}
     for name in files:
         if name not in cameras:
             raise DatasetError(f"{calibration}: has no camera {name!r}, for which a video is named")
@@ -75,7 +62,7 @@ def load_rig(path: Path, files: Mapping[str, str]) -> VideoRig:
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """``rig_dataset`` of a calibration JSON, or of the only one in a folder. Raises DatasetError."""
-    return rig_dataset(load_rig(path, {}), path, options.scale)
+    return rig_dataset(load_rig(path), path, options.scale)
 
 
 def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import ZjuConfig
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
@@ -37,21 +36,10 @@ FPS = 50.0
 _MM = 1e-3
 
 
-def describes(file: Path) -> bool:
-    """See ``formats.Reader``."""
-    return file.name == ANNOTATIONS
-
-
-def from_config(path: Path, config: ZjuConfig) -> Dataset:
-    """See ``formats.Reader``."""
-    options = ImageOptions(config.scale, config.background)
-    return load_dataset(path, options, config.masks, config.recorded_fps)
-
-
 def load_dataset(
-    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, fps: float = FPS
+    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = FPS
 ) -> Dataset:
-    """Every image of every camera, at instants 1 / ``fps`` apart.
+    """Every image of every camera, at instants 1 / ``recorded_fps`` apart.
 
     path: the folder, or its ``annots.npy``.
     masks: a folder beside the cameras' whose masks cut the background out.
@@ -93,12 +81,12 @@ def load_dataset(
             if mask is not None and not mask.is_file():
                 raise DatasetError(f"{mask}: missing, the mask of {name}")
             photo = Photo(folder / name, lens, options, mask)
-            images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / fps))
+            images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / recorded_fps))
     if not images:
         raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
     if len({i.camera for i in images}) != len({(i.camera, i.camera_to_world.tobytes()) for i in images}):
         raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
-    return Dataset(tuple(images), missing, fps)
+    return Dataset(tuple(images), missing, recorded_fps)
 
 
 def _listed(counts: dict[str, int]) -> str:

@@ -18,9 +18,8 @@ from typing import Any
 
 from camera_node.config import LiveConfig
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.sources.base import Shot, Source
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
-from camera_node.sources.playback import rate
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.clock import Clock, WallClock
 from freshfield.geometry import Pinhole
@@ -114,8 +113,8 @@ class LiveSource(Source):
             assert self._newest is not None
             captured_ns, image = self._newest
             self._newest = None
-        paired = self._poses.at(captured_ns)
-        return Shot(image, paired.pose, self.intrinsics, paired.gap_ns, captured_ns)
+        pose, gap_ns = self._poses.at(captured_ns)
+        return Shot(image, pose, self.intrinsics, gap_ns, captured_ns)
 
     def close(self) -> None:
         """End the thread, which closes the camera."""

@@ -10,8 +10,8 @@ The kinds, by where they act:
 * ``clock``    changes the node's clock and so its time stamps;
 * ``pose``     changes the pose that frames report, not the image.
 
-To add one, write a file here with a class (attributes ``kind`` and ``Parameters``, constructor of parameters
-and a random stream) and add a line to ``_CLASSES``.
+To add one, write a file here with a class of the same name (attributes ``kind`` and ``Parameters``,
+constructor of parameters and a random stream) and add it to ``NAMES``.
 
 The held-out camera measures: it shows the sharp, noise-free, unobstructed scene at the true time. Effects
 apply to it only if they are listed with ``in_truth: true``.
@@ -21,66 +21,40 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.bounds import Bounded
+from camera_node.synthetic.render import Image, Rows
+from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, read_section
 
-if TYPE_CHECKING:
-    from camera_node.synthetic.render import Image, Rows
-    from camera_node.synthetic.scene import Scene
-
-_CLASSES = {
-    "clock_drift": "ClockDrift",
-    "exposure_drift": "ExposureDrift",
-    "fog": "Fog",
-    "hot_pixels": "HotPixels",
-    "lens_distortion": "LensDistortion",
-    "motion_blur": "MotionBlur",
-    "occluder": "Occluder",
-    "pose_noise": "PoseNoise",
-    "rolling_shutter": "RollingShutter",
-    "sensor_noise": "SensorNoise",
-    "shadows": "Shadows",
-    "specular": "Specular",
-    "vignetting": "Vignetting",
-}
-NAMES = tuple(_CLASSES)
+NAMES = (
+    "clock_drift", "exposure_drift", "fog", "hot_pixels", "lens_distortion", "motion_blur", "occluder",
+    "pose_noise", "rolling_shutter", "sensor_noise", "shadows", "specular", "vignetting",
+)  # fmt: skip
 
 
 class EffectError(ScenarioError):
     """An effect that cannot be applied as listed; the message says what is valid."""
 
 
-def bounded(default: float, lowest: float, highest: float) -> Any:
-    """Field of EffectParameters with a default and a range."""
-    return field(default=default, metadata={"range": (lowest, highest)})
-
-
 @dataclass(frozen=True)
-class EffectParameters:
-    """in_truth: whether the effect applies to held-out cameras as well. Raises ValueError, in one line, for a
-    value outside the range of its field."""
+class EffectParameters(Bounded):
+    """in_truth: whether the effect applies to held-out cameras as well."""
 
     in_truth: bool = field(default=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        for parameter in fields(self):
-            lowest, highest = parameter.metadata.get("range", (None, None))
-            value = getattr(self, parameter.name)
-            if lowest is not None and not lowest <= value <= highest:  # refuses NaN, too
-                raise ValueError(f"{parameter.name} must be within {lowest:g} to {highest:g}, got {value}")
 
 
 def effect_class(name: str) -> Any:
     """The class of an effect, now imported. Raises EffectError for an unknown name."""
-    if name not in _CLASSES:
+    if name not in NAMES:
         raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
-    return getattr(importlib.import_module(f"{__name__}.{name}"), _CLASSES[name])
+    return getattr(importlib.import_module(f"{__name__}.{name}"), name.title().replace("_", ""))
 
 
 def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
@@ -89,16 +63,12 @@ def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
 
 
 class WorldEffect(Protocol):
-    kind: ClassVar[str]
-
     def extend(self, scene: Scene) -> Scene:
         """The scene with this effect."""
         ...
 
 
 class LensEffect(Protocol):
-    kind: ClassVar[str]
-
     def rendered(self, camera: Pinhole) -> Pinhole:
         """The lens that images are rendered with instead of ``camera``."""
         ...
@@ -119,16 +89,12 @@ class Renderer(Protocol):
 
 
 class ExposureEffect(Protocol):
-    kind: ClassVar[str]
-
     def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
         """Image, or rows (first, one after the last), of an exposure around an instant."""
         ...
 
 
 class ImageEffect(Protocol):
-    kind: ClassVar[str]
-
     def apply(self, image: Image, index: int, t_s: float) -> Image:
         """Frame number ``index``, taken ``t_s`` after the epoch, as the camera delivers it. Must not change
         ``image``."""
@@ -136,16 +102,12 @@ class ImageEffect(Protocol):
 
 
 class ClockEffect(Protocol):
-    kind: ClassVar[str]
-
     def node_ns(self, true_ns: int) -> int:
         """Time of the node's clock at a true time."""
         ...
 
 
 class PoseEffect(Protocol):
-    kind: ClassVar[str]
-
     @property
     def varies(self) -> bool:
         """Whether frames of one camera report different poses."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ClockDrift:
     microsecond. offset_ns, drift_ppb: of this camera.
     """
 
-    kind: ClassVar[str] = "clock"
+    kind = "clock"
     Parameters = ClockDriftParameters
 
     def __init__(self, parameters: ClockDriftParameters, rng: np.random.Generator) -> None:

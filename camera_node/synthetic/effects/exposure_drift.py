@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import cv2
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import phase_of
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.render import Image
+from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class ExposureDrift:
     + phase)). Displayed values are scaled, as everywhere in this world. phase, offset_stops: of this
     camera."""
 
-    kind: ClassVar[str] = "image"
+    kind = "image"
     Parameters = ExposureDriftParameters
 
     def __init__(self, parameters: ExposureDriftParameters, rng: np.random.Generator) -> None:

@@ -10,16 +10,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
+from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -29,18 +27,13 @@ class FogParameters(EffectParameters):
 
     visibility_m: float = bounded(20.0, 0.01, 1e6)
     contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
-    airlight: tuple[float, float, float] = (0.76, 0.78, 0.80)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not all(0.0 <= c <= 1.0 for c in self.airlight):
-            raise ValueError(f"airlight must be three shares within 0 to 1, got {list(self.airlight)}")
+    airlight: tuple[float, float, float] = bounded((0.76, 0.78, 0.80), 0.0, 1.0)
 
 
 class Fog:
     """Rendered ahead; free while streaming. A scene's background is all fog."""
 
-    kind: ClassVar[str] = "world"
+    kind = "world"
     Parameters = FogParameters
 
     def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:

@@ -7,15 +7,13 @@ pixel for one frame. With a color filter, one of a pixel's three values is hit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.render import Image
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, frame_rng
+from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class HotPixels:
     camera's random stream decides which pixels are damaged; a frame's hits follow from that stream and its
     number."""
 
-    kind: ClassVar[str] = "image"
+    kind = "image"
     Parameters = HotPixelsParameters
 
     def __init__(self, parameters: HotPixelsParameters, rng: np.random.Generator) -> None:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectError, EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectError, EffectParameters
 from freshfield.geometry import Pinhole, invertible
 
 
@@ -32,7 +32,7 @@ class LensDistortion:
     """Rendered ahead at no extra cost; free while streaming. Raises EffectError if the distortion cannot be
     inverted over the whole image, or if the scene's lenses have a distortion already."""
 
-    kind: ClassVar[str] = "lens"
+    kind = "lens"
     Parameters = LensDistortionParameters
 
     def __init__(self, parameters: LensDistortionParameters, rng: np.random.Generator) -> None:

@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Renderer
-    from camera_node.synthetic.render import Image, Rows
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, Renderer
+from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
 class MotionBlurParameters(EffectParameters):
     """exposure_ms: time for which the shutter is open. samples: instants averaged within it."""
 
-    exposure_ms: float = 20.0
+    exposure_ms: float = bounded(20.0, 1e-6, 1000.0)
     samples: int = bounded(5, 1, 64)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.exposure_ms <= 1000.0:
-            raise ValueError(f"exposure_ms must be within 0 to 1000, got {self.exposure_ms}")
 
 
 class MotionBlur:
     """The time stamp is the middle of the exposure, so that blur adds no age. Displayed values are averaged,
     as everywhere in this world. Costs ``samples`` renderings a frame, ahead; free while streaming."""
 
-    kind: ClassVar[str] = "exposure"
+    kind = "exposure"
     Parameters = MotionBlurParameters
 
     def __init__(self, parameters: MotionBlurParameters, rng: np.random.Generator) -> None:

@@ -10,19 +10,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import PERIOD_UNIT_S, bone_frames, phase_of
 from camera_node.synthetic.placement import MovingBody, Part
+from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import capsule
 from camera_node.synthetic.textures import Stripes
 from freshfield.geometry import Array
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.scene import Scene
 
 _JOINTS = 9  # of the arch
 
@@ -44,7 +42,7 @@ class Occluder:
     """An arch over the target from the horizon to the zenith, which passes cameras at any height. Rendered
     ahead (1 to 3 ms a frame); free while streaming."""
 
-    kind: ClassVar[str] = "world"
+    kind = "world"
     Parameters = OccluderParameters
 
     def __init__(self, parameters: OccluderParameters, rng: np.random.Generator) -> None:

@@ -6,11 +6,11 @@ Images are taken from the true pose; only the reported pose is wrong.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, frame_rng
 from freshfield.geometry import Array, Pose, so3_exp
 
 
@@ -30,7 +30,7 @@ class PoseNoise:
     """Rotations by a normal rotation vector in camera axes, translations in world axes. A frame's error
     follows from the camera's random stream and the frame's number alone. About .1 ms a frame."""
 
-    kind: ClassVar[str] = "pose"
+    kind = "pose"
     Parameters = PoseNoiseParameters
 
     def __init__(self, parameters: PoseNoiseParameters, rng: np.random.Generator) -> None:

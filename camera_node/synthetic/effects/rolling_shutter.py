@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Renderer
-    from camera_node.synthetic.render import Image, Rows
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, Renderer
+from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class RollingShutter:
     part of a rendering for every row, ahead; free while streaming. To use it with motion_blur, list it after
     motion_blur: each row is then blurred around its own instant."""
 
-    kind: ClassVar[str] = "exposure"
+    kind = "exposure"
     Parameters = RollingShutterParameters
 
     def __init__(self, parameters: RollingShutterParameters, rng: np.random.Generator) -> None:

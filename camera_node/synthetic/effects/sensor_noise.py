@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.render import Image
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, frame_rng
+from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class SensorNoise:
     above about ten electrons. A frame's noise follows from the camera's random stream and the frame's number
     alone. About .6 ms for 128 x 128."""
 
-    kind: ClassVar[str] = "image"
+    kind = "image"
     Parameters = SensorNoiseParameters
 
     def __init__(self, parameters: SensorNoiseParameters, rng: np.random.Generator) -> None:

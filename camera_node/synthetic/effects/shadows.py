@@ -9,19 +9,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.lighting import Light, SpecularReflection, SurfacePoints, direct_light
 from camera_node.synthetic.placement import PlacedParts, place_parts
 from camera_node.synthetic.render import blocked
+from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Shadows:
     """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
     shadows."""
 
-    kind: ClassVar[str] = "world"
+    kind = "world"
     Parameters = ShadowsParameters
 
     def __init__(self, parameters: ShadowsParameters, rng: np.random.Generator) -> None:

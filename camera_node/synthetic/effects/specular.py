@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
+from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import normalize
 from freshfield.geometry import Array
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class Specular:
     """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
     highlights."""
 
-    kind: ClassVar[str] = "world"
+    kind = "world"
     Parameters = SpecularParameters
 
     def __init__(self, parameters: SpecularParameters, rng: np.random.Generator) -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters, Renderer
+from camera_node.synthetic.render import Image, Rows
 from freshfield.geometry import Pinhole
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.effects import Renderer
-    from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class Vignetting:
     """Multiplies every pixel by cos(angle)^exponent, with the angle at which the lens, distorted or not, sees
     it. Displayed values are scaled, as everywhere in this world. Rendered ahead; free while streaming."""
 
-    kind: ClassVar[str] = "exposure"
+    kind = "exposure"
     Parameters = VignettingParameters
 
     def __init__(self, parameters: VignettingParameters, rng: np.random.Generator) -> None:

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from camera_node.bounds import bounded, one_of
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import COURSES, make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import FOV_DEG, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 
@@ -35,16 +36,9 @@ class Params(MovingParams):
     """speed_m_per_s: mean speed of the person's parts; 0 stands still. course: loop, stops, reverses or
     jumps, how the person walks it. people: 1, or 2, half a loop apart."""
 
-    horizontal_fov_deg: float = 64.0
-    course: str = "loop"
-    people: int = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.course not in COURSES:
-            raise ValueError(f"course: expected one of {', '.join(COURSES)}, got {self.course!r}")
-        if self.people not in (1, 2):
-            raise ValueError(f"people: expected 1 or 2, got {self.people}")
+    horizontal_fov_deg: float = bounded(64.0, *FOV_DEG)
+    course: str = one_of("loop", COURSES)
+    people: int = bounded(1, 1, 2)
 
 
 def build(params: Params) -> Scene:

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from camera_node.bounds import bounded
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import BaseParams, Scene, pinhole
+from camera_node.synthetic.scene import FOV_DEG, BaseParams, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Sphere
 from freshfield.geometry import Array
 
@@ -34,7 +35,7 @@ _ANGLES_DEG = [(0.0, 40.0)] + [
 
 @dataclass(frozen=True)
 class Params(BaseParams):
-    horizontal_fov_deg: float = 40.0
+    horizontal_fov_deg: float = bounded(40.0, *FOV_DEG)
 
 
 def build(params: Params) -> Scene:

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from camera_node.bounds import bounded, one_of
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import FOV_DEG, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere, capsule
 from freshfield.geometry import Array
@@ -48,13 +49,8 @@ class Params(MovingParams):
     ``one`` of them, or ``person``, alone on one of four sides; motion_seed draws which. Camera positions then
     do not tell where something moves, but images do."""
 
-    horizontal_fov_deg: float = 90.0
-    movers: str = "both"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.movers not in ("both", "one", "person"):
-            raise ValueError(f"movers: expected both, one or person, got {self.movers!r}")
+    horizontal_fov_deg: float = bounded(90.0, *FOV_DEG)
+    movers: str = one_of("both", ("both", "one", "person"))
 
 
 def build(params: Params) -> Scene:

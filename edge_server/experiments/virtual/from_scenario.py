@@ -6,8 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_node.build import build_cameras
-from camera_node.capture import Camera
+from camera_node.capture import Camera, build_cameras
 from camera_node.config import LiveConfig, SourceConfig, WorldConfig, source_config
 from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene

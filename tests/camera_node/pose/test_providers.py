@@ -23,16 +23,16 @@ def turn(angle: float, x: float = 0.0) -> Pose:
 def test_nearest_and_interpolated():
     times, poses = [0, 100 * MS, 130 * MS], [turn(0.0, 0), turn(1.0, 10), turn(1.0, 10)]
     nearest = Trajectory(times, poses, interpolate=False, max_gap_ns=50 * MS)
-    assert nearest.at(40 * MS).pose == poses[0] and nearest.at(40 * MS).gap_ns == 40 * MS
-    assert nearest.at(70 * MS).pose == poses[1] and nearest.at(70 * MS).gap_ns == 30 * MS
-    between = Trajectory(times, poses, max_gap_ns=50 * MS).at(40 * MS)
-    assert between.gap_ns == 40 * MS  # still the distance to the nearest sample
-    np.testing.assert_allclose(between.pose.matrix(), turn(0.4, 4).matrix(), atol=1e-12)
+    assert nearest.at(40 * MS) == (poses[0], 40 * MS)
+    assert nearest.at(70 * MS) == (poses[1], 30 * MS)
+    between, gap_ns = Trajectory(times, poses, max_gap_ns=50 * MS).at(40 * MS)
+    assert gap_ns == 40 * MS  # still the distance to the nearest sample
+    np.testing.assert_allclose(between.matrix(), turn(0.4, 4).matrix(), atol=1e-12)
 
 
 def test_beyond_the_bound_there_is_no_pose():
     track = Trajectory([0, 200 * MS], [turn(0), turn(1)], max_gap_ns=50 * MS)
-    assert track.at(-50 * MS).pose == turn(0) and track.at(250 * MS).pose == turn(1)
+    assert track.at(-50 * MS)[0] == turn(0) and track.at(250 * MS)[0] == turn(1)
     for t_ms in (-51, 100, 251):
         with pytest.raises(PoseGapError, match="nearest pose"):
             track.at(t_ms * MS)
@@ -45,24 +45,24 @@ def test_beyond_the_bound_there_is_no_pose():
 def test_the_gap_is_the_distance_to_the_nearest_sample(times, t_ns):
     times.sort()
     track = Trajectory(times, [turn(k / 30, k) for k in range(len(times))], max_gap_ns=10**13)
-    found = track.at(t_ns)
-    assert found.gap_ns == min(abs(t - t_ns) for t in times)
+    found, gap_ns = track.at(t_ns)
+    assert gap_ns == min(abs(t - t_ns) for t in times)
     if t_ns in times:
-        assert found.pose == turn(times.index(t_ns) / 30, times.index(t_ns))
-    assert 0 <= found.pose.translation_m[0] <= len(times) - 1
+        assert found == turn(times.index(t_ns) / 30, times.index(t_ns))
+    assert 0 <= found.translation_m[0] <= len(times) - 1
 
 
 def test_a_fixed_pose_has_no_gap():
-    assert FixedPose(turn(0.3)).at(123).gap_ns == 0
+    assert FixedPose(turn(0.3)).at(123) == (turn(0.3), 0)
 
 
 def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     file = tmp_path / "groundtruth.txt"
     file.write_text("# comment\n\n1305031102.175304 1 2 3 0 0 0.5 0.8660254\n1305031102.2 1,2,3,0,0,0,1\n")
     track = read_tum(file)
-    exact = track.at(1305031102_175304000)
-    assert exact.gap_ns == 0
-    np.testing.assert_allclose(exact.pose.matrix()[:3, :3], so3_exp([0, 0, np.pi / 3]), atol=1e-6)
+    exact, gap_ns = track.at(1305031102_175304000)
+    assert gap_ns == 0
+    np.testing.assert_allclose(exact.matrix()[:3, :3], so3_exp([0, 0, np.pi / 3]), atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.camera_poses import base_matrix, load_hand_eyes

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
-from camera_node.capture import Camera
+from camera_node.capture import Camera, build_cameras
 from camera_node.config import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES
@@ -122,7 +121,8 @@ def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name
 
 
 @pytest.mark.parametrize(
-    "name", ["fog", "lens_distortion", "rolling_shutter", "shadows", "specular", "vignetting"]
+    "name",
+    ["fog", "lens_distortion", "motion_blur", "rolling_shutter", "shadows", "specular", "vignetting"],
 )
 def test_recordings_have_lenses_and_weather_of_their_own(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})

@@ -129,7 +129,7 @@ def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
     both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.moving_bodies[0]
     like = [body for body in both.world.moving_bodies if len(body.parts) == len(alone.parts)]
     assert [np.allclose(body.matrices(0.7), alone.matrices(0.7)) for body in like] == [True]
-    with pytest.raises(ValueError, match="both, one or person"):
+    with pytest.raises(ValueError, match=r"movers is .none., expected one of both, one, person"):
         make_scene("tower", {"movers": "none"})
 
 
@@ -192,10 +192,11 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
         ("rooom", {}, "valid scenes: room, tile, tower"),
         ("room", {"speed": 1.0}, "valid .default.: count .13., width"),
         ("tile", {"speed_m_per_s": 1.0}, "unknown parameter 'speed_m_per_s'"),
-        ("room", {"count": 20}, "count must be within 1 to 19"),
-        ("room", {"count": 0}, "count must be within 1 to 19"),
+        ("room", {"count": 20}, "count is 20, expected 1 to 19"),
+        ("room", {"count": 0}, "count is 0, expected 1 to 19"),
+        ("tower", {"horizontal_fov_deg": 160}, "horizontal_fov_deg is 160, expected 5 to 150"),
         ("room", {"width": 12.5}, "whole number"),
-        ("room", {"width": 5000}, "width must be within"),
+        ("room", {"width": 5000}, "width is 5000, expected 8 to"),
         ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s must be 0 or within"),
         ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s must be 0 or within"),
         ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
@@ -240,7 +241,7 @@ def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
         assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
     still = seen(speed_m_per_s=0.0)
     assert np.array_equal(seen(speed_m_per_s=0.0, motion_seed=4), still)
-    with pytest.raises(SceneError, match="motion_seed must be 0 or more"):
+    with pytest.raises(SceneError, match="motion_seed is -1, expected 0"):
         seen(motion_seed=-1)
 
 
@@ -271,7 +272,10 @@ def test_a_walk_may_stop_reverse_or_jump_and_two_may_walk_it():
     two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * loop.period_s)
     still = np.abs(one.astype(int) - other).max(axis=2) <= 1
     assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
-    for params, message in (({"course": "hops"}, "course: expected one of loop"), ({"people": 3}, "1 or 2")):
+    for params, message in (
+        ({"course": "hops"}, "course is 'hops', expected one of loop"),
+        ({"people": 3}, "people is 3, expected 1 to 2"),
+    ):
         with pytest.raises(SceneError, match=message):
             make_scene("room", params)
 

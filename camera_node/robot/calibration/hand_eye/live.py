@@ -9,14 +9,16 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import sort_samples
-from camera_node.pose.providers import PoseProvider, Trajectory, TrajectoryError, read_samples
+from camera_node.pose.providers import PoseProvider, Trajectory, read_samples
+from camera_node.robot.arm.camera_poses import base_matrix
+from camera_node.robot.arm.drive import stop_signals
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
 from camera_node.robot.calibration import ArmStopped, CalibrationError, live_camera
 from camera_node.robot.calibration.files import pairs_json, read_pairs
+from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, HandEyeSession, HandEyeStep, preview
@@ -26,16 +28,13 @@ from camera_node.sources.base import Source
 from freshfield import files, scenario
 from freshfield.geometry import Pinhole, se3_inverse
 
-if TYPE_CHECKING:
-    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
-
 
 def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
     """Run a session with a scenario's camera and calibrate from its samples. Ctrl-C ends the session early.
 
     board, lens: the target, and a lens that replaces the camera's own.
     setup: eye-in-hand or eye-to-hand.
-    Raises CalibrationError and ScenarioError.
+    Raises CalibrationError, and as what it opens: scenario, files, camera, arm.
     """
     if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
         raise CalibrationError("--want-mm, --seconds: expected positive numbers")
@@ -71,11 +70,8 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
 
     hands = None
     if args.hand is not None:
-        try:
-            times, poses, _ = sort_samples(*read_samples(args.hand))
-            hands = Trajectory(times, poses, max_gap_ns=round(args.max_gap_ms * 1e6))
-        except TrajectoryError as error:
-            raise CalibrationError(str(error)) from None
+        times, poses, _ = sort_samples(*read_samples(args.hand))
+        hands = Trajectory(times, poses, max_gap_ns=round(args.max_gap_ms * 1e6))
     session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
     pace = live_camera.Pace(float(source.fps), args.seconds)
     tracks = StreamRecorder() if args.moving and to_base is not None else None
@@ -116,16 +112,8 @@ def _create_writable(folder: Path) -> None:
 
 
 def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
-    """Connect to the arm. From now on a termination signal stops a move first. Raises CalibrationError and
-    ScenarioError."""
-    from camera_node.robot.arm.drive import stop_signals
-    from camera_node.robot.arm.joint_states import ArmError
-    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
-
-    try:
-        mover = ArmMover(loaded, arm, agreed_to)
-    except ArmError as error:
-        raise CalibrationError(str(error)) from None
+    """Connect to the arm. From now on a termination signal stops a move first. Raises as ``ArmMover``."""
+    mover = ArmMover(loaded, arm, agreed_to)
     for number in stop_signals():
         if number != signal.SIGINT:
             signal.signal(number, signal.default_int_handler)
@@ -135,8 +123,6 @@ def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Arm
 def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
     """Base-from-world (4, 4), because the arm's poses are in the world and the calibration needs them in its
     base. Raises CalibrationError."""
-    from camera_node.robot.arm.camera_poses import base_matrix
-
     if camera not in arm.cameras or arm.cameras[camera] is not None:
         raise CalibrationError(
             f"{loaded.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "
@@ -177,7 +163,7 @@ def guide(
         if t_ns is None:
             t_ns = round(tick * 10**9 / source.fps)
         try:
-            hand = shot.pose if hands is None else hands.at(t_ns - begin_ns).pose
+            hand = shot.pose if hands is None else hands.at(t_ns - begin_ns)[0]
         except ValueError as error:
             live_camera.report_skipped(error)
             continue

@@ -8,22 +8,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numpy as np
-
-from camera_node.pose.pairing import sort_samples
+from camera_node.config import ArmConfig
+from camera_node.robot.arm.camera_poses import arm_model
+from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.files import Track, sorted_track
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, HandEyeStep
 from freshfield import files
+from freshfield.clock import WallClock
 from freshfield.geometry import Pose
-
-if TYPE_CHECKING:
-    from camera_node.config import ArmConfig
-    from camera_node.robot.arm.joint_states import ArmStream
-    from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario
 
 HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
 # Motion with the target in sight. The offset's deviation falls with the square root of its duration.
@@ -69,11 +65,11 @@ class StreamRecorder:
 
     def hand(self) -> Track:
         """The hand's stream. Raises CalibrationError for fewer than two poses."""
-        return _track(list(self._hands), "joint states")
+        return sorted_track(*_columns(self._hands), "joint states")
 
     def target(self) -> Track:
         """The target's stream. Raises CalibrationError for fewer than two poses."""
-        return _track(self._targets, "sightings of the target")
+        return sorted_track(*_columns(self._targets), "sightings of the target")
 
     def write(self, folder: Path) -> None:
         """Write ``hand.csv`` and ``target.csv``. Raises CalibrationError."""
@@ -87,28 +83,19 @@ class StreamRecorder:
 
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
-    Raises CalibrationError."""
-    from camera_node.robot.arm.camera_poses import arm_model
-    from camera_node.robot.arm.joint_states import ArmStream
-    from freshfield.clock import WallClock
+    Raises ScenarioError and ArmError."""
 
     def add_hand(t_ns: int, joints: Array) -> None:
         tracks.add_hand(t_ns, model.forward(joints))
 
-    try:
-        model = arm_model(scenario, config)
-        stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=add_hand)
-        stream.start()
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
+    model = arm_model(scenario, config)
+    stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=add_hand)
+    stream.start()
     return stream
 
 
-def _track(rows: list[tuple[int, Array]], what: str) -> Track:
-    times, poses, counts = sort_samples([t for t, _ in rows], [pose for _, pose in rows])
-    if len(times) < 2:
-        raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving hand")
-    return Track(np.array(times, dtype=np.int64), np.array(poses), counts)
+def _columns(rows: list[tuple[int, Array]]) -> tuple[list[int], list[Array]]:
+    return [t_ns for t_ns, _ in list(rows)], [pose for _, pose in list(rows)]
 
 
 def _line(t_ns: int, pose: Array) -> str:

@@ -13,9 +13,9 @@ from camera_node.robot.calibration import CalibrationError, live_camera
 from camera_node.robot.calibration.lens.session import LensSession
 from camera_node.robot.calibration.lens.solve import LensCalibration
 from camera_node.robot.calibration.targets import Target
+from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import as_camera_error
 from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
-from camera_node.sources.playback import rate
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
@@ -24,7 +24,7 @@ _GRAB_S = 1.0
 
 def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
     """Run a session with a scenario's camera and calibrate from its images. Ctrl-C ends the session early.
-    Raises CalibrationError and ScenarioError."""
+    Raises CalibrationError, ScenarioError and CameraError."""
     if args.seconds is not None and not args.seconds > 0:
         raise CalibrationError("--seconds: expected a positive number")
     loaded = live_camera.load_scenario(args)
@@ -64,10 +64,7 @@ def _images(
 def _camera_images(config: LiveConfig, args: argparse.Namespace) -> Generator[live_camera.Image, None, None]:
     """Images from the camera's feed, because a source would require the lens, which is not known yet."""
     fps = rate(config.fps or DEFAULT_FPS)
-    try:
-        feed = open_feed(args.camera, config, fps, WallClock())
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
+    feed = open_feed(args.camera, config, fps, WallClock())
     pace = live_camera.Pace(float(fps), args.seconds)
     try:
         for tick in itertools.count():

@@ -21,12 +21,7 @@ from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from freshfield.scenario import load
-from tests.camera_node.robot.arm.simulated import (
-    simulated_arm,
-    start_cli,
-    wait_until_moving,
-    write_cell,
-)
+from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 
 PATH = {"azimuths_deg": [-150, -120], "elevations_deg": [60], "rolls_deg": [0], "speed_rad_s": 3.0,
         "acceleration_rad_s2": 20.0}  # fmt: skip

@@ -76,7 +76,7 @@ def test_joints_come_with_their_times():
         wait_until(lambda: stream.received > 20)
         assert stream.trouble == "" and stream.connections == 1
         hand = HandPoses(stream, UR3E, np.eye(4), WITHIN_S)
-        assert np.allclose(hand.at(clock.now_ns()).pose.matrix(), UR3E.forward(HOME_RAD), atol=1e-12)
+        assert np.allclose(hand.at(clock.now_ns())[0].matrix(), UR3E.forward(HOME_RAD), atol=1e-12)
 
 
 def test_no_controller_is_one_clear_line():

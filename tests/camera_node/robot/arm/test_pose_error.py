@@ -12,12 +12,7 @@ import pytest
 from camera_node.robot.arm import pose_error as measuring
 from camera_node.robot.arm.pose_error import PoseError, by_gap_and_speed, by_rate, format_gaps, measure
 from camera_node.robot.hand_camera import TruthClient
-from tests.camera_node.robot.arm.simulated import (
-    simulated_arm,
-    start_cli,
-    wait_until_moving,
-    write_cell,
-)
+from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 
 
 def made():

@@ -148,7 +148,7 @@ def test_where_the_base_stands():
         ({"frequency_hz": 1000}, "frequency_hz is 1000, expected 10 to 500"),
         ({"host": "192.168.56.101", "simulated": True}, "simulated: host is 192.168.56.101"),
         ({"pairing": "guessed"}, "pairing is 'guessed'"),
-        ({"path": {"radius_m": -1}}, "radius_m above 0"),
+        ({"path": {"radius_m": -1}}, "arm.path: radius_m is -1, expected 0.001"),
         ({"hosts": "x"}, "arm.hosts: unknown key"),
     ],
 )

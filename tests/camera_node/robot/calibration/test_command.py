@@ -134,7 +134,7 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
     assert "expected one of FOLDER" in fails("--pairs", pairs, "--live", "room")
     assert "expected one of FOLDER" in fails("--hand", pairs)
     assert "expected one of FOLDER" in fails("--live", "room", "--target", pairs)
-    assert "none.json: cannot be read: No such file" in fails("--pairs", tmp_path / "none.json")
+    assert "none.json: no such file" in fails("--pairs", tmp_path / "none.json")
     for option in ("--board", "--lens", "--camera", "--samples"):
         assert f"{option}: goes with " in fails("--pairs", pairs, option, "x")
     assert "--moving: goes with " in fails("--pairs", pairs, "--moving")

@@ -19,12 +19,7 @@ from camera_node.robot.teleop import sinks
 from camera_node.robot.teleop.network_stylus import encode
 from camera_node.robot.teleop.teleoperator import Command
 from freshfield.clock import WallClock
-from tests.camera_node.robot.arm.simulated import (
-    simulated_arm,
-    start_cli,
-    wait_until_moving,
-    write_cell,
-)
+from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 from tests.camera_node.robot.teleop.checks import HOME, sample
 
 
@@ -134,12 +129,12 @@ def test_an_arm_that_is_not_there_is_one_line_and_moves_nothing(tmp_path, capsys
 @pytest.mark.parametrize(
     "section, part",
     [
-        ({"speed_rad_s": 99}, "source.arm.teleop: speed_rad_s: expected 0.001 to 6.28"),
+        ({"speed_rad_s": 99}, "source.arm.teleop: speed_rad_s is 99, expected 0.001 to 6.28"),
         ({"scale": [1, 0, 1]}, "source.arm.teleop: scale"),
         ({"sped": 1}, "source.arm.teleop.sped"),
         ({"acceleration_rad_s2": 0.06}, "too low to come to rest"),
         ({"workspace_low_m": [0, 0, 1]}, "workspace_low_m must be below"),
-        ({"solver": "best"}, "solver: expected one of"),
+        ({"solver": "best"}, "solver is 'best', expected one of"),
     ],
 )
 def test_wrong_settings_are_one_line(tmp_path, capsys, section, part):

@@ -14,7 +14,7 @@ from camera_node.robot.teleop.command import open_stylus
 from camera_node.robot.teleop.gamepad import SPEED_M_S, TURN_RAD_S, AxisRange, GamepadState
 from camera_node.robot.teleop.keyboard import KeyboardStylus
 from camera_node.robot.teleop.network_stylus import MAX_BYTES, NetworkStylus, encode, parse
-from camera_node.robot.teleop.pose_integrator import PoseIntegrator
+from camera_node.robot.teleop.stylus import PoseIntegrator
 from tests.camera_node.robot.teleop.checks import sample
 
 GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}

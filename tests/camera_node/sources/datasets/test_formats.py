@@ -110,7 +110,7 @@ def test_dynerf_damage_is_named(tmp_path):
 
 def test_zju_sees_points_where_they_are(tmp_path):
     cameras = sets.rig(3, BENT)
-    dataset = zju.load_dataset(sets.write_zju(tmp_path, cameras), fps=10.0)
+    dataset = zju.load_dataset(sets.write_zju(tmp_path, cameras), recorded_fps=10.0)
     assert dataset.moving and dataset.cameras == ("Camera_B1", "Camera_B2", "Camera_B3")
     first = [dataset.of(name)[0] for name in dataset.cameras]
     agree(first, cameras)
@@ -364,7 +364,7 @@ def test_colmap_damage_is_named(tmp_path, binary):
             file.write_bytes(whole[file] + b"more")
             fails("4 bytes follow its last entry", colmap.load_dataset, folder)
             file.write_bytes(whole[file])
-        cameras.write_bytes(whole[cameras][:12] + struct_i32(9) + whole[cameras][16:])
+        cameras.write_bytes(whole[cameras][:12] + (9).to_bytes(4, "little") + whole[cameras][16:])
         fails("camera 1: model 9: expected one of", colmap.load_dataset, folder)
     else:
         text = whole[cameras].decode()
@@ -386,10 +386,6 @@ def test_colmap_damage_is_named(tmp_path, binary):
     for file in (folder / "images").iterdir():
         file.unlink()
     fails("none of its 3 images exists", colmap.load_dataset, folder)
-
-
-def struct_i32(value):
-    return int(value).to_bytes(4, "little")
 
 
 # --- all of them --------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import CameraConfig, source_config
 from camera_node.pose.providers import FixedPose
 from camera_node.sources.devices import opencv as opencv_camera

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.pose.providers import FixedPose
 from camera_node.sources.devices import oak

@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from camera_node.build import build_cameras
+from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.sources.devices.feed import CameraError
 from freshfield.clock import VirtualClock, WallClock

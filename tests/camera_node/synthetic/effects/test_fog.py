@@ -88,10 +88,3 @@ def test_a_body_hides_the_fog_behind_it_whatever_the_order():
     assert np.array_equal(*images)
     still = CameraRenderer(foggy(World((near, far), (), FLAT)), CAMERA, POSE).image(0.0)
     assert np.abs(images[0].astype(int) - still).max() <= 1
-
-
-def test_the_original_scene_stays_clear():
-    scene = make_scene("tile", {"width": 16, "height": 16, "supersample": 1})
-    before = scene.render("cam01", 0.0)
-    assert not np.array_equal(make(visibility_m=1.0).extend(scene).render("cam01", 0.0), before)
-    assert scene.world.medium is None and np.array_equal(scene.render("cam01", 0.0), before)

@@ -44,14 +44,6 @@ def test_both_the_arm_and_the_scene_repeat_after_the_new_period():
         assert (np.abs(early - late).max(axis=-1) > 1).mean() < 2e-3
 
 
-def test_the_original_scene_is_unchanged():
-    scene = make_scene("room", SMALL)
-    before = scene.render("cam00", 0.4)
-    make().extend(scene).render("cam00", 0.4)
-    assert np.array_equal(scene.render("cam00", 0.4), before)
-    assert len(scene.world.moving_bodies) == 1
-
-
 def test_it_hides_what_is_behind_and_is_hidden_by_what_is_in_front():
     """Swept to the far side of the target it is behind the person and the furniture: nearly invisible."""
     scene = make_scene("room", {**SMALL, "count": 2, "speed_m_per_s": 0.0})

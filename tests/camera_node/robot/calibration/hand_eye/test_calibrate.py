@@ -14,6 +14,7 @@ from camera_node.robot.calibration.hand_eye.closed_form import METHODS, residual
 from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, rotation_mismatch_deg
 from camera_node.robot.calibration.targets import parse_target
+from camera_node.sources.datasets.records import DatasetError
 from tests.camera_node.robot.calibration.pictures import noisy_samples
 from tests.conftest import data_dir
 
@@ -127,7 +128,7 @@ def test_the_targets_uncertainty_counts_where_it_is_known():
 def test_pairs_that_are_none(tmp_path, text, message):
     file = tmp_path / "pairs.json"
     file.write_text(text)
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises((CalibrationError, DatasetError), match=message):
         read_pairs(file, EYE_IN_HAND)
 
 

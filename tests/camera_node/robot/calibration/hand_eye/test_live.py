@@ -99,7 +99,7 @@ def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatc
     assert distance_mm(found, X) < 0.6 and angle_deg(found, X) < 0.1
     if setup == EYE_TO_HAND:
         used = dataclasses.replace(config, cameras={"eye": str(out)})
-        place = camera_poses(plan, used, ["eye"])["eye"].at(0).pose.matrix()
+        place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
         assert distance_mm(place, base @ X) < 0.6
 
 

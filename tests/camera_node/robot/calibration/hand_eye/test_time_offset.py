@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.pairing import PairingCounts
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.accuracy_study import streams
@@ -31,7 +30,7 @@ def test_any_offset_is_found_to_half_a_millisecond(offset_s):
 
 def test_a_camera_that_stands_works_alike():
     hand, target = streams(simulated.Sweep(0.15), 15.0, 0.1, np.random.default_rng(2))
-    held = Track(hand.times_ns, inverse(hand.poses), hand.counts)
+    held = Track(hand.times_ns, inverse(hand.poses))
     found = calibrate_tracks(held, target, EYE_TO_HAND)
     assert found.time_offset_s == pytest.approx(0.1, abs=5e-4)
     assert distance_mm(found.transform, X) < 1.0
@@ -41,7 +40,7 @@ def test_gaps_are_left_out_and_counted():
     hand, target = streams(simulated.Sweep(0.15), 20.0, 0.25, np.random.default_rng(3))
     t_s = (hand.times_ns - hand.times_ns[0]) / 1e9
     kept = ~(((t_s > 4) & (t_s < 6)) | ((t_s > 11) & (t_s < 11.3)))
-    found = calibrate_streams(Track(hand.times_ns[kept], hand.poses[kept], hand.counts), target, EYE_IN_HAND)
+    found = calibrate_streams(Track(hand.times_ns[kept], hand.poses[kept]), target, EYE_IN_HAND)
     assert found.offset_s == pytest.approx(0.25, abs=5e-4)
     assert 25 <= found.unpaired <= 40  # 2.3 s at 15 a second, less what is within the bound
 
@@ -55,8 +54,8 @@ def turning(angle_of, seconds=12.0) -> tuple[Track, Track]:
         a = angle_of(t_s)
         poses[:, 0, 0] = poses[:, 1, 1] = np.cos(a)
         poses[:, 1, 0], poses[:, 0, 1] = np.sin(a), -np.sin(a)
-        out.append(Track((t_s * 1e9).astype(np.int64), poses, PairingCounts()))
-    return out[0], Track(out[1].times_ns, inverse(out[1].poses), PairingCounts())
+        out.append(Track((t_s * 1e9).astype(np.int64), poses))
+    return out[0], Track(out[1].times_ns, inverse(out[1].poses))
 
 
 @pytest.mark.parametrize(
@@ -77,7 +76,7 @@ def test_streams_of_different_bodies_are_refused():
     hand, _ = streams(simulated.Sweep(0.15), 20.0, 0.0, np.random.default_rng(4))
     still = simulated.Sweep(0.05)
     t_s = (hand.times_ns / 1e9)[::8]
-    other = Track(hand.times_ns[::8], simulated.observed_targets(still.hands(t_s + 300.0)), PairingCounts())
+    other = Track(hand.times_ns[::8], simulated.observed_targets(still.hands(t_s + 300.0)))
     with pytest.raises(CalibrationError, match=r"turn alike|does not settle|repeats"):
         calibrate_streams(hand, other, EYE_IN_HAND)
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera_node.sources.base import rate
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.sources.datasets.streamer import split_photos
-from camera_node.sources.playback import Playback, rate
+from camera_node.sources.datasets.streamer import Playback, split_photos
 
 
 def test_back_and_forth_and_restart():
