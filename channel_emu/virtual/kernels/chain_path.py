@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numba import njit
 
+from channel_emu.model import nanoseconds
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
@@ -25,14 +26,8 @@ _NEVER = float(NEVER_NS)
 _BLOCK = 256
 
 
-@njit(cache=True, nogil=True)
-def saturating_round(span_ns):
-    return NEVER_NS if span_ns >= _NEVER else np.int64(span_ns + 0.5)
-
-
-@njit(cache=True, nogil=True)
-def saturating_add(instant_ns, span_ns):
-    return min(instant_ns + span_ns, NEVER_NS)
+saturating_round = njit(nanoseconds.saturating_round, nogil=True)
+saturating_add = njit(nanoseconds.saturating_add, nogil=True)
 
 
 @njit(cache=True, nogil=True)
