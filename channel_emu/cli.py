@@ -7,17 +7,18 @@ import asyncio
 import dataclasses
 import json
 import logging
+import re
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu import cli_syntax
 from channel_emu.estimate.recording import ROW_DISCIPLINES
-from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping
+from channel_emu.model import ages, spelling
+from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES
-from channel_emu.model.presets import PRESETS
+from channel_emu.model.presets import FROM_FILES, PRESETS
 from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
 
@@ -28,7 +29,9 @@ DESCRIPTION = """\
 Emulates a bad network between cameras and the edge, seeded and per frame.
 
   channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room
+  channel-emu presets
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
+  channel-emu simulate --preset gilbert-elliott --metric shown:20ms:16.7ms --csv frames.csv --plot ages.png
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu replay runs/room/trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
@@ -47,7 +50,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_run, _add_simulate, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
+    for add in (
+        _add_run,
+        _add_simulate,
+        _add_presets,
+        _add_replay,
+        _add_proxy,
+        _add_fit,
+        _add_bench,
+        _add_accuracy,
+    ):
         add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -80,7 +92,7 @@ def _run(args: argparse.Namespace) -> int:
     from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
-    config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
+    config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent)
     priority = "normal" if args.no_priority else raise_priority()
     status, _ = _serve(args, config, plan.seed, hook=FrameStream(plan.cameras, args.out, priority))
     return status
@@ -142,6 +154,12 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument("--frame-bytes", type=int, default=20_000, metavar="N", help="for the bandwidth fault")
     sub.add_argument("--slot-ms", type=float, default=1.0, metavar="MS", help="default: %(default)s")
     sub.add_argument("--engine", choices=["auto", "python", "kernel"], default="auto")
+    sub.add_argument("--metric", action="append", default=[], metavar="NAME[:VALUE...]", help="further ages: "
+                     + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items())
+                     )  # fmt: skip
+    sub.add_argument("--csv", type=Path, metavar="FILE", help="a row a frame: when it was offered and "
+                     "delivered, as fit reads them")  # fmt: skip
+    sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: ages over time, delays")
     sub.add_argument("--json", action="store_true", help="everything, as one JSON object")
     sub.set_defaults(go=_simulate)
 
@@ -149,14 +167,17 @@ def _add_simulate(commands: Any) -> None:
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     """The options that describe a channel, as ``_config_of`` reads them."""
     source = sub.add_mutually_exclusive_group()
-    source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
+    source.add_argument("--preset", default="ideal", metavar="NAME", help="one of those that channel-emu "
+                        "presets lists, or of a file (%(default)s)")  # fmt: skip
     source.add_argument("--scenario", help="take the channel section of a scenario")
     sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
                      "rate for each state: mmpp:1/120ms,1/30ms; mmpp alone: these, the "
                      "thesis's (6.4.2)")  # fmt: skip
     sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-                     "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
-    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
+                     "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms")  # fmt: skip
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="the same: exp:30ms,exp:60ms")
+    sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
+                     "state, reset:{at_ms: [50]}; may be given several times")  # fmt: skip
     sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and "
                      "scope=per-camera, initial=s1, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
@@ -166,19 +187,25 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
+    from channel_emu.virtual import output
     from channel_emu.virtual.link_run import OUTCOMES
     from channel_emu.virtual.simulate import simulate
 
-    result = simulate(
+    simulation = simulate(
         _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
         frame_period_ms=args.frame_period_ms, frame_bytes=args.frame_bytes, slot_ms=args.slot_ms,
-    ).summary()  # fmt: skip
+    )  # fmt: skip
+    result = simulation.summary(args.metric)
+    if args.csv:
+        output.write_frames(simulation, args.csv)
+    if args.plot:
+        output.plot_ages(simulation, args.plot)
     if args.json:
         print(json.dumps(result))
         return 0
-    for key, label in (("mean_age_ms", "mean age"), ("mean_age_slotted_ms", "mean age at slot boundaries"),
-                       ("peak_age_ms", "peak age")):  # fmt: skip
-        value = result[key]
+    shown = {"mean age": result["mean_age_ms"], "mean age at slot boundaries": result["mean_age_slotted_ms"],
+             "peak age": result["peak_age_ms"], **result["metrics_ms"]}  # fmt: skip
+    for label, value in shown.items():
         print(f"{label:28} {'-' if value is None else f'{value:.3f} ms'}")
     delay = result["delay_ms"]
     if delay["mean"] is not None:
@@ -196,27 +223,57 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
+    """The channel of ``_add_channel_options``; a scenario spells its section in the same way."""
     if args.service and args.service_by_state:
-        raise cli_syntax.SpellingError("--service and --service-by-state exclude each other")
+        raise spelling.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
+    folder = Path()
     if args.scenario:
-        section = dict(scenario.load(args.scenario).channel)
-    given = {
-        "arrivals": cli_syntax.arrivals(args.arrivals) if args.arrivals else None,
-        "service": cli_syntax.service(args.service) if args.service else None,
-        "chain": cli_syntax.chain(args.chain) if args.chain else None,
-        "service_state": args.service_state,
-        "discipline": args.discipline,
-    }
-    if args.shared_server:
-        given["server"] = {"shared": True, "order": args.shared_server}
-    if vars(args).get("spread"):  # of simulate alone
-        base = section.get("arrivals") or {}
-        base = {"process": base} if isinstance(base, str) else base
-        given["arrivals"] = {**(given["arrivals"] or base), "spread": True}
+        plan = scenario.load(args.scenario)
+        section, folder = dict(plan.channel), plan.path.parent
+    for key in ("arrivals", "service", "chain", "service_state", "discipline"):
+        if value := vars(args)[key]:
+            section[key] = spelled_out(key, value)
     if args.service_by_state:
-        given["service"] = cli_syntax.service_by_state(args.service_by_state)
-    return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "channel")
+        section["service"] = spelled_out("service", args.service_by_state)
+    if args.fault:
+        section["faults"] = dict(section.get("faults") or {})
+        for text in args.fault:
+            section["faults"] |= spelling.fault(text)
+    if args.shared_server:
+        section["server"] = {"shared": True, "order": args.shared_server}
+    if vars(args).get("spread"):  # of simulate alone
+        section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
+    return channel_from_mapping(section, "channel", folder)
+
+
+def _add_presets(commands: Any) -> None:
+    sub = commands.add_parser(
+        "presets", help="the channels that have a name, with their parameters and mean delay",
+        description="Lists the presets: what each is for, its parameters as a scenario's channel section has "
+        "them, and the mean delay over the long-run shares of its states.",
+    )  # fmt: skip
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_presets)
+
+
+def _presets(args: argparse.Namespace) -> int:
+    rows: list[dict[str, Any]] = []
+    for name, (about, channel) in PRESETS.items():
+        mean_ms = channel_from_mapping({"preset": name}).mean_delay_ms
+        rows.append({"preset": name, "about": about, "mean_delay_ms": mean_ms, "channel": channel})
+    if args.json:
+        print(json.dumps(rows))
+        return 0
+    print(f"{'preset':16} mean delay")
+    for row in rows:
+        print(f"{row['preset']:16} {row['mean_delay_ms']:7.1f} ms  {row['about']}")
+        for key, value in row["channel"].items():
+            text = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):.4g}", json.dumps(value))
+            print(f"{'':28}{key}: {text.replace(chr(34), '')}")
+    for name, about in FROM_FILES.items():
+        print(f"{name}\n{'':28}{about}")
+    return 0
 
 
 def _add_replay(commands: Any) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from channel_emu.model import faults
 from channel_emu.model.chain import Chain
-from channel_emu.model.config import ChannelConfig, per_state
+from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.faults import per_state
 from channel_emu.model.link import Link
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import (

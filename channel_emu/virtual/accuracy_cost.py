@@ -20,7 +20,7 @@ from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS, periodic_loop
 from channel_emu.virtual.simulate import SimulationError, simulate
-from freshfield.files import write_csv
+from freshfield.files import picture, write_csv
 
 Rows = list[dict[str, Any]]
 
@@ -168,25 +168,18 @@ def show(tables: dict[str, Rows]) -> str:
 
 
 def write(tables: dict[str, Rows], out: Path) -> list[Path]:
-    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises SimulationError without matplotlib."""
-    out.mkdir(parents=True, exist_ok=True)
+    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises PlotError without matplotlib."""
     written = []
     for name, rows in tables.items():
         path = out / f"accuracy-{name}.csv"
         write_csv(path, rows)
         written.append(path)
-    return [*written, _draw(tables, out / "accuracy.png")]
+    with picture(out / "accuracy.png", 1, 3, size=(13, 4)) as axes:
+        _draw(tables, *axes[0])
+    return [*written, out / "accuracy.png"]
 
 
-def _draw(tables: dict[str, Rows], path: Path) -> Path:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise SimulationError("the figure needs matplotlib (pip install 'freshfield[edge]')") from None
-    figure = Figure(figsize=(13, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, middle, right = figure.subplots(1, 3)
+def _draw(tables: dict[str, Rows], left: Any, middle: Any, right: Any) -> None:
     error = [r["rms_error_pct"] for r in tables["duration"]]
     left.loglog([r["seconds"] for r in tables["duration"]], error, "o-", label="seconds simulated")
     left.loglog([r["wall_ms"] / 1e3 for r in tables["duration"]], error, "s--", label="seconds of computing")
@@ -208,8 +201,6 @@ def _draw(tables: dict[str, Rows], path: Path) -> Path:
     counts = [r["seeds"] for r in tables["seeds"]]
     right.set_xticks(counts, [str(count) for count in counts])
     right.minorticks_off()
-    figure.savefig(path, dpi=120)
-    return path
 
 
 def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> float:

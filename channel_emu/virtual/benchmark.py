@@ -22,7 +22,7 @@ _CHANCE = {"probability": 0.1}
 FAULTS: dict[str, dict[str, Any]] = {
     "loss": _CHANCE, "duplication": _CHANCE, "corruption": _CHANCE,
     "blackout": {"every_ms": 1000.0, "for_ms": 50.0}, "reset": {"mean_interval_ms": 1000.0},
-    "bandwidth": {"megabits_per_s": 1000.0},
+    "bandwidth": {"megabits_per_s": 1000.0}, "mahimahi": {"opportunities_ms": [1] * 20},
 }  # fmt: skip
 _PERIOD_NS = 10**6
 PERIOD_MS, MEAN_MS = 30.0, 60.0  # of captures and delays in the thesis's chapter 5

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import LAWS, ChannelConfig, per_state
+from channel_emu.model.config import LAWS, ChannelConfig
 from channel_emu.model.counter_rng import stream_key
+from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
-from channel_emu.virtual.kernels import chain_path, service, work
-from channel_emu.virtual.link_run import LinkRun, camera_period_ms, name_ranks
+from channel_emu.virtual.kernels import chain_path, philox, service, work
+from channel_emu.virtual.link_run import OUTCOME_CODES, LinkRun, camera_period_ms, name_ranks
 from freshfield.machine_load import usable_cores
 
 # Virtual time of all cameras together below which a thread pool costs more than it saves.
@@ -101,7 +102,7 @@ def _serve_alone(
         config.queue_limit, _work(config, channel, name, len(arrive)), *_service_means(config), *path,
         np.zeros(1, np.int64), np.array([len(path[0])]), end_ns,
     )  # fmt: skip
-    return LinkRun(name, offered, outcome, started, due, end_ns, _state_shares(config, path, end_ns))
+    return _run_of(config, channel, name, path, (offered, outcome, started, due), end_ns)
 
 
 def _serve_together(
@@ -133,11 +134,26 @@ def _serve_together(
     runs: dict[int, LinkRun] = {}
     for rank, i in enumerate(by_rank):
         mine = camera == rank
-        runs[int(i)] = LinkRun(
-            names[i], offered[mine], outcome[mine], started[mine], due[mine], end_ns,
-            _state_shares(config, paths[rank], end_ns),
-        )  # fmt: skip
+        frames = (offered[mine], outcome[mine], started[mine], due[mine])
+        runs[int(i)] = _run_of(config, channel, names[i], paths[rank], frames, end_ns)
     return [runs[i] for i in range(len(names))]
+
+
+def _run_of(
+    config: ChannelConfig, channel: Channel, name: str, path: Path, frames: tuple[Any, ...], end_ns: int
+) -> LinkRun:
+    """frames: offered_ns, outcome, started_ns and due_ns of a ``LinkRun``, without the fault loss."""
+    offered, outcome, started, due = frames
+    starts, states = path
+    if loss := config.faults.get("loss"):
+        uniform, other = np.empty(len(offered)), np.empty(len(offered))
+        philox.fill(0, uniform, other, _key(channel.seed, name, "channel.loss"))
+        chance = np.array(per_state(loss.probability))
+        if len(chance) > 1:
+            chance = chance[states[np.searchsorted(starts[:-1], np.maximum(started, 0), side="right") - 1]]
+        outcome[(outcome == service.DELIVERED) & (uniform < chance)] = OUTCOME_CODES["lost"]
+    spent_ns = np.bincount(states, np.diff(np.minimum(starts, end_ns)), len(config.state_names))
+    return LinkRun(name, offered, outcome, started, due, end_ns, [float(ns) / end_ns for ns in spent_ns])
 
 
 def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDArray[np.float64]:
@@ -152,12 +168,6 @@ def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], bool]:
     """means_ms and modulated, as the kernels take them."""
     means_ms = per_state(config.service.mean_ms) if config.service.mean_ms is not None else [1.0]
     return np.array(means_ms, float), config.service_state == "modulated" and len(means_ms) > 1
-
-
-def _state_shares(config: ChannelConfig, camera_path: Path, end_ns: int) -> list[float]:
-    starts, states = camera_path
-    spent_ns = np.bincount(states, np.diff(np.minimum(starts, end_ns)), len(config.state_names))
-    return [float(ns) / end_ns for ns in spent_ns]
 
 
 def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:

@@ -34,13 +34,19 @@ def late_ms(records: list[Record]) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("section", [FAST, CHAPTER_5, PARALLEL], ids=["ch6", "ch5", "parallel"])
+# Losses by state, and a line that lets 20 packets go every 4 ms.
+LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "mahimahi": [4] * 20}}
+
+
+@pytest.mark.parametrize(
+    "section", [FAST, CHAPTER_5, PARALLEL, LOSSY], ids=["ch6", "ch5", "parallel", "lossy"]
+)
 def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path, section: dict) -> None:
     """The trace's offers in virtual time deliver each frame when it is due, live a moment later: the age is
     greater by that moment, weighted by what the frame was worth."""
     run(record(tmp_path, section, 0.005, 100))
     found = trace.read(tmp_path / "t.jsonl")
-    end_ns = max(max(r.offered_ns, r.actual_ns or 0) for r in found.records)
+    end_ns = max(max(r.offered_ns, r.ended_ns or 0, r.actual_ns or 0) for r in found.records)
     virtual = replay_offers(found.config, found.seed, found.offers(), end_ns)
     for camera, records in found.by_camera().items():
         assert [r.outcome for r in records] == [t.outcome for t in virtual[camera]]
