@@ -7,7 +7,6 @@ import asyncio
 import dataclasses
 import json
 import logging
-import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
 from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
+from freshfield.files import format_table
 
 if TYPE_CHECKING:
     from channel_emu.live.proxy import Hook, Report
@@ -178,8 +178,8 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="the same: exp:30ms,exp:60ms")
     sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
                      "state, reset:{at_ms: [50]}; may be given several times")  # fmt: skip
-    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and "
-                     "scope=per-camera, initial=s1, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
+    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and states=low/high, "
+                     "scope=per-camera, initial=low, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
     sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
     sub.add_argument("--shared-server", metavar="ORDER", choices=ORDERS, help="one line for all cameras; "
@@ -203,22 +203,15 @@ def _simulate(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(result))
         return 0
-    shown = {"mean age": result["mean_age_ms"], "mean age at slot boundaries": result["mean_age_slotted_ms"],
-             "peak age": result["peak_age_ms"], **result["metrics_ms"]}  # fmt: skip
-    for label, value in shown.items():
-        print(f"{label:28} {'-' if value is None else f'{value:.3f} ms'}")
-    delay = result["delay_ms"]
-    if delay["mean"] is not None:
-        figures = ", ".join(f"{k} {v:.2f}" for k, v in delay.items())
-        print(f"{'drawn delay (ms)':28} {figures}")
-    for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight"):
-        if result[key] or key in ("offered", "delivered"):
-            print(f"{key:28} {result[key]:,}")
-    if len(result["state_share"]) > 1:
-        shares = ", ".join(f"{k} {v:.4f}" for k, v in result["state_share"].items())
-        print(f"{'share of states':28} {shares}")
-    print(f"{'cameras x seconds':28} {result['cameras']} x {result['seconds']:g}, seed {result['seed']}, "
-          f"{result['engine']} engine")  # fmt: skip
+    shown = {
+        "mean age (ms)": result["mean_age_ms"], "peak age (ms)": result["peak_age_ms"],
+        "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"], **result["metrics_ms"],
+        **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
+        **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
+        **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
+        **{key: result[key] for key in ("cameras", "seconds", "seed", "engine")},
+    }  # fmt: skip
+    print(format_table([{"what": k, "value": "-" if v is None else v} for k, v in shown.items()]))
     return 0
 
 
@@ -250,29 +243,26 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
 def _add_presets(commands: Any) -> None:
     sub = commands.add_parser(
         "presets", help="the channels that have a name, with their parameters and mean delay",
-        description="Lists the presets: what each is for, its parameters as a scenario's channel section has "
-        "them, and the mean delay over the long-run shares of its states.",
+        description="Lists the presets: parameters, spelled as the options of simulate and a scenario take "
+        "them; the mean delay over the long-run shares of the states; what each is for.",
     )  # fmt: skip
     sub.add_argument("--json", action="store_true")
     sub.set_defaults(go=_presets)
 
 
 def _presets(args: argparse.Namespace) -> int:
+    parts = ("arrivals", "service", "chain", "discipline", "faults")
     rows: list[dict[str, Any]] = []
-    for name, (about, channel) in PRESETS.items():
+    for name, (_, channel) in PRESETS.items():
         mean_ms = channel_from_mapping({"preset": name}).mean_delay_ms
-        rows.append({"preset": name, "about": about, "mean_delay_ms": mean_ms, "channel": channel})
+        shown = {part: "" if part not in channel else str(channel[part]).replace("'", "") for part in parts}
+        rows.append({"preset": name, "mean_delay_ms": mean_ms, **shown})
     if args.json:
-        print(json.dumps(rows))
+        print(json.dumps([{**row, **PRESETS[row["preset"]]._asdict()} for row in rows]))
         return 0
-    print(f"{'preset':16} mean delay")
-    for row in rows:
-        print(f"{row['preset']:16} {row['mean_delay_ms']:7.1f} ms  {row['about']}")
-        for key, value in row["channel"].items():
-            text = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):.4g}", json.dumps(value))
-            print(f"{'':28}{key}: {text.replace(chr(34), '')}")
-    for name, about in FROM_FILES.items():
-        print(f"{name}\n{'':28}{about}")
+    about = [*((name, preset.about) for name, preset in PRESETS.items()), *FROM_FILES.items()]
+    print(format_table(rows) + "\n")
+    print(format_table([{"preset": name, "what it is": line} for name, line in about]))
     return 0
 
 
@@ -391,17 +381,17 @@ def _add_bench(commands: Any) -> None:
 
 def _bench(args: argparse.Namespace) -> int:
     if args.cost:
-        from channel_emu.virtual.benchmark import bench_cost, show_cost
+        from channel_emu.virtual.benchmark import bench_cost
 
         rows = bench_cost()
-        print(json.dumps(rows) if args.json else show_cost(rows))
+        print(json.dumps(rows) if args.json else format_table(rows))
         return 0
     if args.simulate:
-        from channel_emu.virtual.benchmark import LOOPS, bench_simulate, show_simulate
+        from channel_emu.virtual.benchmark import bench_simulate
 
-        seconds = 2000.0 if args.seconds is None else args.seconds
-        found = [bench_simulate(args.cameras, seconds, preset=preset) for preset in LOOPS]
-        print(json.dumps(found) if args.json else "\n".join(show_simulate(each) for each in found))
+        found = bench_simulate(args.cameras, 2000.0 if args.seconds is None else args.seconds)
+        rows = [{"what": name, "value": value} for name, value in found.items()]
+        print(json.dumps(found) if args.json else format_table(rows))
         return 0
     from channel_emu.live.benchmark import bench, show
 

@@ -119,58 +119,68 @@ def newest_at(saw: Sawtooth, at_ns: Instants) -> Instants:
     return np.where(k >= 0, saw.generated_ns[np.maximum(k, 0)], -1)
 
 
+def mean_of_known(values: list[float | None]) -> float | None:
+    """Over cameras or links; None where none has a value."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
 class Metric(NamedTuple):
-    """about: one line, which says what follows the name. of: the metric of (path, values, seed, camera)."""
+    """about: one line, with what follows the name. values: readers of what follows. of: the metric, given a
+    path, these values and, where it is ``drawn``, the random numbers of a process at the sender."""
 
     about: str
-    of: Callable[[Sawtooth, list[str], int, str], float | None]
+    values: tuple[Callable[[str], float], ...]
+    of: Callable[..., float | None]
+    drawn: bool = False
 
 
-def _two_states(saw: Sawtooth, away: str, back: str, rng: CounterRng) -> tuple[Instants, Instants]:
-    """Changes and states (0 or 1) of a process that leaves state 0 at the rate ``away`` and 1 at ``back``."""
-    chain = Chain(two_state_generator(rate_per_ms(away), rate_per_ms(back)), rng, 0)
-    starts, states = np.array(chain.recent(0, saw.end_ns), np.int64).T
+def _two_states(saw: Sawtooth, away: float, back: float, rng: CounterRng) -> tuple[Instants, Instants]:
+    """Changes and states of a process that leaves state 0 at the rate ``away`` and state 1 at ``back``."""
+    path = Chain(two_state_generator(away, back), rng, initial=0).recent(0, saw.end_ns)
+    starts, states = np.array(path, np.int64).T
     return starts[1:], states
 
 
+def _incorrect(saw: Sawtooth, away: float, back: float, rng: CounterRng) -> float | None:
+    return incorrect_age_ms(saw, *_two_states(saw, away, back, rng))
+
+
+def _urgency(saw: Sawtooth, weight: float, away: float, back: float, rng: CounterRng) -> float | None:
+    changes_ns, states = _two_states(saw, away, back, rng)
+    return urgency_ms(saw, changes_ns, np.where(states == 1, weight, 1.0))
+
+
 METRICS = {
-    "age": Metric("time average of the age", lambda saw, values, *_: mean_age_ms(saw, *values)),
-    "peak": Metric("age just before a delivery", lambda saw, values, *_: peak_age_ms(saw, *values)),
-    "query": Metric(
-        "age at regular queries; query:100ms",
-        lambda saw, values, *_: query_age_ms(saw, *map(span_ms, values)),
-    ),
+    "age": Metric("time average of the age", (), mean_age_ms),
+    "peak": Metric("age just before a delivery", (), peak_age_ms),
+    "query": Metric("age at regular queries, query:100ms", (span_ms,), query_age_ms),
     "shown": Metric(
-        "age of what a screen shows, after computing and by its refreshes; shown:20ms:16.7ms",
-        lambda saw, values, *_: shown_age_ms(saw, *map(span_ms, values)),
+        "age of what a screen shows, by time of computing and interval of refreshes, shown:20ms:16.7ms",
+        (span_ms, span_ms), shown_age_ms,
     ),
     "incorrect": Metric(
-        "age of incorrect information on a source of two states, left at these rates; incorrect:1/2s:1/2s",
-        lambda saw, values, seed, camera: incorrect_age_ms(
-            saw, *_two_states(saw, *values, CounterRng(seed, camera, "age.source"))
-        ),
+        "age of incorrect information on a source of two states, left at these rates, incorrect:1/2s:1/2s",
+        (rate_per_ms, rate_per_ms), _incorrect, drawn=True,
     ),
     "urgency": Metric(
-        "age, weighted more in an urgent state: weight, rates into and out of it; urgency:5:1/3s:1/1s",
-        lambda saw, values, seed, camera: _urgency(saw, *values, CounterRng(seed, camera, "age.context")),
+        "age times a weight while it is urgent, which begins and ends at these rates, urgency:5:1/3s:1/1s",
+        (float, rate_per_ms, rate_per_ms), _urgency, drawn=True,
     ),
-}
-
-
-def _urgency(saw: Sawtooth, weight: str, away: str, back: str, rng: CounterRng) -> float | None:
-    changes_ns, states = _two_states(saw, away, back, rng)
-    return urgency_ms(saw, changes_ns, np.where(states == 1, float(weight), 1.0))
+}  # fmt: skip
 
 
 def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:
     """A metric as people type it, in ms; None where nothing arrived. Raises SpellingError."""
-    name, *values = text.split(":")
+    name, *words = text.split(":")
     if name not in METRICS:
         raise SpellingError(f"metric {text!r}: expected one of {', '.join(METRICS)}")
+    metric = METRICS[name]
     try:
-        return METRICS[name].of(saw, values, seed, camera)
-    except (TypeError, ValueError, ZeroDivisionError):
-        raise SpellingError(f"metric {text!r}: {METRICS[name].about}") from None
+        values = [read(word) for read, word in zip(metric.values, words, strict=True)]
+        return metric.of(saw, *values, *([CounterRng(seed, camera, f"age.{name}")] if metric.drawn else []))
+    except ValueError:
+        raise SpellingError(f"metric {text!r}: {metric.about}") from None
 
 
 class RunningAge:

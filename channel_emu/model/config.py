@@ -280,9 +280,9 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
         raise ScenarioError(f"{where}.preset: {error}") from None
     for key, value in mapping.items():
         value = spelled_out(key, value, where, folder)
-        base = merged.get(key)
+        base = spelled_out(key, merged.get(key))
         merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
-    merged["preset"] = name
+    merged = {key: spelled_out(key, value) for key, value in merged.items()} | {"preset": name}
     faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
     config = read_section(ChannelConfig, merged, where)
     try:

@@ -9,79 +9,54 @@ from typing import Any, NamedTuple
 
 from channel_emu.model.spelling import SpellingError, read_text
 
-# s = G is the low-traffic state, s = B the high-traffic one (6.24).
-_STATES = ["low", "high"]
-
 
 class Preset(NamedTuple):
-    """about: one line for people. channel: its section."""
+    """about: one line for people. channel: its section, in short spellings."""
 
     about: str
     channel: dict[str, Any]
 
 
-def _ch6(mean_sojourn_ms: float) -> dict[str, Any]:
-    return {
-        "arrivals": {"process": "poisson", "rate_per_ms": [1 / 120, 1 / 30]},
-        "chain": {"mu1_per_ms": 1 / mean_sojourn_ms, "mu2_per_ms": 1 / mean_sojourn_ms, "states": _STATES},
-        "service": {"law": "exponential", "mean_ms": [30.0, 60.0]},
-        "service_state": "at-start",
-        "discipline": "newest-waits",
-    }
+def _two_states(sojourn_ms: int) -> str:
+    """s = G is the low-traffic state, s = B the high-traffic one (6.24)."""
+    return f"mu1=1/{sojourn_ms},mu2=1/{sojourn_ms},states=low/high"
 
 
-def _ch6_one_state(arrivals_every_ms: float, mean_delay_ms: float) -> dict[str, Any]:
-    return {
-        "arrivals": {"process": "poisson", "rate_per_ms": 1 / arrivals_every_ms},
-        "service": {"law": "exponential", "mean_ms": mean_delay_ms},
-        "discipline": "newest-waits",
-    }
+_CH6 = {"arrivals": "mmpp:1/120ms,1/30ms", "service": "exp:30ms,exp:60ms", "discipline": "newest-waits"}
 
-
-PRESETS: dict[str, Preset] = {
+PRESETS = {
     "ideal": Preset("nothing happens: every frame arrives as it is offered", {}),
     "ch5": Preset(
         "thesis 5.5: a frame every 30 ms, one is sent at a time, the others are dropped (D/G/1/0)",
-        {
-            "arrivals": {"process": "periodic", "period_ms": 30.0},
-            "service": {"law": "exponential", "mean_ms": 60.0},
-            "discipline": "drop-new",
-        },
+        {"arrivals": "periodic:30ms", "service": "exp:60ms", "discipline": "drop-new"},
     ),
     "ch6": Preset(
         "thesis 6.2.5 and 6.5: Gilbert-Elliott traffic of 30 ms a state, Poisson sampling, the newest waits",
-        _ch6(30.0),
+        {**_CH6, "chain": _two_states(30)},
     ),
-    "ch6-high": Preset("thesis 6.5.1: high traffic for good", _ch6_one_state(60.0, 60.0)),
-    "ch6-low": Preset("thesis 6.5.1: low traffic for good", _ch6_one_state(120.0, 30.0)),
+    "ch6-high": Preset(
+        "thesis 6.5.1: high traffic for good", {**_CH6, "arrivals": "poisson:1/60ms", "service": "exp:60ms"}
+    ),
+    "ch6-low": Preset(
+        "thesis 6.5.1: low traffic for good", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}
+    ),
     "ch6-slow": Preset(
         "as ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn",
-        _ch6(3000.0),
+        {**_CH6, "chain": _two_states(3000)},
     ),
     # In both states of ch6 a buffer fills about equally fast (few frames and short delays, many and
     # long ones), so that the best wait is the same. Here only delays differ, tenfold, and a state lasts 3 s:
     # what is best depends on the state, which the ages tell.
     "swing": Preset(
         "delays of 15 and 150 ms alternate, 3 s a state: what is best depends on the state",
-        {
-            "arrivals": {"process": "periodic", "period_ms": 30.0},
-            "chain": {"mu1_per_ms": 1 / 3000, "mu2_per_ms": 1 / 3000, "states": _STATES},
-            "service": {"law": "exponential", "mean_ms": [15.0, 150.0]},
-            "service_state": "at-start",
-            "discipline": "newest-waits",
-        },
+        {**_CH6, "arrivals": "periodic:30ms", "service": "exp:15ms,exp:150ms", "chain": _two_states(3000)},
     ),
     "gilbert-elliott": Preset(
         "losses in bursts: a good state of 1 s loses 1 % of the frames, a bad one of 100 ms loses half",
-        {
-            "arrivals": {"process": "periodic", "period_ms": 30.0},
-            "chain": {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 100, "states": ["good", "bad"]},
-            "service": {"law": "deterministic", "mean_ms": 20.0},
-            "discipline": "parallel",
-            "faults": {"loss": {"probability": [0.01, 0.5]}},
-        },
+        {"arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel",
+         "chain": "mu1=1/1000,mu2=1/100,states=good/bad", "faults": {"loss": [0.01, 0.5]}},
     ),
-}
+}  # fmt: skip
 
 FROM_FILES = {
     "mahimahi:FILE": "a Mahimahi trace: a line for each instant, in ms, at which 1500 bytes may leave",
@@ -96,20 +71,14 @@ def preset(name: str, folder: Path) -> dict[str, Any]:
         return dict(PRESETS[name].channel)
     kind, _, rest = name.partition(":")
     if kind == "mahimahi" and rest:
-        opportunities_ms = _opportunities_ms(folder / rest)
-        return {"discipline": "fcfs", "faults": {"mahimahi": {"opportunities_ms": opportunities_ms}}}
+        words = read_text(folder / rest).split()
+        if not all(word.isdecimal() for word in words):
+            raise SpellingError(f"{rest}: expected a whole number of ms a line, as Mahimahi has them")
+        return {"discipline": "fcfs", "faults": {"mahimahi": [int(word) for word in words]}}
     if kind == "errant" and rest.count(":") == 1:
         path, _, profile = rest.partition(":")
         return _errant(folder / path, profile)
     raise SpellingError(f"expected one of {', '.join([*PRESETS, *FROM_FILES])}, got {name!r}")
-
-
-def _opportunities_ms(path: Path) -> list[int]:
-    lines = read_text(path).split()
-    try:
-        return [int(line) for line in lines]
-    except ValueError:
-        raise SpellingError(f"{path}: expected a whole number of ms a line, as Mahimahi has them") from None
 
 
 def _errant(path: Path, profile: str) -> dict[str, Any]:

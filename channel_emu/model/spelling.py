@@ -124,7 +124,8 @@ def service(text: str, folder: Path) -> dict[str, Any]:
 
 
 def chain(text: str) -> dict[str, Any]:
-    """``mu1=1/30,mu2=1/30``, optionally ``scope=per-camera``, ``initial=s1``, ``slots=1ms``."""
+    """``mu1=1/30,mu2=1/30``, optionally ``states=low/high``, ``scope=per-camera``, ``initial=low``,
+    ``slots=1ms``."""
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -132,6 +133,8 @@ def chain(text: str) -> dict[str, Any]:
             found[f"{key}_per_ms"] = rate_per_ms(value)
         elif key in ("scope", "initial") and value:
             found[key] = value
+        elif key == "states" and value:
+            found["states"] = value.split("/")
         elif key == "slots" and value:
             found |= {"sampled": "slots", "slot_ms": span_ms(value)}
         else:

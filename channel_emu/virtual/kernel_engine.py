@@ -164,10 +164,12 @@ def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDA
     return work.draw(count, LAWS.index(law.law), parameter, delays_ms, key)
 
 
-def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], bool]:
-    """means_ms and modulated, as the kernels take them."""
-    means_ms = per_state(config.service.mean_ms) if config.service.mean_ms is not None else [1.0]
-    return np.array(means_ms, float), config.service_state == "modulated" and len(means_ms) > 1
+def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """means_ms, speeds and modulated, as the kernels take them."""
+    means_ms = np.array(per_state(1.0 if config.service.mean_ms is None else config.service.mean_ms), float)
+    with np.errstate(divide="ignore"):
+        speeds = 1.0 / (means_ms * 1e6)
+    return means_ms, speeds, config.service_state == "modulated" and len(means_ms) > 1
 
 
 def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:

@@ -52,7 +52,7 @@ class Simulation:
 
     def mean_age_ms(self) -> float | None:
         """Continuous time average, over the cameras that had a delivery; None where there was none."""
-        return _mean([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
+        return ages.mean_of_known([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
 
     def summary(self, metrics: Sequence[str] = ()) -> dict[str, Any]:
         """What the command prints with --json. metrics: see ``ages.measure``; each the mean over the cameras
@@ -62,10 +62,10 @@ class Simulation:
         share = np.mean([run.state_share for run in self.runs], 0)
         counts = {name: sum(run.count(name) for run in self.runs) for name in OUTCOMES}
         return {
-            "mean_age_ms": _mean([ages.mean_age_ms(s) for s in saws]),
-            "mean_age_slotted_ms": _mean([ages.query_age_ms(s, self.slot_ms) for s in saws]),
-            "peak_age_ms": _mean([ages.peak_age_ms(s) for s in saws]),
-            "metrics_ms": {text: _mean([ages.measure(text, saw, self.seed, run.camera)
+            "mean_age_ms": ages.mean_of_known([ages.mean_age_ms(s) for s in saws]),
+            "mean_age_slotted_ms": ages.mean_of_known([ages.query_age_ms(s, self.slot_ms) for s in saws]),
+            "peak_age_ms": ages.mean_of_known([ages.peak_age_ms(s) for s in saws]),
+            "metrics_ms": {text: ages.mean_of_known([ages.measure(text, saw, self.seed, run.camera)
                                         for saw, run in zip(saws, self.runs)]) for text in metrics},
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
@@ -166,8 +166,3 @@ def _kernel_unsupported(config: ChannelConfig, channel: Channel) -> str | None:
     except ImportError:
         return "numba is not installed (pip install 'freshfield[emu]')"
     return None
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

@@ -60,6 +60,19 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Mappings with the same keys as a table for people: numbers to five digits, to the right; text to the
+    left."""
+    columns = []
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        numbers = all(isinstance(value, int | float) for value in values)
+        cells = [name, *(f"{value:.5g}" if isinstance(value, float) else str(value) for value in values)]
+        width = max(map(len, cells))
+        columns.append([cell.rjust(width) if numbers else cell.ljust(width) for cell in cells])
+    return "\n".join("  ".join(cells).rstrip() for cells in zip(*columns))
+
+
 class PlotError(ValueError):
     """A picture that cannot be drawn; the message says why."""
 

@@ -72,7 +72,8 @@ def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
     assert main(["presets"]) == 0
     text = capsys.readouterr().out
     assert all(f"\n{name} " in text for name in PRESETS)
-    assert "45.0 ms  thesis 6.2.5" in text and "chain: {mu1_per_ms: 0.03333, mu2_per_ms" in text
+    assert "\nch6                         45  mmpp:1/120ms,1/30ms  exp:30ms,exp:60ms " in text
+    assert " mu1=1/30,mu2=1/30,states=low/high " in text and " {loss: [0.01, 0.5]}\n" in text
     assert "mahimahi:FILE" in text
     assert main(["presets", "--json"]) == 0
     found = {row["preset"]: row for row in json.loads(capsys.readouterr().out)}

@@ -18,15 +18,6 @@ FIRST_COME, NEWEST_FIRST, ROUND_ROBIN, OLDEST_AGE = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True)
-def speeds_per_ns(means_ms):
-    """Work served in a nanosecond by state: the inverse of the mean delay, inf where that is 0."""
-    speeds = np.empty(len(means_ms))
-    for i in range(len(means_ms)):
-        speeds[i] = 1.0 / (means_ms[i] * 1e6) if means_ms[i] > 0.0 else np.inf
-    return speeds
-
-
-@njit(cache=True, nogil=True)
 def _choose(order, head, ticket, last, newest_delivered_ns):
     """The camera whose waiting frame is next; at least one waits."""
     cameras = len(head)
@@ -83,8 +74,8 @@ def _drop_new(
 
 @njit(cache=True, nogil=True)
 def serve(
-    arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, modulated, starts, states,
-    path_from, path_to, horizon_ns,
+    arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, speeds, modulated,
+    starts, states, path_from, path_to, horizon_ns,
 ):  # fmt: skip
     """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
 
@@ -94,7 +85,7 @@ def serve(
     order: index into ``queue_server.ORDERS``: whose waiting frame is next.
     queue_limit: most frames waiting (fcfs) or in service (parallel).
     work: of ``work.draw``.
-    means_ms: mean delay, (1,) or one a state.
+    means_ms: mean delay, (1,) or one a state. speeds: its inverse in 1/ns, inf where it is 0.
     modulated: the work is served at the rate of each state passed through, not of the first one.
     starts, states: all paths (see ``chain_path``); camera c's is starts[path_from[c] : path_to[c]], with one
         entry of ``states`` unused at its end.
@@ -104,7 +95,6 @@ def serve(
     outcome = np.zeros(count, np.int8)
     started = np.full(count, -1, np.int64)
     due = np.full(count, -1, np.int64)
-    speeds = speeds_per_ns(means_ms)
     if discipline == DROP_NEW and cameras == 1:
         # The general loop below would decide the same; nothing waits here, which makes it twice as fast.
         _drop_new(

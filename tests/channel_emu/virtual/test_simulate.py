@@ -5,10 +5,11 @@ import sys
 import numpy as np
 import pytest
 
+from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.virtual.link_run import OUTCOMES, LinkRun
-from channel_emu.virtual.replay import replay_offers
+from channel_emu.virtual.replay import offer_all
 from channel_emu.virtual.simulate import SimulationError, simulate
 from edge_server.live.buffer import FrameBuffer
 from tests.channel_emu.live.emulator import frame_of
@@ -106,7 +107,7 @@ def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
     config = channel_from_mapping({"preset": "ch6", "faults": {"loss": {"probability": 0.2}}})
     run = simulate(config, ["x"], 30, 9, engine="python", frame_period_ms=33.3).runs[0]
     offers = {"x": [(int(t), 20_000) for t in run.offered_ns]}
-    transits = replay_offers(config, 9, offers, run.end_ns)["x"]
+    transits = offer_all(Channel(config, 9), offers, run.end_ns)[1]["x"]
     assert [OUTCOMES.index(t.outcome or "in_flight") for t in transits] == run.outcome.tolist()
     assert [t.due_ns or -1 for t in transits] == run.due_ns.tolist()
 
