@@ -251,8 +251,9 @@ class ChannelConfig:
         if service.mean_ms is None:
             return float(np.mean(service.delays_ms or [0.0]))
         means = per_state(service.mean_ms)
-        one = len(means) == 1 or self.chain is None
-        return means[0] if one else float(stationary(self.chain.generator()) @ means)
+        if len(means) == 1 or self.chain is None:
+            return means[0]
+        return float(stationary(self.chain.generator()) @ means)
 
     def to_mapping(self) -> dict[str, Any]:
         """The resolved section: reading it again gives this configuration."""

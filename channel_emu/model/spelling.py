@@ -14,6 +14,7 @@ import yaml
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
          "trace": "trace", "none": "none"}  # fmt: skip
+_MAX_CHARS = 2**26  # of a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
 
@@ -144,11 +145,15 @@ def chain(text: str) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """Raises SpellingError."""
+    """The text of a file that a spelling names. Raises SpellingError."""
     try:
-        return path.read_text()
+        with path.open() as file:
+            text = file.read(_MAX_CHARS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise SpellingError(f"{path}: cannot be read: {error}") from None
+    if len(text) > _MAX_CHARS:
+        raise SpellingError(f"{path}: more than {_MAX_CHARS} characters")
+    return text
 
 
 def delays_ms(path: Path) -> list[float]:
