@@ -77,10 +77,10 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
             f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of "
             f"{', '.join(TREATMENTS)}"
         )
-    from edge_server.scheduler.treated import Treated
-
     module, cls, _ = TREATMENTS[treatment]
-    return Treated(name, policy, getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)())
+    policy.name = name
+    policy.treatment = getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)()
+    return policy
 
 
 def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
