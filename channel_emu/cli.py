@@ -13,13 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu import cli_syntax
 from channel_emu.estimate.recording import ROW_DISCIPLINES
-from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping
+from channel_emu.model import ages, spelling
+from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES
-from channel_emu.model.presets import PRESETS
+from channel_emu.model.presets import FROM_FILES, PRESETS
 from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
+from freshfield.files import format_table
 
 if TYPE_CHECKING:
     from channel_emu.live.proxy import Hook, Report
@@ -28,7 +29,9 @@ DESCRIPTION = """\
 Emulates a bad network between cameras and the edge, seeded and per frame.
 
   channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room
+  channel-emu presets
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
+  channel-emu simulate --preset gilbert-elliott --metric shown:20ms:16.7ms --csv frames.csv --plot ages.png
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu replay runs/room/trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
@@ -47,7 +50,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_run, _add_simulate, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
+    for add in (
+        _add_run,
+        _add_simulate,
+        _add_presets,
+        _add_replay,
+        _add_proxy,
+        _add_fit,
+        _add_bench,
+        _add_accuracy,
+    ):
         add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -80,7 +92,7 @@ def _run(args: argparse.Namespace) -> int:
     from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
-    config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
+    config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent)
     priority = "normal" if args.no_priority else raise_priority()
     status, _ = _serve(args, config, plan.seed, hook=FrameStream(plan.cameras, args.out, priority))
     return status
@@ -142,6 +154,12 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument("--frame-bytes", type=int, default=20_000, metavar="N", help="for the bandwidth fault")
     sub.add_argument("--slot-ms", type=float, default=1.0, metavar="MS", help="default: %(default)s")
     sub.add_argument("--engine", choices=["auto", "python", "kernel"], default="auto")
+    sub.add_argument("--metric", action="append", default=[], metavar="NAME[:VALUE...]", help="further ages: "
+                     + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items())
+                     )  # fmt: skip
+    sub.add_argument("--csv", type=Path, metavar="FILE", help="a row a frame: when it was offered and "
+                     "delivered, as fit reads them")  # fmt: skip
+    sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: ages over time, delays")
     sub.add_argument("--json", action="store_true", help="everything, as one JSON object")
     sub.set_defaults(go=_simulate)
 
@@ -149,16 +167,19 @@ def _add_simulate(commands: Any) -> None:
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     """The options that describe a channel, as ``_config_of`` reads them."""
     source = sub.add_mutually_exclusive_group()
-    source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
+    source.add_argument("--preset", default="ideal", metavar="NAME", help="one of those that channel-emu "
+                        "presets lists, or of a file (%(default)s)")  # fmt: skip
     source.add_argument("--scenario", help="take the channel section of a scenario")
     sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
                      "rate for each state: mmpp:1/120ms,1/30ms; mmpp alone: these, the "
                      "thesis's (6.4.2)")  # fmt: skip
     sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-                     "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
-    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
-    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and "
-                     "scope=per-camera, initial=s1, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
+                     "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms")  # fmt: skip
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="the same: exp:30ms,exp:60ms")
+    sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
+                     "state, reset:{at_ms: [50]}; may be given several times")  # fmt: skip
+    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and states=low/high, "
+                     "scope=per-camera, initial=low, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
     sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
     sub.add_argument("--shared-server", metavar="ORDER", choices=ORDERS, help="one line for all cameras; "
@@ -166,57 +187,83 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
+    from channel_emu.virtual import output
     from channel_emu.virtual.link_run import OUTCOMES
     from channel_emu.virtual.simulate import simulate
 
-    result = simulate(
+    simulation = simulate(
         _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
         frame_period_ms=args.frame_period_ms, frame_bytes=args.frame_bytes, slot_ms=args.slot_ms,
-    ).summary()  # fmt: skip
+    )  # fmt: skip
+    result = simulation.summary(args.metric)
+    if args.csv:
+        output.write_frames(simulation, args.csv)
+    if args.plot:
+        output.plot_ages(simulation, args.plot)
     if args.json:
         print(json.dumps(result))
         return 0
-    for key, label in (("mean_age_ms", "mean age"), ("mean_age_slotted_ms", "mean age at slot boundaries"),
-                       ("peak_age_ms", "peak age")):  # fmt: skip
-        value = result[key]
-        print(f"{label:28} {'-' if value is None else f'{value:.3f} ms'}")
-    delay = result["delay_ms"]
-    if delay["mean"] is not None:
-        figures = ", ".join(f"{k} {v:.2f}" for k, v in delay.items())
-        print(f"{'drawn delay (ms)':28} {figures}")
-    for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight"):
-        if result[key] or key in ("offered", "delivered"):
-            print(f"{key:28} {result[key]:,}")
-    if len(result["state_share"]) > 1:
-        shares = ", ".join(f"{k} {v:.4f}" for k, v in result["state_share"].items())
-        print(f"{'share of states':28} {shares}")
-    print(f"{'cameras x seconds':28} {result['cameras']} x {result['seconds']:g}, seed {result['seed']}, "
-          f"{result['engine']} engine")  # fmt: skip
+    shown = {
+        "mean age (ms)": result["mean_age_ms"], "peak age (ms)": result["peak_age_ms"],
+        "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"], **result["metrics_ms"],
+        **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
+        **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
+        **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
+        **{key: result[key] for key in ("cameras", "seconds", "seed", "engine")},
+    }  # fmt: skip
+    print(format_table([{"what": k, "value": "-" if v is None else v} for k, v in shown.items()]))
     return 0
 
 
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
+    """The channel of ``_add_channel_options``; a scenario spells its section in the same way."""
     if args.service and args.service_by_state:
-        raise cli_syntax.SpellingError("--service and --service-by-state exclude each other")
+        raise spelling.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
+    folder = Path()
     if args.scenario:
-        section = dict(scenario.load(args.scenario).channel)
-    given = {
-        "arrivals": cli_syntax.arrivals(args.arrivals) if args.arrivals else None,
-        "service": cli_syntax.service(args.service) if args.service else None,
-        "chain": cli_syntax.chain(args.chain) if args.chain else None,
-        "service_state": args.service_state,
-        "discipline": args.discipline,
-    }
-    if args.shared_server:
-        given["server"] = {"shared": True, "order": args.shared_server}
-    if vars(args).get("spread"):  # of simulate alone
-        base = section.get("arrivals") or {}
-        base = {"process": base} if isinstance(base, str) else base
-        given["arrivals"] = {**(given["arrivals"] or base), "spread": True}
+        plan = scenario.load(args.scenario)
+        section, folder = dict(plan.channel), plan.path.parent
+    for key in ("arrivals", "service", "chain", "service_state", "discipline"):
+        if value := vars(args)[key]:
+            section[key] = spelled_out(key, value)
     if args.service_by_state:
-        given["service"] = cli_syntax.service_by_state(args.service_by_state)
-    return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "channel")
+        section["service"] = spelled_out("service", args.service_by_state)
+    if args.fault:
+        section["faults"] = dict(section.get("faults") or {})
+        for text in args.fault:
+            section["faults"] |= spelling.fault(text)
+    if args.shared_server:
+        section["server"] = {"shared": True, "order": args.shared_server}
+    if vars(args).get("spread"):  # of simulate alone
+        section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
+    return channel_from_mapping(section, "channel", folder)
+
+
+def _add_presets(commands: Any) -> None:
+    sub = commands.add_parser(
+        "presets", help="the channels that have a name, with their parameters and mean delay",
+        description="Lists the presets: parameters, spelled as the options of simulate and a scenario take "
+        "them; the mean delay over the long-run shares of the states; what each is for.",
+    )  # fmt: skip
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_presets)
+
+
+def _presets(args: argparse.Namespace) -> int:
+    parts = ("arrivals", "service", "chain", "discipline", "faults")
+    rows: list[dict[str, Any]] = []
+    for name, (_, channel) in PRESETS.items():
+        mean_ms = channel_from_mapping({"preset": name}).mean_delay_ms
+        shown = {part: "" if part not in channel else str(channel[part]).replace("'", "") for part in parts}
+        rows.append({"preset": name, "mean_delay_ms": mean_ms, **shown})
+    if args.json:
+        print(json.dumps([{**row, **PRESETS[row["preset"]]._asdict()} for row in rows]))
+        return 0
+    about = [*((name, preset.about) for name, preset in PRESETS.items()), *FROM_FILES.items()]
+    print(format_table(rows) + "\n")
+    print(format_table([{"preset": name, "what it is": line} for name, line in about]))
+    return 0
 
 
 def _add_replay(commands: Any) -> None:
@@ -334,17 +381,17 @@ def _add_bench(commands: Any) -> None:
 
 def _bench(args: argparse.Namespace) -> int:
     if args.cost:
-        from channel_emu.virtual.benchmark import bench_cost, show_cost
+        from channel_emu.virtual.benchmark import bench_cost
 
         rows = bench_cost()
-        print(json.dumps(rows) if args.json else show_cost(rows))
+        print(json.dumps(rows) if args.json else format_table(rows))
         return 0
     if args.simulate:
-        from channel_emu.virtual.benchmark import LOOPS, bench_simulate, show_simulate
+        from channel_emu.virtual.benchmark import bench_simulate
 
-        seconds = 2000.0 if args.seconds is None else args.seconds
-        found = [bench_simulate(args.cameras, seconds, preset=preset) for preset in LOOPS]
-        print(json.dumps(found) if args.json else "\n".join(show_simulate(each) for each in found))
+        found = bench_simulate(args.cameras, 2000.0 if args.seconds is None else args.seconds)
+        rows = [{"what": name, "value": value} for name, value in found.items()]
+        print(json.dumps(found) if args.json else format_table(rows))
         return 0
     from channel_emu.live.benchmark import bench, show
 

@@ -9,13 +9,10 @@ import numpy as np
 import yaml
 
 from channel_emu.estimate.fit import Fit, IntervalEstimate
+from freshfield.files import picture
 
 _MIN_FRAMES, _MAX_FRAMES, _CYCLES = 300, 4000, 40
 _COLORS, _GREY = ("#0072B2", "#D55E00"), "#777777"
-
-
-class PlotError(ValueError):
-    """A picture that cannot be drawn; the message says why."""
 
 
 def format_fit(fit: Fit) -> str:
@@ -55,15 +52,8 @@ def scenario_text(fit: Fit) -> str:
 def plot(fit: Fit, path: Path) -> None:
     """Plot delays and the second state's probability over time, for the first part of a long recording.
 
-    Raises PlotError if matplotlib is missing or the file cannot be written.
+    Raises PlotError.
     """
-    try:
-        import matplotlib
-    except ImportError:
-        raise PlotError("--plot needs matplotlib (pip install 'freshfield[edge]')") from None
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     cameras = fit.recording.cameras
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
     delay_ms = np.concatenate([c.delay_ms for c in cameras])
@@ -71,28 +61,19 @@ def plot(fit: Fit, path: Path) -> None:
     order = np.argsort(start_s[has_delay], kind="stable")[: _plotted_frames(fit, np.sort(start_s[has_delay]))]
     start_s, delay_ms = start_s[has_delay][order], delay_ms[has_delay][order]
     two = fit.estimate is not None
-    figure, axes = plt.subplots(
-        1 + two, 1, sharex=True, squeeze=False, figsize=(9, 3 + 1.5 * two), layout="constrained",
-        height_ratios=[3, 1] if two else [1],
-    )  # fmt: skip
-    top = axes[0, 0]
-    top.set_ylabel("delay (ms)")
-    if two:
-        _draw_states(fit, figure, axes[:, 0], start_s, delay_ms)
-    else:
-        mean = fit.parameters["mean_ms"].value
-        top.scatter(start_s, delay_ms, s=5, color=_GREY)
-        top.axhline(mean, color=_COLORS[0], lw=0.8, label=f"mean {mean:.3g} ms")
-    if top.get_legend_handles_labels()[0]:
-        top.legend(loc="upper right")
-    axes[-1, 0].set_xlabel("start of transmission (s)")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:
-        raise PlotError(f"--plot {path}: {error}") from None
-    finally:
-        plt.close(figure)
+    ratios = [3, 1] if two else [1]
+    with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=ratios) as axes:
+        top = axes[0, 0]
+        top.set_ylabel("delay (ms)")
+        if two:
+            _draw_states(fit, axes[:, 0], start_s, delay_ms)
+        else:
+            mean = fit.parameters["mean_ms"].value
+            top.scatter(start_s, delay_ms, s=5, color=_GREY)
+            top.axhline(mean, color=_COLORS[0], lw=0.8, label=f"mean {mean:.3g} ms")
+        if top.get_legend_handles_labels()[0]:
+            top.legend(loc="upper right")
+        axes[-1, 0].set_xlabel("start of transmission (s)")
 
 
 def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
@@ -104,7 +85,7 @@ def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
     return min(max(wanted, _MIN_FRAMES), _MAX_FRAMES)
 
 
-def _draw_states(fit: Fit, figure: Any, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
+def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
     """Delays colored by the state's probability, means, and below the probability over time."""
     assert fit.estimate is not None
     names, (top, bottom) = fit.channel["chain"]["states"], axes
@@ -119,7 +100,7 @@ def _draw_states(fit: Fit, figure: Any, axes: Any, start_s: np.ndarray, delay_ms
         if len(fit.lines) == 1:
             second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1), 1]
             drawn = top.scatter(start_s, delay_ms, c=second, s=8, cmap="coolwarm", vmin=0, vmax=1)
-            figure.colorbar(drawn, ax=top, label=f"P({names[1]})")
+            top.figure.colorbar(drawn, ax=top, label=f"P({names[1]})")
     if len(fit.lines) > 1:
         top.scatter(start_s, delay_ms, s=5, color=_GREY)
 

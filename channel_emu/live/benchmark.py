@@ -33,6 +33,7 @@ from channel_emu.live.priority import raise_priority
 from channel_emu.live.upstream import PUSH
 from channel_emu.model import trace
 from freshfield.clock import WallClock
+from freshfield.files import format_table
 from freshfield.frame import parse
 from freshfield.machine_load import cpu_s, machine_ticks, rss_mb
 from freshfield.transport import Transport
@@ -118,33 +119,20 @@ def bench(
 
 def show(result: dict[str, Any]) -> str:
     """The result for a person, with the histogram of the delay error."""
-    error = result["delay_error_ms"]
-    lines = [
-        f"{result['cameras']} cameras x {result['rate_hz']:g} Hz x {result['frame_bytes']:,} bytes for "
-        f"{result['seconds']:g} s, {result['load']} computing beside, priority {result['priority']}",
-        f"throughput       {result['messages_per_s']:,.0f} messages/s, {result['megabytes_per_s']:g} MB/s; "
-        f"sent {result['sent']:,}, lost {result['lost']:,}, cameras behind {result['not_sent']:,} times"
-        + (f"; {result['broken']:,} found the sink too far behind" if result["broken"] else ""),
-        _row("delay error", error),
-        _row("arrival error", result["arrival_error_ms"]),
-        _row("answer to camera", result["answer_ms"]),
-        _row("machine's floor", result["floor_ms"])
-        + ("" if result["stolen"] is None else f"; hypervisor took {result['stolen']:.1%} of the time"),
+    late = [
+        {"ms": name.removesuffix("_ms").replace("_", " "),
+         **{k: "-" if figures[k] is None else figures[k] for k in ("p50", "p95", "p99", "max")}}
+        for name, figures in result.items() if isinstance(figures, dict)
+    ]  # fmt: skip
+    plain = [{"what": name, "value": value} for name, value in result.items() if not isinstance(value, dict)]
+    shape = result["delay_error_ms"]["histogram"]
+    most = max(shape["counts"], default=0)
+    edges = shape["edges_ms"]
+    bins = [
+        f"{low:7.3f} - {high:7.3f}  {round(count):7d}  {'#' * round(50 * count / most)}"
+        for low, high, count in zip(edges, edges[1:], shape["counts"])
     ]
-    if result["emulator_cpu"] is not None:
-        lines.append(f"emulator         {result['emulator_cpu']:.2f} cores, {result['emulator_rss_mb']:g} MB")
-    edges, counts = error["histogram"]["edges_ms"], error["histogram"]["counts"]
-    if counts:
-        lines.append("delay error, histogram (ms)")
-        most = max(counts)
-        for low, high, count in zip(edges, edges[1:], counts):
-            lines.append(f"  {low:7.3f} - {high:7.3f}  {round(count):7d}  {'#' * round(50 * count / most)}")
-    return "\n".join(lines)
-
-
-def _row(name: str, figures: dict[str, Any]) -> str:
-    known = [k for k in ("p50", "p95", "p99", "max") if figures[k] is not None]
-    return f"{name:16} {', '.join(f'{k} {figures[k]:.3f}' for k in known)} ms"
+    return "\n".join([format_table(plain), "", format_table(late), "", "delay error, histogram (ms)", *bins])
 
 
 @contextlib.contextmanager

@@ -17,8 +17,6 @@ from typing import Any
 import grpc
 import grpc.aio
 import numpy as np
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
 
 from channel_emu.live.camera_flow import CameraFlow
 from channel_emu.live.live_link import Flips
@@ -30,7 +28,7 @@ from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
-from freshfield.streams import OpenStreams, ServedCall, SessionStreams
+from freshfield.streams import OpenStreams, ServedCall, SessionStreams, serve_health
 from freshfield.transport import CLIENT_OPTIONS
 from freshfield.v1 import clock_pb2, frames_pb2
 
@@ -84,12 +82,7 @@ class FrameStream:
 
     async def start(self, server: grpc.aio.Server) -> None:
         """Look for the edge; return when it is found or a moment has passed."""
-        checks = health.aio.HealthServicer()
-        health_pb2_grpc.add_HealthServicer_to_server(checks, server)
-        names = (SERVICE, CLOCK_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME)
-        reflection.enable_server_reflection(names, server)
-        for name in ("", SERVICE, CLOCK_SERVICE):
-            await checks.set(name, health_pb2.HealthCheckResponse.SERVING)
+        await serve_health(server, (SERVICE, CLOCK_SERVICE))
         for flow in self.flows.values():
             self._proxy.spawn(flow.upstream.run())
         # Frames that come before the streams to the edge would be broken, and not by the channel.

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from channel_emu.live.live_link import DelayStats, LiveLink
+from channel_emu.model.ages import mean_of_known
 from channel_emu.model.link import EventKind
 
 DROPPED = (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED, EventKind.LOST, EventKind.BROKEN)
@@ -64,8 +65,8 @@ def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
         dropped=sum(outcomes[kind] for kind in DROPPED),
         in_flight=sum(link.model.in_flight for link in links),
         outcomes={name: count for name, count in outcomes.items() if count},
-        mean_age_ms=_mean([link.age.mean_age_ms(link.last_ns) for link in links]),
-        peak_age_ms=_mean([link.age.peak_age_ms() for link in links]),
+        mean_age_ms=mean_of_known([link.age.mean_age_ms(link.last_ns) for link in links]),
+        peak_age_ms=mean_of_known([link.age.peak_age_ms() for link in links]),
         delay_ms=stats.drawn.summary(),
         latency_ms=stats.latency.summary(),
         error_ms=stats.error.summary(),
@@ -87,8 +88,3 @@ def show(report: Report) -> str:
 
 def _ms(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f} ms"
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None

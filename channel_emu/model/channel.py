@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from channel_emu.model import faults
 from channel_emu.model.chain import Chain
-from channel_emu.model.config import ChannelConfig, per_state
+from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.faults import per_state
 from channel_emu.model.link import Link
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import (
-    NoServiceTime,
     ServiceTime,
     WorkSampler,
-    deterministic,
     exponential,
     gamma,
     lognormal,
@@ -62,10 +61,8 @@ class Channel:
             return None
         return PoissonArrivals(per_state(rates), chain, CounterRng(self.seed, camera, "channel.arrivals"))
 
-    def service(self, camera: str, chain: Chain | None) -> ServiceTime | NoServiceTime:
+    def service(self, camera: str, chain: Chain | None) -> ServiceTime:
         config = self.config.service
-        if config.law == "none":
-            return NoServiceTime(chain)
         means = [1.0] if config.mean_ms is None else per_state(config.mean_ms)
         modulated = self.config.service_state == "modulated"
         return ServiceTime(
@@ -76,16 +73,11 @@ class Channel:
         config = self.config.service
         if config.law == "exponential":
             return exponential(rng)
-        if config.law == "gamma":
-            assert config.shape is not None
+        if config.law == "gamma" and config.shape is not None:
             return gamma(rng, config.shape)
-        if config.law == "lognormal":
-            assert config.sigma is not None
+        if config.law == "lognormal" and config.sigma is not None:
             return lognormal(rng, config.sigma)
-        if config.law == "trace":
-            assert config.delays_ms is not None
-            return replayed(config.delays_ms)
-        return deterministic()
+        return replayed(config.delays_ms or [0.0 if config.law == "none" else 1.0])
 
     def _chain(self, camera: str) -> Chain:
         config = self.config.chain

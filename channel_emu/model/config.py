@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,11 @@ from channel_emu.model.chain import (
     transition_matrix,
     two_state_generator,
 )
+from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
-from channel_emu.model.presets import PRESETS
+from channel_emu.model.presets import preset
 from channel_emu.model.queue_server import ORDERS
+from channel_emu.model.spelling import section
 from freshfield.scenario import ScenarioError, read_section
 
 PROCESSES = ("as-offered", "periodic", "poisson")
@@ -206,8 +209,11 @@ class ChannelConfig:
         if self.hard_limit_ms is not None and self.hard_limit_ms <= 0:
             raise ValueError(f"hard_limit_ms: expected more than 0, got {self.hard_limit_ms:g}")
         states = 1 if self.chain is None else len(self.chain.names())
-        for key, value in (("arrivals.rate_per_ms", self.arrivals.rate_per_ms),
-                           ("service.mean_ms", self.service.mean_ms)):  # fmt: skip
+        chances = {f"faults.{name}.probability": getattr(p, "probability", None)
+                   for name, p in self.faults.items()}  # fmt: skip
+        by_state = {"arrivals.rate_per_ms": self.arrivals.rate_per_ms,
+                    "service.mean_ms": self.service.mean_ms, **chances}  # fmt: skip
+        for key, value in by_state.items():
             if isinstance(value, list) and len(value) != states:
                 what = "there is no chain" if self.chain is None else f"the chain has {states} states"
                 raise ValueError(f"{key}: expected one number or one a state, got {len(value)}; {what}")
@@ -238,6 +244,17 @@ class ChannelConfig:
     def state_names(self) -> list[str]:
         return ["-"] if self.chain is None else self.chain.names()
 
+    @property
+    def mean_delay_ms(self) -> float:
+        """Mean of the law, over the long-run shares of the states if it depends on them."""
+        service = self.service
+        if service.mean_ms is None:
+            return float(np.mean(service.delays_ms or [0.0]))
+        means = per_state(service.mean_ms)
+        if len(means) == 1 or self.chain is None:
+            return means[0]
+        return float(stationary(self.chain.generator()) @ means)
+
     def to_mapping(self) -> dict[str, Any]:
         """The resolved section: reading it again gives this configuration."""
         plain = _without_none(dataclasses.asdict(dataclasses.replace(self, preset=None, faults={})))
@@ -245,39 +262,46 @@ class ChannelConfig:
         return plain
 
 
-def channel_from_mapping(mapping: Any, where: str = "channel") -> ChannelConfig:
+def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Path()) -> ChannelConfig:
     """Read a ``channel:`` section. An empty one is the ideal channel.
 
     Keys beside ``preset`` override the preset's: mappings are merged key by key, unless they name another
-    process or law, which replaces the preset's whole. ``arrivals: as-offered`` and ``service: none`` may be
-    written as one word. Raises ScenarioError (a ValueError), one line that names the key.
+    process or law, which replaces the preset's whole. ``arrivals``, ``service``, ``chain`` and each of
+    ``faults`` may be spelled as on the command line (``spelling``). folder: that files are relative to.
+    Raises ScenarioError (a ValueError), one line that names the key.
     """
     if mapping is None:
         mapping = {}
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
-    given = {key: _spelled_out(key, value) for key, value in mapping.items()}
-    name = given.get("preset", "ideal")
-    if not isinstance(name, str) or name not in PRESETS:
-        raise ScenarioError(f"{where}.preset: expected one of {', '.join(PRESETS)}, got {name!r}")
-    merged: dict[str, Any] = dict(PRESETS[name])
-    for key, value in given.items():
-        base = merged.get(key)
+    name = mapping.get("preset", "ideal")
+    try:
+        merged = preset(name if isinstance(name, str) else repr(name), folder)
+    except ValueError as error:
+        raise ScenarioError(f"{where}.preset: {error}") from None
+    for key, value in mapping.items():
+        value = spelled_out(key, value, where, folder)
+        base = spelled_out(key, merged.get(key))
         merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
-    merged["preset"] = name
-    faults = merged.pop("faults", None) or {}
+    merged = {key: spelled_out(key, value) for key, value in merged.items()} | {"preset": name}
+    faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
     config = read_section(ChannelConfig, merged, where)
-    return dataclasses.replace(config, faults=_read_faults(faults, f"{where}.faults"))
+    try:
+        return dataclasses.replace(config, faults=faults)
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {error}") from None
 
 
-def per_state(value: float | list[float]) -> list[float]:
-    """A value as a list: one entry a state, or one for all."""
-    return list(value) if isinstance(value, list) else [value]
-
-
-def _spelled_out(key: Any, value: Any) -> Any:
-    names = {"arrivals": "process", "service": "law"}
-    return {names[key]: value} if key in names and isinstance(value, str) else value
+def spelled_out(key: Any, value: Any, where: str = "channel", folder: Path = Path()) -> Any:
+    """The value of a section's key, a short spelling as what it stands for. Raises ScenarioError."""
+    names = {"arrivals": ("process", PROCESSES), "service": ("law", LAWS), "chain": ("", ())}
+    if key not in names or not isinstance(value, str):
+        return value
+    kind, known = names[key]
+    try:
+        return {kind: value} if value in known else section(key, value, folder)
+    except ValueError as error:
+        raise ScenarioError(f"{where}.{key}: {error}") from None
 
 
 def _merge(base: dict[str, Any], value: dict[str, Any]) -> dict[str, Any]:
@@ -289,15 +313,18 @@ def _merge(base: dict[str, Any], value: dict[str, Any]) -> dict[str, Any]:
     return {**base, **value}
 
 
-def _read_faults(section: Any, where: str) -> dict[str, Any]:
-    if not isinstance(section, dict):
-        raise ScenarioError(f"{where}: expected a mapping of faults, got {section!r}")
+def _read_faults(faults: Any, where: str) -> dict[str, Any]:
+    if not isinstance(faults, dict):
+        raise ScenarioError(f"{where}: expected a mapping of faults, got {faults!r}")
     read: dict[str, Any] = {}
-    for name, params in section.items():
+    for name, params in faults.items():
         if name not in fault_modules.NAMES:
             known = ", ".join(fault_modules.NAMES)
             raise ScenarioError(f"{where}.{name}: unknown fault; expected one of {known}")
-        read[name] = read_section(fault_modules.params_class(name), params, f"{where}.{name}")
+        kind = fault_modules.params_class(name)
+        if not isinstance(params, dict):  # the first parameter alone: loss: 0.1
+            params = {dataclasses.fields(kind)[0].name: params}
+        read[name] = read_section(kind, params, f"{where}.{name}")
     return read
 
 

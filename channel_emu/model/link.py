@@ -16,7 +16,7 @@ from typing import Any
 
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import QueueServer
-from channel_emu.model.service_time import NoServiceTime, ServiceTime
+from channel_emu.model.service_time import ServiceTime
 from channel_emu.model.traffic import PoissonArrivals
 
 DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
@@ -104,7 +104,7 @@ class Link:
         self,
         camera: str,
         discipline: str,
-        service: ServiceTime | NoServiceTime,
+        service: ServiceTime,
         arrivals: PoissonArrivals | None = None,
         faults: Sequence[Fault] = (),
         server: QueueServer | None = None,

@@ -1,56 +1,107 @@
-"""Channels with a name: the thesis's numbers, to be overridden key by key in a scenario."""
+"""Channels with a name: the thesis's numbers and others, to be overridden key by key in a scenario; and
+channels in files of other tools."""
 
 from __future__ import annotations
 
-from typing import Any
+import csv
+from pathlib import Path
+from typing import Any, NamedTuple
 
-# s = G is the low-traffic state, s = B the high-traffic one (6.24).
-_STATES = ["low", "high"]
-
-
-def _ch6(mean_sojourn_ms: float) -> dict[str, Any]:
-    return {
-        "arrivals": {"process": "poisson", "rate_per_ms": [1 / 120, 1 / 30]},
-        "chain": {"mu1_per_ms": 1 / mean_sojourn_ms, "mu2_per_ms": 1 / mean_sojourn_ms, "states": _STATES},
-        "service": {"law": "exponential", "mean_ms": [30.0, 60.0]},
-        "service_state": "at-start",
-        "discipline": "newest-waits",
-    }
+from channel_emu.model.spelling import SpellingError, read_text
 
 
-def _ch6_one_state(arrivals_every_ms: float, mean_delay_ms: float) -> dict[str, Any]:
-    return {
-        "arrivals": {"process": "poisson", "rate_per_ms": 1 / arrivals_every_ms},
-        "service": {"law": "exponential", "mean_ms": mean_delay_ms},
-        "discipline": "newest-waits",
-    }
+class Preset(NamedTuple):
+    """about: one line for people. channel: its section, in short spellings."""
+
+    about: str
+    channel: dict[str, Any]
 
 
-PRESETS: dict[str, dict[str, Any]] = {
-    # Nothing happens: every frame arrives as it is offered.
-    "ideal": {},
-    # 5.5: C = 30 ms, exponential delays of mean 60 ms, D/G/1/0.
-    "ch5": {
-        "arrivals": {"process": "periodic", "period_ms": 30.0},
-        "service": {"law": "exponential", "mean_ms": 60.0},
-        "discipline": "drop-new",
-    },
-    # 6.2.5 and 6.5: Gilbert-Elliott, arrivals 1/120 and 1/30 a ms, delay rates 1/30 and 1/60 a ms in low and
-    # high traffic, mu1 = mu2 = 1/30 a ms.
-    "ch6": _ch6(30.0),
-    # 6.5.1: one traffic state for good.
-    "ch6-high": _ch6_one_state(60.0, 60.0),
-    "ch6-low": _ch6_one_state(120.0, 30.0),
-    # As ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn.
-    "ch6-slow": _ch6(3000.0),
+def _two_states(sojourn_ms: int) -> str:
+    """s = G is the low-traffic state, s = B the high-traffic one (6.24)."""
+    return f"mu1=1/{sojourn_ms},mu2=1/{sojourn_ms},states=low/high"
+
+
+_CH6 = {"arrivals": "mmpp:1/120ms,1/30ms", "service": "exp:30ms,exp:60ms", "discipline": "newest-waits"}
+
+PRESETS = {
+    "ideal": Preset("nothing happens: every frame arrives as it is offered", {}),
+    "ch5": Preset(
+        "thesis 5.5: a frame every 30 ms, one is sent at a time, the others are dropped (D/G/1/0)",
+        {"arrivals": "periodic:30ms", "service": "exp:60ms", "discipline": "drop-new"},
+    ),
+    "ch6": Preset(
+        "thesis 6.2.5 and 6.5: Gilbert-Elliott traffic of 30 ms a state, Poisson sampling, the newest waits",
+        {**_CH6, "chain": _two_states(30)},
+    ),
+    "ch6-high": Preset(
+        "thesis 6.5.1: high traffic for good", {**_CH6, "arrivals": "poisson:1/60ms", "service": "exp:60ms"}
+    ),
+    "ch6-low": Preset(
+        "thesis 6.5.1: low traffic for good", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}
+    ),
+    "ch6-slow": Preset(
+        "as ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn",
+        {**_CH6, "chain": _two_states(3000)},
+    ),
     # In both states of ch6 a buffer fills about equally fast (few frames and short delays, many and
     # long ones), so that the best wait is the same. Here only delays differ, tenfold, and a state lasts 3 s:
     # what is best depends on the state, which the ages tell.
-    "swing": {
-        "arrivals": {"process": "periodic", "period_ms": 30.0},
-        "chain": {"mu1_per_ms": 1 / 3000, "mu2_per_ms": 1 / 3000, "states": _STATES},
-        "service": {"law": "exponential", "mean_ms": [15.0, 150.0]},
-        "service_state": "at-start",
-        "discipline": "newest-waits",
-    },
-}
+    "swing": Preset(
+        "delays of 15 and 150 ms alternate, 3 s a state: what is best depends on the state",
+        {**_CH6, "arrivals": "periodic:30ms", "service": "exp:15ms,exp:150ms", "chain": _two_states(3000)},
+    ),
+    "gilbert-elliott": Preset(
+        "losses in bursts: a good state of 1 s loses 1 % of the frames, a bad one of 100 ms loses half",
+        {"arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel",
+         "chain": "mu1=1/1000,mu2=1/100,states=good/bad", "faults": {"loss": [0.01, 0.5]}},
+    ),
+}  # fmt: skip
+
+FROM_FILES = {
+    "mahimahi:FILE": "a Mahimahi trace: a line for each instant, in ms, at which 1500 bytes may leave",
+    "errant:FILE:OPERATOR/COUNTRY/RAT/QUALITY": "of ERRANT's profiles.csv: half the latency, and the upload",
+}  # fmt: skip
+"""Presets that are read from files of other tools."""
+
+
+def preset(name: str, folder: Path) -> dict[str, Any]:
+    """The section of a preset. folder: that files are relative to. Raises SpellingError."""
+    if name in PRESETS:
+        return dict(PRESETS[name].channel)
+    kind, _, rest = name.partition(":")
+    if kind == "mahimahi" and rest:
+        words = read_text(folder / rest).split()
+        if not all(word.isdecimal() for word in words):
+            raise SpellingError(f"{rest}: expected a whole number of ms a line, as Mahimahi has them")
+        return {"discipline": "fcfs", "faults": {"mahimahi": [int(word) for word in words]}}
+    if kind == "errant" and rest.count(":") == 1:
+        path, _, profile = rest.partition(":")
+        return _errant(folder / path, profile)
+    raise SpellingError(f"expected one of {', '.join([*PRESETS, *FROM_FILES])}, got {name!r}")
+
+
+def _errant(path: Path, profile: str) -> dict[str, Any]:
+    """Gamma delays of half the profile's round trip (mean and standard deviation) behind a line of its upload
+    rate, on which packets queue."""
+    try:
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+        found = {"/".join(list(row.values())[:4]).lower(): row for row in rows}
+        if profile.lower() not in found:
+            raise SpellingError(f"{path}: no profile {profile!r}; write it like {next(iter(found), '-')}")
+        row = found[profile.lower()]
+        mean_ms, deviation_ms = float(row["latency_ms_avg"]) / 2, float(row["latency_ms_stdev"]) / 2
+        service = {"law": "gamma", "mean_ms": mean_ms, "shape": (mean_ms / deviation_ms) ** 2}
+        packets_per_s = float(row["upload_kbps"]) / 12  # of 1500 bytes
+        span_s = 1 + int(1000 / packets_per_s)  # so that a whole number of packets fits well
+        count = max(1, round(packets_per_s * span_s))
+    except SpellingError:
+        raise
+    except (KeyError, TypeError, ZeroDivisionError, OverflowError, ValueError) as error:
+        raise SpellingError(f"{path}: not profiles of ERRANT: {error}") from None
+    times_ms = [-(-(i + 1) * span_s * 1000 // count) for i in range(count)]
+    return {
+        "service": service,
+        "discipline": "parallel",
+        "faults": {"mahimahi": {"opportunities_ms": times_ms}},
+    }

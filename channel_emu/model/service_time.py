@@ -24,16 +24,11 @@ def exponential(rng: CounterRng) -> WorkSampler:
     return rng.exponential
 
 
-def deterministic() -> WorkSampler:
-    """Always one: the mean delay itself."""
-    return lambda number: 1.0
-
-
 def lognormal(rng: CounterRng, sigma: float) -> WorkSampler:
     """exp(sigma Z - sigma²/2), Z standard normal by Box and Muller."""
 
     def draw(number: int) -> float:
-        return math.exp(sigma * _normal(*rng.pair(number)) - sigma * sigma / 2)
+        return math.exp(sigma * normal(*rng.pair(number)) - sigma * sigma / 2)
 
     return draw
 
@@ -48,7 +43,7 @@ def gamma(rng: CounterRng, shape: float) -> WorkSampler:
     def draw(number: int) -> float:
         attempt = 1
         while True:
-            x = _normal(*rng.pair(number, attempt))
+            x = normal(*rng.pair(number, attempt))
             v = (1.0 + c * x) ** 3
             u = rng.uniform(number, attempt + 1)
             if v > 0.0 and math.log(u) < 0.5 * x * x + d - d * v + d * math.log(v):
@@ -62,9 +57,9 @@ def gamma(rng: CounterRng, shape: float) -> WorkSampler:
     return draw
 
 
-def replayed(delays_ms: Sequence[float]) -> WorkSampler:
-    """The given delays in turn, from the start again after the last (mean_ms is then 1: works are ms)."""
-    return lambda number: delays_ms[number % len(delays_ms)]
+def replayed(works: Sequence[float]) -> WorkSampler:
+    """The given works in turn, from the start again after the last: delays in ms where the mean is 1 ms."""
+    return lambda number: works[number % len(works)]
 
 
 class ServiceTime:
@@ -90,18 +85,6 @@ class ServiceTime:
         return saturating_add(start_ns, to_ns(work * mean)), state
 
 
-class NoServiceTime:
-    """The ideal link: a frame is delivered as it starts."""
-
-    means_ms: Sequence[float] = (0.0,)
-    modulated = False
-
-    def __init__(self, chain: Chain | None = None) -> None:
-        self.chain = chain
-
-    def due_ns(self, start_ns: int, number: int) -> tuple[int, int]:
-        return start_ns, 0 if self.chain is None else self.chain.state(start_ns)
-
-
-def _normal(u: float, v: float) -> float:
+def normal(u: float, v: float) -> float:
+    """Standard normal of two uniforms (Box and Muller)."""
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)

@@ -20,7 +20,7 @@ from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS, periodic_loop
 from channel_emu.virtual.simulate import SimulationError, simulate
-from freshfield.files import write_csv
+from freshfield.files import format_table, picture, write_csv
 
 Rows = list[dict[str, Any]]
 
@@ -141,52 +141,29 @@ def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
     return rows
 
 
+_TITLES = {
+    "duration": "rms error of the mean age against seconds simulated (chapter 5)",
+    "slots": "bias of a slot grid against its length (slot 0: continuous time)",
+    "seeds": "half width of the 95 % interval of the mean age against seeds, bias of a run (chapter 5)",
+}
+
+
 def show(tables: dict[str, Rows]) -> str:
     """The tables for a person."""
-    lines = ["error of the mean age against seconds simulated (18 cameras, chapter 5)",
-             f"{'seconds':>10} {'rms error %':>12} {'wall ms':>10}"]  # fmt: skip
-    lines += [
-        f"{r['seconds']:10.1f} {r['rms_error_pct']:12.3f} {r['wall_ms']:10.2f}" for r in tables["duration"]
-    ]
-    lines += ["", "bias of a slot grid against its length (slot 0: continuous time)"]
-    lines += [f"{'what':16} {'slot ms':>8} {'exact %':>9} {'measured %':>20} {'camera-s/wall-s':>16}"]
-    lines += [
-        f"{r['what']:16} {r['slot_ms']:8g} {r['bias_exact_pct']:9.3f} "
-        f"{r['bias_measured_pct']:10.3f} +- {r['half_width_pct']:6.3f} {r['camera_s_per_wall_s']:16,.0f}"
-        for r in tables["slots"]
-    ]
-    lines += ["", "95 % interval of the mean age against seeds (18 cameras, chapter 5)",
-              f"{'seeds':>6} {'half width %':>13} {'holds exact':>12} {'wall ms':>10}"]  # fmt: skip
-    lines += [
-        f"{r['seeds']:6d} {r['half_width_pct']:13.3f} {r['holds_exact']:12.2f} {r['wall_ms']:10.2f}"
-        for r in tables["seeds"]
-    ]
-    last = tables["seeds"][-1]
-    lines.append(f"bias of a run of {last['seconds']:g} s, which starts with a delivery: "
-                 f"{last['bias_pct']:.3f} +- {last['bias_half_width_pct']:.3f} %")  # fmt: skip
-    return "\n".join(lines)
+    return "\n\n".join(f"{_TITLES[name]}\n{format_table(rows)}" for name, rows in tables.items())
 
 
 def write(tables: dict[str, Rows], out: Path) -> list[Path]:
-    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises SimulationError without matplotlib."""
-    out.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, rows in tables.items():
-        path = out / f"accuracy-{name}.csv"
+    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises PlotError without matplotlib."""
+    files = {out / f"accuracy-{name}.csv": rows for name, rows in tables.items()}
+    for path, rows in files.items():
         write_csv(path, rows)
-        written.append(path)
-    return [*written, _draw(tables, out / "accuracy.png")]
+    with picture(out / "accuracy.png", 1, 3, size=(13, 4)) as axes:
+        _draw(tables, *axes[0])
+    return [*files, out / "accuracy.png"]
 
 
-def _draw(tables: dict[str, Rows], path: Path) -> Path:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise SimulationError("the figure needs matplotlib (pip install 'freshfield[edge]')") from None
-    figure = Figure(figsize=(13, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, middle, right = figure.subplots(1, 3)
+def _draw(tables: dict[str, Rows], left: Any, middle: Any, right: Any) -> None:
     error = [r["rms_error_pct"] for r in tables["duration"]]
     left.loglog([r["seconds"] for r in tables["duration"]], error, "o-", label="seconds simulated")
     left.loglog([r["wall_ms"] / 1e3 for r in tables["duration"]], error, "s--", label="seconds of computing")
@@ -208,8 +185,6 @@ def _draw(tables: dict[str, Rows], path: Path) -> Path:
     counts = [r["seeds"] for r in tables["seeds"]]
     right.set_xticks(counts, [str(count) for count in counts])
     right.minorticks_off()
-    figure.savefig(path, dpi=120)
-    return path
 
 
 def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> float:

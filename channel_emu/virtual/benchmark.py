@@ -10,10 +10,8 @@ import math
 import random
 import statistics
 import time
-from collections.abc import Callable
 from typing import Any
 
-from channel_emu.model import ages
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.virtual.simulate import simulate
@@ -22,7 +20,7 @@ _CHANCE = {"probability": 0.1}
 FAULTS: dict[str, dict[str, Any]] = {
     "loss": _CHANCE, "duplication": _CHANCE, "corruption": _CHANCE,
     "blackout": {"every_ms": 1000.0, "for_ms": 50.0}, "reset": {"mean_interval_ms": 1000.0},
-    "bandwidth": {"megabits_per_s": 1000.0},
+    "bandwidth": {"megabits_per_s": 1000.0}, "mahimahi": {"opportunities_ms": [1] * 20},
 }  # fmt: skip
 _PERIOD_NS = 10**6
 PERIOD_MS, MEAN_MS = 30.0, 60.0  # of captures and delays in the thesis's chapter 5
@@ -51,51 +49,17 @@ def periodic_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 
     return total * slot_ms / (slots * cameras)
 
 
-def modulated_loop(cameras: int, seconds: float, seed: int = 0) -> float:
-    """Mean age in ms at slot boundaries of the thesis's chapter 6 (6.23 to 6.27) stepped by slots of 1 ms:
-    the state drawn at each, at most one arrival a slot, delays at-start, the newest frame waits."""
-    uniform = random.Random(seed).random
-    moves = -math.expm1(-2 / 30) / 2  # from either state to the other
-    arrives = [-math.expm1(-1.0 / every_ms) for every_ms in (120.0, 30.0)]
-    means = [30.0, 60.0]
-    left, sending, waiting, newest = [0] * cameras, [0] * cameras, [-1] * cameras, [0] * cameras
-    links = range(cameras)
-    state, total = 0, 0
-    slots = round(seconds * 1e3)
-    for now in range(slots):
-        if uniform() < moves:
-            state = 1 - state
-        chance, mean = arrives[state], means[state]
-        for link in links:
-            busy = left[link]
-            if busy:
-                left[link] = busy = busy - 1
-                if not busy:
-                    newest[link] = sending[link]
-            if uniform() < chance:
-                waiting[link] = now
-            if not busy and waiting[link] >= 0:
-                sending[link], waiting[link] = waiting[link], -1
-                left[link] = math.ceil(-math.log(1.0 - uniform()) * mean)
-            total += now - newest[link]
-    return total / (slots * cameras)
-
-
-LOOPS: dict[str, Callable[[int, float, int], float]] = {"ch5": periodic_loop, "ch6": modulated_loop}
-
-
 def bench_simulate(
     cameras: int = 18,
     seconds: float = 2000.0,
     rounds: int = 5,
-    preset: str = "ch5",
     loop_seconds: float = 60.0,
 ) -> dict[str, Any]:
     """Link-slots (of 1 ms) a wall second: links in virtual time, with and without their ages, and the loop.
 
     Simulator and loop alternate, so that both see the same machine load. Medians, without compile time.
     """
-    config = channel_from_mapping({"preset": preset})
+    config = channel_from_mapping({"preset": "ch5"})
     simulate(config, cameras, 1.0, engine="kernel")
     decide, with_ages, loop = [], [], []
     found: list[float] = []
@@ -104,36 +68,20 @@ def bench_simulate(
         begun = time.perf_counter()
         result = simulate(config, cameras, seconds, seed, engine="kernel")
         decided = time.perf_counter()
-        known = [age for run in result.runs if (age := ages.mean_age_ms(run.sawtooth())) is not None]
+        found.append(result.mean_age_ms() or 0.0)
         decide.append(cameras * seconds * 1e3 / (decided - begun))
         with_ages.append(cameras * seconds * 1e3 / (time.perf_counter() - begun))
-        found.append(statistics.fmean(known))
         begun = time.perf_counter()
-        stepped.append(LOOPS[preset](cameras, loop_seconds, seed))
+        stepped.append(periodic_loop(cameras, loop_seconds, seed))
         loop.append(cameras * loop_seconds * 1e3 / (time.perf_counter() - begun))
     speeds = {"decisions": decide, "decisions_and_ages": with_ages, "plain_loop": loop}
     return {
-        "preset": preset, "cameras": cameras, "seconds": seconds, "loop_seconds": loop_seconds,
+        "preset": "ch5", "cameras": cameras, "seconds": seconds, "loop_seconds": loop_seconds,
         "rounds": rounds,
         **{f"{name}_link_slots_per_s": statistics.median(values) for name, values in speeds.items()},
         "times_the_loop": statistics.median(with_ages) / statistics.median(loop),
         "mean_age_ms": statistics.fmean(found), "loop_mean_age_ms": statistics.fmean(stepped),
     }  # fmt: skip
-
-
-def show_simulate(result: dict[str, Any]) -> str:
-    lines = [
-        f"{result['preset']}: {result['cameras']} links x {result['seconds']:g} s of 1 ms slots in virtual "
-        f"time; plain loop {result['loop_seconds']:g} s; medians of {result['rounds']} rounds in turns"
-    ]
-    for key, label in (("decisions", "every decision"), ("decisions_and_ages", "and mean ages"),
-                       ("plain_loop", "plain Python loop")):  # fmt: skip
-        lines.append(f"  {label:20} {result[f'{key}_link_slots_per_s'] / 1e6:9.2f} million link-slots/s")
-    lines.append(f"  {'ratio':20} {result['times_the_loop']:9.1f} times the loop (ages included)")
-    lines.append(
-        f"  {'mean age':20} {result['mean_age_ms']:9.2f} ms, loop {result['loop_mean_age_ms']:.2f} ms"
-    )
-    return "\n".join(lines)
 
 
 def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
@@ -145,15 +93,13 @@ def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
     cases: dict[str, ChannelConfig] = {"ideal link": channel_from_mapping({})}
     for name, params in FAULTS.items():
         cases[f"fault {name}"] = channel_from_mapping({"faults": {name: params}})
-    exponential = {"law": "exponential", "mean_ms": 0.01}
-    chain = {"mu1_per_ms": 1 / 30, "mu2_per_ms": 1 / 30}
     for what, section in {
-        "service exponential": {"service": exponential},
-        "service gamma": {"service": {"law": "gamma", "mean_ms": 0.01, "shape": 2.0}},
-        "service lognormal": {"service": {"law": "lognormal", "mean_ms": 0.01, "sigma": 0.5}},
-        "chain of two states": {"chain": chain},
-        "chain at 1 ms slots": {"chain": {**chain, "sampled": "slots", "slot_ms": 1.0}},
-        "Poisson sampling": {"arrivals": {"process": "poisson", "rate_per_ms": 100.0}},
+        "service exponential": {"service": "exp:0.01ms"},
+        "service gamma": {"service": "gamma:0.01ms:2"},
+        "service lognormal": {"service": "lognormal:0.01ms:0.5"},
+        "chain of two states": {"chain": "mu1=1/30,mu2=1/30"},
+        "chain at 1 ms slots": {"chain": "mu1=1/30,mu2=1/30,slots=1ms"},
+        "Poisson sampling": {"arrivals": "poisson:100"},
         "server of 18 cameras": {"server": {"shared": True}},
     }.items():
         cases[what] = channel_from_mapping(section)
@@ -170,12 +116,6 @@ def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
         }
         for what, values in spent.items()
     ]
-
-
-def show_cost(rows: list[dict[str, Any]]) -> str:
-    lines = [f"{'one Python link':24} {'ns a frame':>12} {'added':>9}"]
-    lines += [f"{row['what']:24} {row['ns_per_frame']:12,.0f} {row['added_ns']:+9,.0f}" for row in rows]
-    return "\n".join(lines)
 
 
 def _ns_per_frame(config: ChannelConfig, frames: int) -> float:

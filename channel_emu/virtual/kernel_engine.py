@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import LAWS, ChannelConfig, per_state
+from channel_emu.model.config import LAWS, ChannelConfig
 from channel_emu.model.counter_rng import stream_key
+from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
-from channel_emu.virtual.kernels import chain_path, link_service, shared_service, work
-from channel_emu.virtual.link_run import LinkRun, camera_period_ms, name_ranks
+from channel_emu.virtual.kernels import chain_path, philox, service, work
+from channel_emu.virtual.link_run import OUTCOME_CODES, LinkRun, camera_period_ms, name_ranks
 from freshfield.machine_load import usable_cores
 
 # Virtual time of all cameras together below which a thread pool costs more than it saves.
@@ -34,8 +35,7 @@ Offers = tuple[NDArray[np.int64], NDArray[np.int64]]
 Prepared = tuple[Path, Offers]
 
 # numba's signatures say nothing that a type checker could use.
-_serve: Any = link_service.serve
-_serve_all: Any = shared_service.serve_shared
+_serve: Any = service.serve
 
 
 def run(
@@ -55,9 +55,9 @@ def run(
         for name, rank in zip(names, name_ranks(names))
     ]
     if config.server.shared:
-        return _serve_shared(config, channel, names, _run_jobs(jobs, threads), end_ns)
-    services = [partial(_serve_one, config, channel, name, job, end_ns) for name, job in zip(names, jobs)]
-    return _run_jobs(services, threads)
+        return _serve_together(config, channel, names, _run_jobs(jobs, threads), end_ns)
+    alone = [partial(_serve_alone, config, channel, name, job, end_ns) for name, job in zip(names, jobs)]
+    return _run_jobs(alone, threads)
 
 
 def _run_jobs(jobs: Sequence[Callable[[], Any]], threads: int) -> list[Any]:
@@ -93,23 +93,25 @@ def _prepare(
     )
 
 
-def _serve_one(
+def _serve_alone(
     config: ChannelConfig, channel: Channel, name: str, prepare: Callable[[], Prepared], end_ns: int
 ) -> LinkRun:
-    camera_path, (offered, arrive) = prepare()
+    path, (offered, arrive) = prepare()
     outcome, started, due = _serve(
-        arrive, DISCIPLINES.index(config.discipline), config.queue_limit,
-        _work(config, channel, name, len(arrive)), *_service_means(config), *camera_path, end_ns,
+        arrive, offered, np.zeros(len(arrive), np.int64), DISCIPLINES.index(config.discipline), 0,
+        config.queue_limit, _work(config, channel, name, len(arrive)), *_service_means(config), *path,
+        np.zeros(1, np.int64), np.array([len(path[0])]), end_ns,
     )  # fmt: skip
-    return LinkRun(name, offered, outcome, started, due, end_ns, _state_shares(config, camera_path, end_ns))
+    return _run_of(config, channel, name, path, (offered, outcome, started, due), end_ns)
 
 
-def _serve_shared(
+def _serve_together(
     config: ChannelConfig, channel: Channel, names: list[str], prepared: list[Prepared], end_ns: int
 ) -> list[LinkRun]:
+    """The runs of cameras that share one server."""
     by_rank = np.argsort(name_ranks(names))
     offers = [prepared[i][1] for i in by_rank]
-    camera = np.concatenate([np.full(len(o[0]), rank, np.int64) for rank, o in enumerate(offers)])
+    camera = np.repeat(np.arange(len(names)), [len(o[0]) for o in offers])
     drawn = np.concatenate([_work(config, channel, names[i], len(o[0])) for i, o in zip(by_rank, offers)])
     offered = np.concatenate([o[0] for o in offers])
     arrive = np.concatenate([o[1] for o in offers])
@@ -121,9 +123,9 @@ def _serve_shared(
     ends = np.cumsum(lengths)
     pick = np.zeros(len(names), np.int64) if one_path else np.arange(len(names))
     kept = paths[:1] if one_path else paths
-    outcome = np.full(len(arrive), link_service.SKIPPED, np.int8)
+    outcome = np.full(len(arrive), service.SKIPPED, np.int8)
     started, due = np.full(len(arrive), -1, np.int64), np.full(len(arrive), -1, np.int64)
-    outcome[order], started[order], due[order] = _serve_all(
+    outcome[order], started[order], due[order] = _serve(
         arrive[order], offered[order], camera[order], DISCIPLINES.index(config.discipline),
         ORDERS.index(config.server.order), config.queue_limit, drawn[order], *_service_means(config),
         np.concatenate([p[0] for p in kept]), np.concatenate([np.append(p[1], 0) for p in kept]),
@@ -132,31 +134,42 @@ def _serve_shared(
     runs: dict[int, LinkRun] = {}
     for rank, i in enumerate(by_rank):
         mine = camera == rank
-        runs[int(i)] = LinkRun(
-            names[i], offered[mine], outcome[mine], started[mine], due[mine], end_ns,
-            _state_shares(config, paths[rank], end_ns),
-        )  # fmt: skip
+        frames = (offered[mine], outcome[mine], started[mine], due[mine])
+        runs[int(i)] = _run_of(config, channel, names[i], paths[rank], frames, end_ns)
     return [runs[i] for i in range(len(names))]
 
 
-def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDArray[np.float64]:
-    service = config.service
-    parameter = float(service.shape or service.sigma or 0.0)
-    delays_ms = np.array(service.delays_ms or [0.0])
-    key = _key(channel.seed, name, "channel.service")
-    return work.draw(count, LAWS.index(service.law), parameter, delays_ms, key)
-
-
-def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], bool]:
-    """means_ms and modulated, as the kernels take them."""
-    means_ms = per_state(config.service.mean_ms) if config.service.mean_ms is not None else [1.0]
-    return np.array(means_ms, float), config.service_state == "modulated" and len(means_ms) > 1
-
-
-def _state_shares(config: ChannelConfig, camera_path: Path, end_ns: int) -> list[float]:
-    starts, states = camera_path
+def _run_of(
+    config: ChannelConfig, channel: Channel, name: str, path: Path, frames: tuple[Any, ...], end_ns: int
+) -> LinkRun:
+    """frames: offered_ns, outcome, started_ns and due_ns of a ``LinkRun``, without the fault loss."""
+    offered, outcome, started, due = frames
+    starts, states = path
+    if loss := config.faults.get("loss"):
+        uniform, other = np.empty(len(offered)), np.empty(len(offered))
+        philox.fill(0, uniform, other, _key(channel.seed, name, "channel.loss"))
+        chance = np.array(per_state(loss.probability))
+        if len(chance) > 1:
+            chance = chance[states[np.searchsorted(starts[:-1], np.maximum(started, 0), side="right") - 1]]
+        outcome[(outcome == service.DELIVERED) & (uniform < chance)] = OUTCOME_CODES["lost"]
     spent_ns = np.bincount(states, np.diff(np.minimum(starts, end_ns)), len(config.state_names))
-    return [float(ns) / end_ns for ns in spent_ns]
+    return LinkRun(name, offered, outcome, started, due, end_ns, [float(ns) / end_ns for ns in spent_ns])
+
+
+def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDArray[np.float64]:
+    law = config.service
+    parameter = float(law.shape or law.sigma or 0.0)
+    delays_ms = np.array(law.delays_ms or [0.0])
+    key = _key(channel.seed, name, "channel.service")
+    return work.draw(count, LAWS.index(law.law), parameter, delays_ms, key)
+
+
+def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """means_ms, speeds and modulated, as the kernels take them."""
+    means_ms = np.array(per_state(1.0 if config.service.mean_ms is None else config.service.mean_ms), float)
+    with np.errstate(divide="ignore"):
+        speeds = 1.0 / (means_ms * 1e6)
+    return means_ms, speeds, config.service_state == "modulated" and len(means_ms) > 1
 
 
 def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +10,7 @@ from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind, Link, Transit
 from channel_emu.model.traffic import PeriodicArrivals, PoissonArrivals
 from channel_emu.virtual.link_run import OUTCOME_CODES, LinkRun, camera_period_ms, name_ranks
+from channel_emu.virtual.replay import offer_all
 
 
 def run(
@@ -23,30 +22,24 @@ def run(
     frame_bytes: int,
 ) -> list[LinkRun]:
     """Every camera's run, in the order of ``names``; the arguments are those of ``simulate.simulate``."""
-    links = [channel.link(name, sampled=frame_period_ms is not None) for name in names]
-    ranks = name_ranks(names)
-    sources = [
-        _source(config, channel, link, frame_period_ms, rank / len(names)) for link, rank in zip(links, ranks)
-    ]
-    transits: list[list[Transit]] = [[] for _ in names]
-    # (next offer's instant, camera's rank, camera, number of the offer)
-    offers = [(source.next_ns(0, 0), ranks[i], i, 0) for i, source in enumerate(sources)]
-    heapq.heapify(offers)
-    while offers[0][0] <= end_ns:
-        at_ns, _, i, number = offers[0]
-        transits[i].append(links[i].offer(at_ns, None, frame_bytes)[0])
-        heapq.heapreplace(offers, (sources[i].next_ns(at_ns, number + 1), ranks[i], i, number + 1))
-    for link in links:
-        link.advance(end_ns)
-    return [_collect(link, each, end_ns) for link, each in zip(links, transits)]
+    offers: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    for name, rank in zip(names, name_ranks(names)):
+        source = _source(config, channel, name, frame_period_ms, rank / len(names))
+        at_ns, number = source.next_ns(0, 0), 0
+        while at_ns <= end_ns:
+            offers[name].append((at_ns, frame_bytes))
+            number += 1
+            at_ns = source.next_ns(at_ns, number)
+    links, transits = offer_all(channel, offers, end_ns, sampled=frame_period_ms is not None)
+    return [_collect(links[name], transits[name], end_ns) for name in names]
 
 
 def _source(
-    config: ChannelConfig, channel: Channel, link: Link, frame_period_ms: float | None, phase: float
+    config: ChannelConfig, channel: Channel, camera: str, frame_period_ms: float | None, phase: float
 ) -> PeriodicArrivals | PoissonArrivals:
     """phase: in [0, 1), the part of the period by which a staggered camera is late."""
     if frame_period_ms is None and config.arrivals.process == "poisson":
-        arrivals = channel.arrivals(link.camera, link.chain)
+        arrivals = channel.arrivals(camera, channel.chain_of(camera))
         assert arrivals is not None
         return arrivals
     period_ms = camera_period_ms(config, frame_period_ms)

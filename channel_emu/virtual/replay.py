@@ -5,27 +5,27 @@ from __future__ import annotations
 from typing import Any
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig
-from channel_emu.model.link import Transit
+from channel_emu.model.link import Link, Transit
 from channel_emu.model.trace import Trace
 
 
-def replay_offers(
-    config: ChannelConfig, seed: int, offers: dict[str, list[tuple[int, int]]], end_ns: int
-) -> dict[str, list[Transit]]:
+def offer_all(
+    channel: Channel, offers: dict[str, list[tuple[int, int]]], end_ns: int, sampled: bool = True
+) -> tuple[dict[str, Link], dict[str, list[Transit]]]:
     """Offer frames to fresh links, as the live emulator would have been offered them.
 
-    offers: (instant in ns, bytes) of each frame, by camera. Returns the transits by camera, as of ``end_ns``.
+    offers: (instant in ns, bytes) of each frame, by camera. sampled: see ``Channel.link``. Returns links and
+    transits by camera, as of ``end_ns``.
     """
-    channel = Channel(config, seed)
-    links = {camera: channel.link(camera) for camera in offers}
+    links = {camera: channel.link(camera, sampled=sampled) for camera in offers}
     transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
-    merged = sorted((at_ns, camera, size) for camera, given in offers.items() for at_ns, size in given)
-    for at_ns, camera, size in merged:
+    for at_ns, camera, size in sorted(
+        (at, name, size) for name, given in offers.items() for at, size in given
+    ):
         transits[camera].append(links[camera].offer(at_ns, None, size)[0])
     for link in links.values():
         link.advance(end_ns)
-    return transits
+    return links, transits
 
 
 def compare(trace: Trace) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def compare(trace: Trace) -> dict[str, Any]:
     Returns {frames: records compared, equal: decided as recorded, different: [one line each, at most 20]}.
     """
     last_ns = max((max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in trace.records), default=0)
-    decided = replay_offers(trace.config, trace.seed, trace.offers(), last_ns)
+    _, decided = offer_all(Channel(trace.config, trace.seed), trace.offers(), last_ns)
     different = []
     for camera, records in trace.by_camera().items():
         for record, transit in zip(records, decided[camera]):

@@ -1,12 +1,13 @@
 """Simulates the links in virtual time: thousands of camera-seconds in a moment, from one seed.
 
 Two engines decide the same for every frame: ``python`` runs ``link.Link`` in an event loop, ``kernel``
-(numba) computes whole arrays. Faults and a chain that is white noise need the Python engine.
+(numba) computes whole arrays. Faults other than loss, and a chain that is white noise, need the Python one.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,18 +52,21 @@ class Simulation:
 
     def mean_age_ms(self) -> float | None:
         """Continuous time average, over the cameras that had a delivery; None where there was none."""
-        return _mean([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
+        return ages.mean_of_known([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
 
-    def summary(self) -> dict[str, Any]:
-        """What the command prints with --json."""
+    def summary(self, metrics: Sequence[str] = ()) -> dict[str, Any]:
+        """What the command prints with --json. metrics: see ``ages.measure``; each the mean over the cameras
+        that have one."""
         saws = [run.sawtooth() for run in self.runs]
         delays = np.concatenate([run.delays_ms() for run in self.runs])
         share = np.mean([run.state_share for run in self.runs], 0)
         counts = {name: sum(run.count(name) for run in self.runs) for name in OUTCOMES}
         return {
-            "mean_age_ms": _mean([ages.mean_age_ms(s) for s in saws]),
-            "mean_age_slotted_ms": _mean([ages.mean_age_slotted_ms(s, self.slot_ms) for s in saws]),
-            "peak_age_ms": _mean([ages.peak_age_ms(s) for s in saws]),
+            "mean_age_ms": ages.mean_of_known([ages.mean_age_ms(s) for s in saws]),
+            "mean_age_slotted_ms": ages.mean_of_known([ages.query_age_ms(s, self.slot_ms) for s in saws]),
+            "peak_age_ms": ages.mean_of_known([ages.peak_age_ms(s) for s in saws]),
+            "metrics_ms": {text: ages.mean_of_known([ages.measure(text, saw, self.seed, run.camera)
+                                        for saw, run in zip(saws, self.runs)]) for text in metrics},
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
             "dropped": counts["dropped_busy"],
@@ -150,7 +154,8 @@ def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> floa
 
 def _kernel_unsupported(config: ChannelConfig, channel: Channel) -> str | None:
     """Why the kernel cannot run this channel, or None."""
-    if config.faults:
+    other = [name for name in config.faults if name != "loss"]
+    if other or (config.faults and config.server.order == "oldest-age"):  # whose turn depends on losses
         return f"faults ({', '.join(config.faults)}) are simulated by the python engine only"
     if config.chain is not None:
         probe = channel.chain or channel.chain_of("")
@@ -161,8 +166,3 @@ def _kernel_unsupported(config: ChannelConfig, channel: Channel) -> str | None:
     except ImportError:
         return "numba is not installed (pip install 'freshfield[emu]')"
     return None
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

@@ -8,14 +8,12 @@ import threading
 
 import grpc
 import grpc.aio
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
 
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
 from freshfield.limits import MAX_WATCHERS
-from freshfield.streams import OpenStreams
+from freshfield.streams import OpenStreams, serve_health
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2
 
@@ -173,20 +171,15 @@ class GrpcThread:
         self._ingest.add_to_server(server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
         edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
-        checker = health.aio.HealthServicer()
-        health_pb2_grpc.add_HealthServicer_to_server(checker, server)
-        names = [
+        checks = await serve_health(server, [
             service.full_name
             for module in (frames_pb2, clock_pb2, edge_pb2)
             for service in module.DESCRIPTOR.services_by_name.values()
-        ]
-        reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
+        ])  # fmt: skip
         port = self._transport.bind(server, self._address)
         await server.start()
-        for name in ("", *names):
-            await checker.set(name, health_pb2.HealthCheckResponse.SERVING)
         log.info("listening on port %d", port)
         self._ready.set()
         await asyncio.to_thread(self._stopping.wait)
-        await checker.enter_graceful_shutdown()
+        await checks.enter_graceful_shutdown()
         await server.stop(0.5)

@@ -1,7 +1,7 @@
 """How long the next update may fit: a fixed time, or what keeps the whole update within a deadline.
 
 An update is more than its fit: frames are decoded, views packed, the field copied for its readers, and on a
-busy machine a step ends late. ``DeadlineBudget`` measures this overhead and reserves time for it.
+busy machine a step ends late. ``UpdateBudget`` measures this overhead and reserves time for it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from edge_server.config import EdgeConfig
 from edge_server.fields import Budget
@@ -35,48 +35,26 @@ _FIRST_RESERVE = 0.2
 _USUAL_SPEED_M_PER_S = 1.0
 
 
-class UpdateBudget(Protocol):
-    """Sets the fitting time of each update."""
-
-    def next(self) -> Budget:
-        """What the next fit may spend."""
-        ...
-
-    def record(self, budget: Budget, update_ms: float) -> None:
-        """An update of ``budget`` took ``update_ms`` from its decision to its publication."""
-        ...
-
-
-@dataclass(frozen=True)
-class FixedBudget:
-    """Every update may fit for ``fit_ms``, however long the rest of it takes."""
-
-    fit_ms: float
-
-    def next(self) -> Budget:
-        return Budget(seconds=self.fit_ms / 1e3)
-
-    def record(self, budget: Budget, update_ms: float) -> None:
-        pass
-
-
 @dataclass
-class DeadlineBudget:
-    """Keeps updates within a deadline.
+class UpdateBudget:
+    """Sets the fitting time of each update.
 
+    fit_ms: longest fit that is worth it; without a deadline, of every fit, however long the rest takes.
     deadline_ms: from decision to publication; ValueError if it leaves no time to fit.
-    fit_ms: longest fit that is worth it.
     """
 
-    deadline_ms: float
     fit_ms: float = math.inf
+    deadline_ms: float | None = None
     _overhead_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
 
     def __post_init__(self) -> None:
-        if not self.deadline_ms >= 2 * _LEAST_MS:
+        if self.deadline_ms is not None and not self.deadline_ms >= 2 * _LEAST_MS:
             raise ValueError(f"deadline_ms: expected {2 * _LEAST_MS:g} or more, got {self.deadline_ms:g}")
 
     def next(self) -> Budget:
+        """What the next fit may spend."""
+        if self.deadline_ms is None:
+            return Budget(seconds=self.fit_ms / 1e3)
         if self._overhead_ms:
             reserve = max(self._overhead_ms) + _MARGIN_MS
         else:
@@ -84,6 +62,7 @@ class DeadlineBudget:
         return Budget(seconds=max(_LEAST_MS, min(self.deadline_ms - reserve, self.fit_ms)) / 1e3)
 
     def record(self, budget: Budget, update_ms: float) -> None:
+        """An update of ``budget`` took ``update_ms`` from its decision to its publication."""
         assert budget.seconds is not None
         self._overhead_ms.append(update_ms - budget.seconds * 1e3)
 
@@ -169,7 +148,7 @@ def open_budget(scenario: Scenario, config: EdgeConfig) -> tuple[UpdateBudget, d
     """The budget that a scenario asks for, and the field's options: the scenario's own, over those of the
     frontier point that a deadline leads to. ValueError where the frontier cannot be read."""
     if config.deadline_ms is None:
-        return FixedBudget(config.update_ms), config.field_options
+        return UpdateBudget(config.update_ms), config.field_options
     path = None if config.frontier is None else scenario.path.parent / config.frontier
     speed = scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S)
     point = best_point(read_frontier(path, config.field), config.deadline_ms, float(speed))
@@ -180,4 +159,4 @@ def open_budget(scenario: Scenario, config: EdgeConfig) -> tuple[UpdateBudget, d
     )  # fmt: skip
     if point.update_ms > config.deadline_ms:
         log.warning("no measured update is as short as that: updates do what fits")
-    return DeadlineBudget(config.deadline_ms, point.update_ms), {**point.options, **config.field_options}
+    return UpdateBudget(point.update_ms, config.deadline_ms), {**point.options, **config.field_options}

@@ -1,21 +1,19 @@
 """Policies: which of the newest views an update uses, and how long to wait for younger ones.
 
-``policy`` says what a policy is, ``registry`` makes one by name; every other file here holds one policy.
+``policy`` says what a policy is, ``registry`` makes one by name; ``fixed`` and ``wait`` hold the fixed ones.
 ``learned`` trains policies and runs them, ``online`` keeps a learned policy learning while it is used.
 """
 
-from edge_server.scheduler.policy import STATE_PARTS, Epoch, Observer, Policy, SelectionWindow
+from edge_server.scheduler.policy import STATE_PARTS, Epoch, Policy, SelectionWindow
 from edge_server.scheduler.registry import (
     BANDIT,
     OFFERED,
     POLICIES,
     TREATMENTS,
-    VIRTUAL_ONLY,
     make_live_policy,
     make_policy,
     parse_policy,
     policy_help,
-    policy_label,
     resolve_checkpoint,
     short_name,
 )
@@ -26,16 +24,13 @@ __all__ = [
     "POLICIES",
     "STATE_PARTS",
     "TREATMENTS",
-    "VIRTUAL_ONLY",
     "Epoch",
-    "Observer",
     "Policy",
     "SelectionWindow",
     "make_live_policy",
     "make_policy",
     "parse_policy",
     "policy_help",
-    "policy_label",
     "resolve_checkpoint",
     "short_name",
 ]

@@ -62,9 +62,10 @@ class SelectionWindow:
 class Policy:
     """Base of all policies. A subclass sets ``name`` and implements ``select``; the rest are defaults.
 
-    parameter: name and unit of the one value a user may set, such as ``omega_ms``; None if there is none.
-    value: that value. treatment: applied to the selected views before they supervise the field. embedding:
-    width of the embeddings it decides by (0: it needs none) and the name of their embedder (empty: not said).
+    parameter: name and unit of the one value a user may set, such as ``omega_ms`` or the count ``k``; None if
+    there is none. value: that value. treatment: applied to the selected views before they supervise the
+    field. embedding: width of the embeddings it decides by (0: it needs none) and the name of their embedder
+    (empty: not said).
     """
 
     name: str
@@ -72,6 +73,20 @@ class Policy:
     value: float | None = None
     treatment: Treatment | None = None
     embedding: tuple[int, str] = (0, "")
+
+    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
+        """value: of ``parameter``; None keeps the default. rng: for policies that draw. Raises ValueError."""
+        self._rng = rng
+        if self.parameter is None or value is None:
+            return
+        if self.parameter == "k":
+            if value != int(value) or value < 1:
+                raise ValueError(f"k: expected a whole number from 1, got {value:g}")
+            self.value = int(value)
+        else:
+            if not np.isfinite(value) or value < 0:
+                raise ValueError(f"{self.parameter}: expected zero or more, got {value:g}")
+            self.value = float(value)
 
     @property
     def last_decision(self) -> Decision | None:
@@ -85,21 +100,3 @@ class Policy:
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting."""
         raise NotImplementedError
-
-
-def positive_int(value: float | None, default: int, name: str) -> int:
-    """``value`` as a count of at least one, or ValueError naming the parameter."""
-    if value is None:
-        return default
-    if value != int(value) or value < 1:
-        raise ValueError(f"{name}: expected a whole number from 1, got {value:g}")
-    return int(value)
-
-
-def non_negative(value: float | None, default: float, name: str) -> float:
-    """``value`` as a finite number of at least zero, or ValueError naming the parameter."""
-    if value is None:
-        return default
-    if not np.isfinite(value) or value < 0:
-        raise ValueError(f"{name}: expected zero or more, got {value:g}")
-    return float(value)

@@ -1,6 +1,6 @@
 """Policies by name, as people write them: ``threshold:120``, ``wait+freshen``, ``bandit:FILE``.
 
-Adding a policy takes one file in this folder and a line in ``POLICIES``. A name may go on with a treatment of
+Adding a policy takes a class and a line in ``POLICIES``. A name may go on with a treatment of
 the selected views: ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a
 treatment's name alone treats all views. ``bandit:FILE`` is a learned policy
 (``edge_server.scheduler.learned``).
@@ -13,19 +13,21 @@ from pathlib import Path
 
 import numpy as np
 
+from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
+from edge_server.scheduler.wait import Wait, WaitFlush
 
-# name -> (module, class, one line of help)
-POLICIES: dict[str, tuple[str, str, str]] = {
-    "all": ("all", "UseAll", "every camera's newest frame, however old"),
-    "periodic": ("periodic", "Periodic", "use all, at fixed instants; value: period_ms"),
-    "random": ("random", "RandomSubset", "a uniformly random non-empty set; value: k fixes its size"),
-    "round-robin": ("round_robin", "RoundRobin", "the next k cameras in turn; value: k"),
-    "freshest-k": ("freshest_k", "FreshestK", "the k youngest frames; value: k"),
-    "age-driven": ("age_driven", "AgeDriven", "the largest set whose mean age is minimal"),
-    "threshold": ("threshold", "Threshold", "frames no older than omega (6.12-6.14); value: omega_ms"),
-    "wait": ("wait", "Wait", "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
-    "wait-flush": ("wait", "WaitFlush", "as wait, what is on its way at the decision broken off (6.5)"),
+# name -> (class, one line of help)
+POLICIES: dict[str, tuple[type[Policy], str]] = {
+    "all": (fixed.UseAll, "every camera's newest frame, however old"),
+    "periodic": (fixed.Periodic, "use all, at fixed instants; value: period_ms"),
+    "random": (fixed.RandomSubset, "a uniformly random non-empty set; value: k fixes its size"),
+    "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
+    "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
+    "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
+    "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
+    "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
+    "wait-flush": (WaitFlush, "as wait, what is on its way at the decision broken off (6.5)"),
 }
 
 
@@ -48,7 +50,7 @@ OFFERED: tuple[str, ...] = (
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
-    """The named policy, whose module is imported only now.
+    """The named policy; modules of treatments and of learned policies are imported only now.
 
     name: as in ``POLICIES``, or POLICY+TREATMENT, TREATMENT, bandit:FILE. value: of its parameter; None takes
     the default. rng: for policies that draw. ValueError for an unknown name or a value out of range, with the
@@ -67,8 +69,7 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
             f"policy {wrong!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
             "or join a policy and a treatment, as in threshold+freshen; a learned one is bandit:FILE"
         )
-    module, cls, _ = POLICIES[base]
-    policy: Policy = getattr(importlib.import_module(f"edge_server.scheduler.{module}"), cls)(value, rng)
+    policy = POLICIES[base][0](value, rng)
     if not treatment:
         return policy
     if treatment not in TREATMENTS:
@@ -76,10 +77,10 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
             f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of "
             f"{', '.join(TREATMENTS)}"
         )
-    from edge_server.scheduler.treated import Treated
-
     module, cls, _ = TREATMENTS[treatment]
-    return Treated(name, policy, getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)())
+    policy.name = name
+    policy.treatment = getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)()
+    return policy
 
 
 def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -130,7 +131,7 @@ def policy_help(name: str) -> str:
     base, treatment = _split(name)
     if base not in POLICIES or (treatment and treatment not in TREATMENTS):
         return ""
-    line = POLICIES[base][2]
+    line = POLICIES[base][1]
     if not treatment:
         return line
     what, _, parameter = line.partition("; value:")

@@ -11,21 +11,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow, non_negative
-
-DEFAULT_OMEGA_MS = 120.0
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
 
 class Wait(Policy):
     name = "wait"
     parameter = "omega_ms"
-    value: float
-
-    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        del rng
-        self.value = non_negative(value, DEFAULT_OMEGA_MS, "omega_ms")
+    value: float = 120.0
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
         return wait_window(epoch.now_ns, self.value)

@@ -6,13 +6,15 @@ adds them up can say that something is missing.
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
 import logging
 import os
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,47 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer = csv.DictWriter(file, names, restval="")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Mappings with the same keys as a table for people: numbers to five digits, to the right; text to the
+    left."""
+    columns = []
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        numbers = all(isinstance(value, int | float) for value in values)
+        cells = [name, *(f"{value:.5g}" if isinstance(value, float) else str(value) for value in values)]
+        width = max(map(len, cells))
+        columns.append([cell.rjust(width) if numbers else cell.ljust(width) for cell in cells])
+    return "\n".join("  ".join(cells).rstrip() for cells in zip(*columns))
+
+
+class PlotError(ValueError):
+    """A picture that cannot be drawn; the message says why."""
+
+
+@contextlib.contextmanager
+def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **options: Any) -> Iterator[Any]:
+    """Axes (rows, columns) to draw on; ``path`` is then replaced by the picture.
+
+    size: in inches. options: of matplotlib's ``subplots``. Raises PlotError without matplotlib, or if the
+    file cannot be written.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise PlotError("a picture needs matplotlib (pip install 'freshfield[edge]')") from None
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    yield figure.subplots(rows, columns, squeeze=False, **options)
+    drawn = io.BytesIO()
+    try:
+        figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=120)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, drawn.getvalue())
+    except (OSError, ValueError) as error:
+        raise PlotError(f"{path}: cannot be drawn: {error}") from None
 
 
 class Lines:

@@ -54,39 +54,26 @@ def outside_cores(row: Mapping[str, Any]) -> float | None:
     return None if found is None else round(found, 2)
 
 
-def outside_load(processes: Sequence[dict[str, Any]], proc: Path = _PROC) -> dict[str, Any]:
+def outside_load(processes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """How many cores others kept busy during a whole run.
 
     processes: rows of ``processes.jsonl``.
 
     Returns {cores, ours, method}. ``cores`` is the median of ``outside_cores`` over the rows that say what
-    the machine used. Where none does, it is the load average of the last minute minus what ours used then:
-    rougher, because the load average counts our waiting threads too. None where neither is known.
+    the machine used, None where none does.
     """
     ours = [_ours(row) for row in processes]
     others = [cores for row in processes if (cores := _outside(row)) is not None]
-    used = round(statistics.median(ours), 2) if ours else None
-    if others:
-        return {"cores": round(statistics.median(others), 2), "ours": used, "method": "machine minus ours"}
-    load = load_average(proc)
-    if load is None or used is None:
-        return {"cores": None, "ours": used, "method": None}
-    last_s = processes[-1]["t_s"]
-    recent = statistics.fmean(o for o, row in zip(ours, processes) if row["t_s"] > last_s - 60.0)
-    return {"cores": round(max(0.0, load - recent), 2), "ours": used, "method": "load average minus ours"}
+    return {
+        "cores": round(statistics.median(others), 2) if others else None,
+        "ours": round(statistics.median(ours), 2) if ours else None,
+        "method": "machine minus ours" if others else None,
+    }
 
 
 def usable_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def load_average(proc: Path = _PROC) -> float | None:
-    """Load average of the last minute."""
-    try:
-        return float((proc / "loadavg").read_text().split()[0])
-    except (OSError, ValueError, IndexError):
-        return None
 
 
 def rss_mb(pid: int | str = "self") -> float | None:

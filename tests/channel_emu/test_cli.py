@@ -11,8 +11,9 @@ from pathlib import Path
 import grpc
 import pytest
 
-from channel_emu import cli_syntax
 from channel_emu.cli import main
+from channel_emu.model import spelling
+from channel_emu.model.presets import PRESETS
 from freshfield import ledger
 from freshfield.transport import Transport
 from tests.channel_emu.model.test_trace import record
@@ -67,6 +68,37 @@ def test_simulate_from_a_scenario_and_for_people(capsys, scenario: Path) -> None
     assert "mean age" in text and "dropped_busy" in text and "drawn delay" in text
 
 
+def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
+    assert main(["presets"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n{name} " in text for name in PRESETS)
+    assert "\nch6                         45  mmpp:1/120ms,1/30ms  exp:30ms,exp:60ms " in text
+    assert " mu1=1/30,mu2=1/30,states=low/high " in text and " {loss: [0.01, 0.5]}\n" in text
+    assert "mahimahi:FILE" in text
+    assert main(["presets", "--json"]) == 0
+    found = {row["preset"]: row for row in json.loads(capsys.readouterr().out)}
+    assert found["swing"]["mean_delay_ms"] == 82.5 and found["ideal"]["mean_delay_ms"] == 0
+
+
+def test_frames_metrics_and_a_picture_of_a_simulation(capsys, tmp_path: Path) -> None:
+    frames, drawn = tmp_path / "new" / "frames.csv", tmp_path / "ages.png"
+    found = simulate(
+        capsys, "--preset", "ch5", "--fault", "loss:0.1", "--fault", "duplication:{probability: 0.5}",
+        "--csv", str(frames), "--plot", str(drawn), "--metric", "peak", "--metric", "shown:9ms:1ms",
+        "--seconds", "60",
+    )  # fmt: skip
+    assert found["lost"] > 0 and found["duplicated"] > 0
+    assert found["metrics_ms"]["peak"] == found["peak_age_ms"]
+    assert found["metrics_ms"]["shown:9ms:1ms"] == pytest.approx(found["mean_age_ms"] + 9.5, abs=0.5)
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    rows = frames.read_text().splitlines()
+    assert rows[0] == "offered_ms,delivered_ms,camera" and len(rows) == found["offered"] + 1
+    assert main(["fit", str(frames), "--states", "1", "--json"]) == 0
+    fitted = json.loads(capsys.readouterr().out)
+    assert fitted["delays"] == found["delivered"]
+    assert fitted["parameters"]["mean_ms"]["low"] < 60 < fitted["parameters"]["mean_ms"]["high"]
+
+
 def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("# ms\n10\n20\n\n60\n")
     found = simulate(capsys, "--service", f"trace:{tmp_path / 'delays.txt'}", "--seconds", "30",
@@ -78,7 +110,7 @@ def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
     ("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)]
 )
 def test_spans(text: str, value: float) -> None:
-    assert cli_syntax.span_ms(text) == pytest.approx(value)
+    assert spelling.span_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +118,7 @@ def test_spans(text: str, value: float) -> None:
     [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)],
 )
 def test_rates(text: str, value: float) -> None:
-    assert cli_syntax.rate_per_ms(text) == pytest.approx(value)
+    assert spelling.rate_per_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -114,6 +146,10 @@ def test_rates(text: str, value: float) -> None:
         (["--seconds", "1e9", "--cameras", "18"], "frames: expected at most"),
         (["--arrivals", "poisson:1e12"], "frames: expected at most"),
         (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
+        (["--preset", "ch7"], "expected one of ideal, ch5"),
+        (["--fault", "rain:1"], "unknown fault"),
+        (["--fault", "loss:[0.1"], "expected something like loss:0.1"),
+        (["--metric", "youth"], "metric 'youth': expected one of age, peak"),
     ],
 )
 def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
@@ -223,7 +259,7 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
 
 
 def test_bare_mmpp_is_the_thesiss() -> None:
-    assert cli_syntax.arrivals("mmpp") == cli_syntax.arrivals("mmpp:1/120ms,1/30ms")
+    assert spelling.arrivals("mmpp") == spelling.arrivals("mmpp:1/120ms,1/30ms")
 
 
 def test_a_bench_of_no_seconds_is_refused(capsys) -> None:
@@ -240,6 +276,8 @@ def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Pat
         ["fit", str(rows), "--states", "1", "--out", nowhere],
         ["fit", str(rows), "--states", "1", "--plot", nowhere],
         ["accuracy", "--quick", "--out", nowhere],
+        ["simulate", "--seconds", "1", "--csv", nowhere],
+        ["simulate", "--seconds", "1", "--plot", nowhere],
         ["run", str(scenario), "--no-priority", "--listen", listen, "--out", nowhere],
         ["proxy", "--no-priority", "--to", "127.0.0.1:1", "--listen", listen, "--trace", nowhere],
     ):

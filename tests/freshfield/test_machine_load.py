@@ -13,7 +13,6 @@ import pytest
 from freshfield.machine_load import (
     LoadMeter,
     cpu_s,
-    load_average,
     outside_cores,
     outside_load,
     peak_rss_mb,
@@ -62,18 +61,6 @@ def test_outside_load_is_what_the_machine_used_minus_ours():
     assert outside_load(rows) == {"cores": pytest.approx(0.7), "ours": 1.3, "method": "machine minus ours"}
 
 
-def test_without_the_machines_own_count_the_load_average_must_do(tmp_path):
-    (tmp_path / "loadavg").write_text("2.50 1.00 0.50 3/200 999\n")
-    rows = [{"t_s": t, "edge": use(cpu)} for t, cpu in ((0.0, 9.0), (100.0, 1.0), (110.0, 2.0))]
-    found = outside_load(rows, tmp_path)
-    assert found["cores"] == 1.0 and found["method"] == "load average minus ours"  # 2.5 less a mean of 1.5
-
-
-def test_ours_can_be_more_than_the_load_average_but_others_never_negative(tmp_path):
-    (tmp_path / "loadavg").write_text("0.10 1.00 0.50 3/200 999\n")
-    assert outside_load([{"t_s": 0.0, "edge": use(1.0)}], tmp_path)["cores"] == 0.0
-
-
-def test_nothing_known_is_none(tmp_path):
-    assert load_average(tmp_path) is None
-    assert outside_load([], tmp_path) == {"cores": None, "ours": None, "method": None}
+def test_nothing_known_is_none():
+    assert outside_load([]) == {"cores": None, "ours": None, "method": None}
+    assert outside_load([{"t_s": 0.0, "edge": use(1.0)}])["cores"] is None

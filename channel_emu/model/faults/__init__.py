@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.link import Fault, Transit
 
-NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth")
+NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth", "mahimahi")
 
 
 def params_class(name: str) -> type[Any]:
@@ -32,13 +32,15 @@ def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
 
 @dataclass(frozen=True)
 class ChanceParams:
-    """Parameters of a ``ChanceFault``."""
+    """Parameters of a ``ChanceFault``. probability: one number, or one for each state of the chain in which
+    transmission starts; losses are then those of Gilbert and Elliott."""
 
-    probability: float
+    probability: float | list[float]
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.probability <= 1.0:
-            raise ValueError(f"probability: expected a probability from 0 to 1, got {self.probability:g}")
+        for p in per_state(self.probability):
+            if not 0.0 <= p <= 1.0:
+                raise ValueError(f"probability: expected a probability from 0 to 1, got {p:g}")
 
 
 class ChanceFault(Fault):
@@ -49,6 +51,13 @@ class ChanceFault(Fault):
     def __init__(self, params: Any, seed: int, camera: str) -> None:
         self.params = params
         self.rng = CounterRng(seed, camera, self.purpose)
+        self._by_state = per_state(params.probability)
 
     def hits(self, transit: Transit) -> bool:
-        return self.rng.uniform(transit.number) < self.params.probability
+        p = self._by_state[transit.state if len(self._by_state) > 1 else 0]
+        return self.rng.uniform(transit.number) < p
+
+
+def per_state(value: float | list[float]) -> list[float]:
+    """A value as a list: one entry a state, or one for all."""
+    return list(value) if isinstance(value, list) else [value]

@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numba import njit
 
+from channel_emu.model import nanoseconds
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
@@ -25,14 +26,8 @@ _NEVER = float(NEVER_NS)
 _BLOCK = 256
 
 
-@njit(cache=True, nogil=True)
-def saturating_round(span_ns):
-    return NEVER_NS if span_ns >= _NEVER else np.int64(span_ns + 0.5)
-
-
-@njit(cache=True, nogil=True)
-def saturating_add(instant_ns, span_ns):
-    return min(instant_ns + span_ns, NEVER_NS)
+saturating_round = njit(nanoseconds.saturating_round, nogil=True)
+saturating_add = njit(nanoseconds.saturating_add, nogil=True)
 
 
 @njit(cache=True, nogil=True)
@@ -109,48 +104,18 @@ def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
 
 @njit(cache=True, nogil=True)
 def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
-    """Instants of a (Markov-modulated) Poisson process in [0, horizon], int64.
-
-    ``completion_ns`` inlined: the same operations in the same order, without a call for each arrival.
-    """
+    """Instants of a (Markov-modulated) Poisson process in [0, horizon], int64."""
     found = np.empty(1024, np.int64)
     u, v = np.empty(_BLOCK), np.empty(_BLOCK)
-    alike = True
-    for k in range(1, len(rates_per_ns)):
-        alike &= rates_per_ns[k] == rates_per_ns[0]
-    count, at_ns, i = 0, np.int64(0), 0
+    count, at_ns, hint = 0, np.int64(0), 0
     while True:
         k = count % _BLOCK
         if k == 0:
             fill(count, u, v, key)
-        work = -math.log(u[k])
-        if alike:
-            at_ns = (
-                saturating_add(at_ns, saturating_round(work / rates_per_ns[0]))
-                if rates_per_ns[0] > 0.0
-                else NEVER_NS
-            )
-        else:
-            while True:
-                until_ns = starts[i + 1]
-                rate = rates_per_ns[states[i]]
-                if rate > 0.0:
-                    left = float(until_ns - at_ns)
-                    need = work / rate
-                    if need <= left:
-                        at_ns = saturating_add(at_ns, saturating_round(need))
-                        break
-                    work -= rate * left
-                at_ns = until_ns
-                i += 1
-                if i == len(states):
-                    at_ns = NEVER_NS
-                    break
+        at_ns = completion_ns(-math.log(u[k]), rates_per_ns, starts, states, at_ns, hint)
         if at_ns > horizon_ns:
             return found[:count].copy()
-        if not alike:  # an instant rounded to the end of a sojourn belongs to the next one
-            while starts[i + 1] <= at_ns:
-                i += 1
+        hint = segment(starts, at_ns, hint)
         if count == len(found):
             found = np.concatenate((found, np.empty_like(found)))
         found[count] = at_ns

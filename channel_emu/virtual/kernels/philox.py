@@ -10,12 +10,9 @@ _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _WORD, _HALF, _TWELVE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(12)
 
 
-@njit(cache=True, nogil=True)
-def pair(number, again, key):
-    """Two uniforms in (0, 1); ``key``: uint64 (2,) holding 32-bit words."""
-    n = np.uint64(number)
-    c0, c1, c2, c3 = n & _WORD, n >> _HALF, np.uint64(again), np.uint64(0)
-    k0, k1 = key[0], key[1]
+@njit(inline="always")
+def _pair(n, again, k0, k1):
+    c0, c1, c2, c3 = n & _WORD, n >> _HALF, again, np.uint64(0)
     for _ in range(10):
         p0, p1 = _MULTIPLY_0 * c0, _MULTIPLY_1 * c2
         c0, c1, c2, c3 = (p1 >> _HALF) ^ c1 ^ k0, p1 & _WORD, (p0 >> _HALF) ^ c3 ^ k1, p0 & _WORD
@@ -26,21 +23,14 @@ def pair(number, again, key):
 
 
 @njit(cache=True, nogil=True)
-def fill(first, u, v, key):
-    """Write the pairs of numbers first, first + 1, ... into u and v (float64, one length).
+def pair(number, again, key):
+    """Two uniforms in (0, 1); ``key``: uint64 (2,) holding 32-bit words."""
+    return _pair(np.uint64(number), np.uint64(again), key[0], key[1])
 
-    The loop vectorizes, which is ten times as fast as ``pair`` one by one. That is why the rounds stand here
-    a second time; the tests compare the two.
-    """
-    n = np.uint64(first)
-    key_0, key_1 = key[0], key[1]
+
+@njit(cache=True, nogil=True)
+def fill(first, u, v, key):
+    """Write the pairs of numbers first, first + 1, ... into u and v (float64, one length)."""
+    n, k0, k1 = np.uint64(first), key[0], key[1]
     for i in range(len(u)):
-        k0, k1 = key_0, key_1
-        number = n + np.uint64(i)
-        c0, c1, c2, c3 = number & _WORD, number >> _HALF, np.uint64(0), np.uint64(0)
-        for _ in range(10):
-            p0, p1 = _MULTIPLY_0 * c0, _MULTIPLY_1 * c2
-            c0, c1, c2, c3 = (p1 >> _HALF) ^ c1 ^ k0, p1 & _WORD, (p0 >> _HALF) ^ c3 ^ k1, p0 & _WORD
-            k0, k1 = (k0 + _WEYL_0) & _WORD, (k1 + _WEYL_1) & _WORD
-        u[i] = (float((c1 << _HALF | c0) >> _TWELVE) + 0.5) * 2.0**-52
-        v[i] = (float((c3 << _HALF | c2) >> _TWELVE) + 0.5) * 2.0**-52
+        u[i], v[i] = _pair(n + np.uint64(i), np.uint64(0), k0, k1)

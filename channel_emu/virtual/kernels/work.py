@@ -7,14 +7,13 @@ import math
 import numpy as np
 from numba import njit
 
+from channel_emu.model import service_time
 from channel_emu.virtual.kernels.philox import fill, pair
 
 LAW_NONE, LAW_EXPONENTIAL, LAW_DETERMINISTIC, LAW_GAMMA, LAW_LOGNORMAL, LAW_TRACE = 0, 1, 2, 3, 4, 5
 
 
-@njit(cache=True, nogil=True)
-def _normal(u, v):
-    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
+_normal = njit(service_time.normal, nogil=True)
 
 
 @njit(cache=True, nogil=True)

@@ -76,7 +76,7 @@ class ChaosDeployment(VirtualDeployment):
         self._ledgers: dict[str, Ledger] = {}
         self._rng = np.random.default_rng(seed_sequence(scenario.seed, "chaos", "hostile"))
         self._attempts = 0
-        config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel")
+        config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
         self._config = config
         self.shared = config.server.shared
         super().__init__(cameras, config, self._new_updater(0), settings, scenario.seed)

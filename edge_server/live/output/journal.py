@@ -48,10 +48,7 @@ class Journal:
         self._status = status
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
-        self._series = Lines(out / "series.jsonl")
-        self._shown = Lines(out / "shown.jsonl")
-        self._ages = Lines(out / "ages.jsonl")
-        self._poses = Lines(out / "poses.jsonl")
+        self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages", "poses")}
         self._last_s: float | None = None  # of the last publication
         self._usual_s: float | None = None  # from one publication to the next
         self._without_line = 0  # publications since the last line of the series
@@ -62,7 +59,7 @@ class Journal:
     @property
     def lines_lost(self) -> int:
         """Number of lines that could not be written so far."""
-        return self._series.lost + self._shown.lost + self._ages.lost + self._poses.lost
+        return sum(file.lost for file in self._files.values())
 
     def published(self, publication: Publication) -> None:
         with self._lock:
@@ -95,14 +92,14 @@ class Journal:
                 "display": 1e3 * (t_s - publication.t_s),
             },
         }
-        self._shown.write(json.dumps(line, allow_nan=False))
+        self._files["shown"].write(json.dumps(line, allow_nan=False))
 
     def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
         line = {
             "t_s": round(t_s, 4),
             "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()},
         }
-        self._ages.write(json.dumps(line))
+        self._files["ages"].write(json.dumps(line))
 
     def poses(self, views: Sequence[View]) -> None:
         """Write the poses of those views whose cameras have moved."""
@@ -114,7 +111,7 @@ class Journal:
             self._poses_left -= 1
             q, t_m = pose.quaternion, pose.translation_m
             line = {"camera": view.camera, "ns": view.generated_ns, "q": q, "t_m": t_m}
-            self._poses.write(json.dumps(line))
+            self._files["poses"].write(json.dumps(line))
 
     def write_status(self) -> None:
         """Replace edge.json; where that fails, the old one stays."""
@@ -130,10 +127,8 @@ class Journal:
         with self._lock:
             while self._open:
                 self._write_oldest()
-            self._series.close()
-            self._shown.close()
-            self._ages.close()
-            self._poses.close()
+            for file in self._files.values():
+                file.close()
         self.write_status()
 
     def _write_oldest(self) -> None:
@@ -151,4 +146,4 @@ class Journal:
             self._without_line += 1
             return
         self._without_line = 0
-        self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False))
+        self._files["series"].write(json.dumps(dataclasses.asdict(publication), allow_nan=False))

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.scheduler.fixed import within_threshold
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
-from edge_server.scheduler.threshold import within_threshold
 from edge_server.scheduler.wait import generated_in, wait_window
 
 

@@ -53,10 +53,6 @@ class Explanation:
     cameras_error: NDArray[np.float64]
     names: tuple[str, ...]
 
-    def strongest(self) -> int | None:
-        """The camera with the largest share in magnitude; None without cameras."""
-        return int(np.argmax(np.abs(self.cameras))) if len(self.cameras) else None
-
 
 def explain(actor: Actor, state: State, action: Any, pairs: int | None = None) -> Explanation:
     """Explain why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs: of

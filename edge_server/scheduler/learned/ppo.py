@@ -148,10 +148,6 @@ class Learner:
         ``explore`` the most probable ones."""
         return self.actor.act(states, self._rng["actions"] if explore else None)
 
-    def greedy(self, state: State) -> NDArray[Any]:
-        """The most probable action: (N,) bool, or an index of the omegas as a 0-d array."""
-        return np.asarray(self.actor.act([state], None)[0][0])
-
     def value(self, states: Sequence[State]) -> NDArray[np.float64]:
         """V (B,), in the reward's unit."""
         weights = {name: w.detach().numpy() for name, w in self._value.items()}

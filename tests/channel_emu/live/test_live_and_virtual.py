@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from channel_emu.model import ages, trace
+from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind, Transit
 from channel_emu.model.trace import Record
-from channel_emu.virtual.replay import replay_offers
+from channel_emu.virtual.replay import offer_all
 from tests.channel_emu.live.emulator import CAMERAS, emulate, run
 from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
@@ -34,14 +35,20 @@ def late_ms(records: list[Record]) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("section", [FAST, CHAPTER_5, PARALLEL], ids=["ch6", "ch5", "parallel"])
+# Losses by state, and a line that lets 20 packets go every 4 ms.
+LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "mahimahi": [4] * 20}}
+
+
+@pytest.mark.parametrize(
+    "section", [FAST, CHAPTER_5, PARALLEL, LOSSY], ids=["ch6", "ch5", "parallel", "lossy"]
+)
 def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path, section: dict) -> None:
     """The trace's offers in virtual time deliver each frame when it is due, live a moment later: the age is
     greater by that moment, weighted by what the frame was worth."""
     run(record(tmp_path, section, 0.005, 100))
     found = trace.read(tmp_path / "t.jsonl")
-    end_ns = max(max(r.offered_ns, r.actual_ns or 0) for r in found.records)
-    virtual = replay_offers(found.config, found.seed, found.offers(), end_ns)
+    end_ns = max(max(r.offered_ns, r.ended_ns or 0, r.actual_ns or 0) for r in found.records)
+    _, virtual = offer_all(Channel(found.config, found.seed), found.offers(), end_ns)
     for camera, records in found.by_camera().items():
         assert [r.outcome for r in records] == [t.outcome for t in virtual[camera]]
         # A frame that leaves the link while the edge is stalled is broken and has no actual instant.

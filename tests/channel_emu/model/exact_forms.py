@@ -148,3 +148,37 @@ def modulated_drop_new(a: float, b: float, mu_good: float, mu_bad: float, period
     mean = alpha @ r @ one
     square = alpha @ (eye + big_b) @ r @ r @ one
     return float((period**2 * square / 2 + period * (alpha @ r @ r @ (big_a - big_b) @ m)) / (period * mean))
+
+
+def incorrect_without_delay(lam: float, away: float, back: float) -> float:
+    """Age of incorrect information where Poisson updates arrive at once, on a source of two states.
+
+    Wrong after the source left what was known, which lasts until it returns or is updated: visits to a state
+    of a chain (source, known). For each known state, its share of being wrong times the mean age of a visit.
+    """
+    # Of (source, known): 00, 10, 11, 01.
+    q = np.zeros((4, 4))
+    q[0, 1], q[1, 0], q[1, 2] = away, back, lam
+    q[2, 3], q[3, 2], q[3, 0] = back, away, lam
+    q -= np.diag(q.sum(1))
+    share = np.linalg.lstsq(np.vstack((q.T, np.ones(4))), np.array([0, 0, 0, 0, 1.0]), rcond=None)[0]
+    return float(share[1] / (back + lam) + share[3] / (away + lam))
+
+
+def gilbert_elliott(
+    a: float, b: float, loss: tuple[float, float], period: float, delay: float
+) -> tuple[float, float]:
+    """Mean and peak age of periodic frames that each take ``delay``, lost with the probability of the state.
+
+    N frames from one delivery to the next: with P the chain's change over a period, F = P diag(loss) and
+    G = P diag(1 - loss), alpha = alpha (I - F)^-1 G is the state at a delivery; E[N] = alpha (I - F)^-1 1,
+    E[N²] = alpha (I + F) (I - F)^-2 1. Age: delay + C E[N²] / (2 E[N]); peak: delay + C E[N].
+    """
+    p = expm(np.array([[-a, a], [b, -b]]) * period)
+    f, g = p * np.array(loss), p * (1 - np.array(loss))
+    r = np.linalg.inv(np.eye(2) - f)
+    values, vectors = np.linalg.eig((r @ g).T)
+    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
+    alpha /= alpha.sum()
+    first, second = alpha @ r @ np.ones(2), alpha @ (np.eye(2) + f) @ r @ r @ np.ones(2)
+    return delay + period * second / (2 * first), delay + period * first

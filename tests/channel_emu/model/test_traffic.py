@@ -8,7 +8,7 @@ import pytest
 from channel_emu.model.chain import Chain, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.nanoseconds import NEVER_NS
-from channel_emu.model.service_time import ServiceTime, deterministic, exponential, gamma, lognormal, replayed
+from channel_emu.model.service_time import ServiceTime, exponential, gamma, lognormal, replayed
 from channel_emu.model.traffic import PoissonArrivals, completion_ns
 
 
@@ -68,7 +68,7 @@ def test_spending_follows_the_state() -> None:
     ("shape", "mean", "cv"),
     [
         (exponential(CounterRng(2, "c", "s")), 1.0, 1.0),
-        (deterministic(), 1.0, 0.0),
+        (replayed([1.0]), 1.0, 0.0),
         (gamma(CounterRng(2, "c", "s"), 4.0), 1.0, 0.5),
         (gamma(CounterRng(2, "c", "s"), 0.5), 1.0, 2**0.5),
         (lognormal(CounterRng(2, "c", "s"), 0.5), 1.0, math.sqrt(math.exp(0.25) - 1)),
@@ -100,9 +100,9 @@ def test_delay_laws_have_their_shape(law: str, parameter: float) -> None:
 def test_service_at_start_keeps_the_delay_of_the_state_it_started_in() -> None:
     path = chain(1.0, 1e-6, initial=0)
     switch = path.segment(0)[1]
-    service = ServiceTime(deterministic(), [10.0, 1000.0], path)
+    service = ServiceTime(replayed([1.0]), [10.0, 1000.0], path)
     assert service.due_ns(0, 0) == (10 * 10**6, 0)
     assert service.due_ns(switch, 1) == (switch + 1000 * 10**6, 1)
-    modulated = ServiceTime(deterministic(), [10.0, 1000.0], path, modulated=True)
+    modulated = ServiceTime(replayed([1.0]), [10.0, 1000.0], path, modulated=True)
     left = 1.0 - switch / 10e6  # of the work, after the first state's share
     assert modulated.due_ns(0, 0)[0] == pytest.approx(switch + left * 1000e6, abs=2)

@@ -14,11 +14,9 @@ pytest.importorskip("scipy", reason="the tables' intervals need scipy")
 
 from channel_emu.cli import main
 from channel_emu.model.closed_forms import slotted_drop_new_age_ms
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults import NAMES
 from channel_emu.virtual import accuracy_cost
-from channel_emu.virtual.benchmark import FAULTS, bench_cost, bench_simulate, modulated_loop, periodic_loop
-from channel_emu.virtual.simulate import simulate
+from channel_emu.virtual.benchmark import FAULTS, bench_cost, bench_simulate, periodic_loop
 
 
 @pytest.mark.parametrize("slot_ms", [5.0, 30.0])
@@ -26,12 +24,6 @@ def test_the_plain_loop_has_the_age_that_slotting_gives_it(slot_ms: float) -> No
     """2.1 % and 13 % too old, as the closed form says; half a slot is its sampling."""
     found = np.mean([periodic_loop(18, 150.0, seed, slot_ms) for seed in range(3)]) + slot_ms / 2
     assert found == pytest.approx(slotted_drop_new_age_ms(60.0, 30.0, slot_ms), rel=0.012)
-
-
-def test_the_plain_loop_of_chapter_6_agrees_with_the_links() -> None:
-    links = simulate(channel_from_mapping({"preset": "ch6"}), 18, 2000, 1).summary()["mean_age_slotted_ms"]
-    # A loop over slots ends each transmission at a boundary, half a slot late on average.
-    assert modulated_loop(18, 80.0, 2) == pytest.approx(links + 0.5, rel=0.015)
 
 
 def test_bench_simulate_compares_like_with_like() -> None:

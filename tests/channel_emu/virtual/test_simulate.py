@@ -5,11 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from channel_emu.model import ages
+from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.virtual.link_run import OUTCOMES, LinkRun
-from channel_emu.virtual.replay import replay_offers
+from channel_emu.virtual.replay import offer_all
 from channel_emu.virtual.simulate import SimulationError, simulate
 from edge_server.live.buffer import FrameBuffer
 from tests.channel_emu.live.emulator import frame_of
@@ -28,7 +28,8 @@ def same(a: LinkRun, b: LinkRun) -> None:
 
 
 CHANNELS = [
-    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow", "swing")),
+    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow", "swing",
+                              "gilbert-elliott")),
     *({"preset": "ch6", "discipline": d, "service_state": s}
       for d in DISCIPLINES for s in ("at-start", "modulated")),
     *({"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
@@ -40,6 +41,9 @@ CHANNELS = [
     {"preset": "ch6", "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low", "sampled": "slots",
                                 "slot_ms": 2.0}},
     {"preset": "ch5", "arrivals": {"spread": True}},
+    *({"preset": "ch6", "discipline": d, "faults": {"loss": [0.1, 0.6]}, "chain": {"scope": "per-camera"}}
+      for d in ("drop-new", "newest-waits")),
+    {"preset": "ch6", "server": {"shared": True}, "faults": {"loss": 0.3}},
     *({"preset": "ch6", "service": s} for s in (
         {"law": "gamma", "mean_ms": [10, 30], "shape": 0.5}, {"law": "gamma", "mean_ms": 30, "shape": 2.5},
         {"law": "lognormal", "mean_ms": [10, 30], "sigma": 0.5}, {"law": "deterministic", "mean_ms": 10},
@@ -103,7 +107,7 @@ def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
     config = channel_from_mapping({"preset": "ch6", "faults": {"loss": {"probability": 0.2}}})
     run = simulate(config, ["x"], 30, 9, engine="python", frame_period_ms=33.3).runs[0]
     offers = {"x": [(int(t), 20_000) for t in run.offered_ns]}
-    transits = replay_offers(config, 9, offers, run.end_ns)["x"]
+    transits = offer_all(Channel(config, 9), offers, run.end_ns)[1]["x"]
     assert [OUTCOMES.index(t.outcome or "in_flight") for t in transits] == run.outcome.tolist()
     assert [t.due_ns or -1 for t in transits] == run.due_ns.tolist()
 
@@ -155,26 +159,6 @@ def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
     )
 
 
-def test_ages_by_hand() -> None:
-    """Generated at 0, 10, 20 ms; delivered at 5, 40, 30: the second comes too late to matter."""
-    saw = ages.sawtooth(np.array([5, 40, 30]) * 10**6, np.array([0, 10, 20]) * 10**6, 50 * 10**6)
-    assert saw.delivered_ns.tolist() == [5 * 10**6, 30 * 10**6]
-    # Teeth: 5 -> 30 over 25 ms, then 10 -> 30 over 20 ms.
-    assert ages.mean_age_ms(saw) == pytest.approx((25 * 17.5 + 20 * 20) / 45)
-    assert ages.peak_age_ms(saw) == pytest.approx(30)
-    # At 5, 10, ..., 25: 5 10 15 20 25; at 30, ..., 45: 10 15 20 25.
-    assert ages.mean_age_slotted_ms(saw, 5.0) == pytest.approx((75 + 70) / 9)
-    at = ages.newest_at(saw, np.array([0, 5, 29, 30, 50]) * 10**6)
-    assert at.tolist() == [-1, 0, 0, 20 * 10**6, 20 * 10**6]
-
-
-def test_no_delivery_has_no_age() -> None:
-    nothing = ages.sawtooth(np.zeros(0, np.int64), np.zeros(0, np.int64), 10**9)
-    assert ages.mean_age_ms(nothing) is None and ages.peak_age_ms(nothing) is None
-    assert ages.mean_age_slotted_ms(nothing) is None
-    assert ages.newest_at(nothing, np.array([5])).tolist() == [-1]
-
-
 def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "numba", None)  # what import finds where it is not installed
     config = channel_from_mapping({"preset": "ch5"})
@@ -189,6 +173,6 @@ def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch)
      ({"engine": "kernel"}, "python engine only")],
 )  # fmt: skip
 def test_impossible_requests_are_refused(more: dict, why: str) -> None:
-    config = channel_from_mapping({"faults": {"loss": {"probability": 0.5}}})
+    config = channel_from_mapping({"faults": {"duplication": {"probability": 0.5}}})
     with pytest.raises(SimulationError, match=why):
         simulate(config, **{"cameras": 1, "seconds": 1, **more})

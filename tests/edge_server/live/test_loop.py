@@ -12,7 +12,7 @@ from edge_server.fields import Budget
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
-from edge_server.live.update_budget import FixedBudget
+from edge_server.live.update_budget import UpdateBudget
 from edge_server.scheduler import make_policy
 from freshfield.clock import WallClock
 from tests.edge_server.fields_for_tests import tiny_field
@@ -143,7 +143,7 @@ class Running:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
         self.loop = UpdateLoop(
-            u, self.clock, budget or FixedBudget(100.0), grace_ms,
+            u, self.clock, budget or UpdateBudget(100.0), grace_ms,
             lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append,
         )  # fmt: skip
 

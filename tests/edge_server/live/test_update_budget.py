@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.update_budget import (
-    DeadlineBudget,
-    FixedBudget,
     FrontierPoint,
+    UpdateBudget,
     best_point,
     read_frontier,
 )
@@ -29,12 +28,12 @@ from tests.edge_server.frames import frame
 
 
 def test_a_fixed_fit_stays_what_it_is():
-    budgets = FixedBudget(250.0)
+    budgets = UpdateBudget(250.0)
     budgets.record(budgets.next(), 900.0)
     assert budgets.next().seconds == 0.25
 
 
-def drive(budgets: DeadlineBudget, overheads_ms) -> int:
+def drive(budgets: UpdateBudget, overheads_ms) -> int:
     """Updates whose fit keeps its budget and whose overhead is given; returns how many met the deadline."""
     met = 0
     for overhead_ms in overheads_ms:
@@ -48,11 +47,11 @@ def drive(budgets: DeadlineBudget, overheads_ms) -> int:
 def test_nineteen_of_twenty_updates_meet_a_deadline_whatever_their_overhead():
     rng = np.random.default_rng(3)
     for overheads in (rng.exponential(15.0, 2000), rng.gamma(2.0, 20.0, 2000), rng.uniform(0, 80, 2000)):
-        assert drive(DeadlineBudget(300.0), overheads) / 2000 >= 0.95
+        assert drive(UpdateBudget(deadline_ms=300.0), overheads) / 2000 >= 0.95
 
 
 def test_the_time_to_fit_shrinks_while_the_machine_is_busy_and_comes_back():
-    budgets = DeadlineBudget(300.0)
+    budgets = UpdateBudget(deadline_ms=300.0)
     drive(budgets, [5.0] * 64)
     calm = budgets.next().seconds
     drive(budgets, [90.0] * 8)
@@ -63,7 +62,7 @@ def test_the_time_to_fit_shrinks_while_the_machine_is_busy_and_comes_back():
 
 
 def test_a_slow_update_is_remembered_for_sixty_four_updates():
-    budgets = DeadlineBudget(300.0)
+    budgets = UpdateBudget(deadline_ms=300.0)
     drive(budgets, [5.0] * 30 + [150.0] + [5.0] * 63)
     assert budgets.next().seconds == pytest.approx(0.149)
     drive(budgets, [5.0])
@@ -71,13 +70,13 @@ def test_a_slow_update_is_remembered_for_sixty_four_updates():
 
 
 def test_more_than_is_worth_it_is_not_spent():
-    budgets = DeadlineBudget(5000.0, fit_ms=250.0)
+    budgets = UpdateBudget(250.0, 5000.0)
     assert budgets.next().seconds == 0.25
 
 
 @given(st.lists(st.floats(-1e3, 1e7), max_size=80), st.floats(20.0, 1e6))
 def test_there_is_always_a_budget(overheads, deadline_ms):
-    budgets = DeadlineBudget(deadline_ms)
+    budgets = UpdateBudget(deadline_ms=deadline_ms)
     drive(budgets, overheads)
     assert budgets.next().seconds >= 0.01 and math.isfinite(budgets.next().seconds)
 
@@ -85,7 +84,7 @@ def test_there_is_always_a_budget(overheads, deadline_ms):
 def test_a_deadline_without_time_to_fit_is_refused():
     for deadline_ms in (0.0, 19.0, math.nan):
         with pytest.raises(ValueError, match="deadline_ms"):
-            DeadlineBudget(deadline_ms)
+            UpdateBudget(deadline_ms=deadline_ms)
 
 
 def frontier_point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
@@ -145,7 +144,7 @@ def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
     updates.field.warm_up()
     for camera in buffer.cameras:
         buffer.put(frame(camera, generated_ns=0), 1)
-    budgets, met = DeadlineBudget(250.0), 0
+    budgets, met = UpdateBudget(deadline_ms=250.0), 0
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     others = [spawn.Process(target=burn, args=(stop,), daemon=True) for _ in range(2)]

@@ -114,7 +114,7 @@ def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outco
 
 def channel_states(scenario: Scenario, at_ns: list[int]) -> list[str]:
     """Names of the states of the chain that all cameras share, at instants; "" without one."""
-    config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel")
+    config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
     chain = Channel(config, scenario.seed).chain
     return ["" if chain is None else config.state_names[chain.state(t)] for t in at_ns]
 

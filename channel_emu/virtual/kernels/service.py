@@ -1,4 +1,4 @@
-"""One server for several cameras: the decisions of ``queue_server.QueueServer``, over whole arrays."""
+"""The decisions of ``queue_server.QueueServer`` and ``link.Link`` over whole arrays, one server at a time."""
 
 from __future__ import annotations
 
@@ -9,18 +9,10 @@ from numba import njit
 
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add, saturating_round
-from channel_emu.virtual.kernels.link_service import (
-    DELIVERED,
-    DROP_NEW,
-    DROPPED_BUSY,
-    FCFS,
-    IN_FLIGHT,
-    NEWEST_WAITS,
-    PARALLEL,
-    SUPERSEDED,
-    speeds_per_ns,
-)
 
+# Outcomes, as in link_run.OUTCOMES.
+IN_FLIGHT, DELIVERED, DROPPED_BUSY, SUPERSEDED, SKIPPED = 0, 1, 2, 3, 4
+DROP_NEW, NEWEST_WAITS, FCFS, PARALLEL = 0, 1, 2, 4
 # Orders, as in queue_server.ORDERS.
 FIRST_COME, NEWEST_FIRST, ROUND_ROBIN, OLDEST_AGE = 0, 1, 2, 3
 
@@ -50,23 +42,65 @@ def _choose(order, head, ticket, last, newest_delivered_ns):
 
 
 @njit(cache=True, nogil=True)
-def serve_shared(
-    arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, modulated, starts, states,
-    path_from, path_to, horizon_ns,
+def _drop_new(
+    arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
+):  # fmt: skip
+    """``serve`` for one camera under drop-new, into the last three arguments."""
+    by_state = len(means_ms) > 1
+    mean_ms = means_ms[0]
+    free_ns, hint = np.int64(0), 0
+    for i in range(len(arrive_ns)):
+        at_ns = arrive_ns[i]
+        if at_ns > horizon_ns:
+            return
+        if at_ns < 0:
+            outcome[i] = SKIPPED
+            continue
+        if free_ns > at_ns:
+            outcome[i] = DROPPED_BUSY
+            continue
+        while starts[hint + 1] <= at_ns:
+            hint += 1
+        if modulated:
+            free_ns = completion_ns(work[i], speeds, starts, states, at_ns, hint)
+        else:
+            if by_state:
+                mean_ms = means_ms[states[hint]]
+            free_ns = saturating_add(at_ns, saturating_round(work[i] * mean_ms * 1e6))
+        started[i], due[i] = at_ns, free_ns
+        if free_ns <= horizon_ns:
+            outcome[i] = DELIVERED
+
+
+@njit(cache=True, nogil=True)
+def serve(
+    arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, speeds, modulated,
+    starts, states, path_from, path_to, horizon_ns,
 ):  # fmt: skip
     """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
 
-    arrive_ns, offered_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive.
+    arrive_ns, offered_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive
+        (-1: never sampled).
+    discipline: index into ``link.DISCIPLINES``.
     order: index into ``queue_server.ORDERS``: whose waiting frame is next.
-    starts, states: all paths; camera c's is starts[path_from[c] : path_to[c]], with one entry of ``states``
-        unused at its end.
-    The rest is as for ``link_service.serve``.
+    queue_limit: most frames waiting (fcfs) or in service (parallel).
+    work: of ``work.draw``.
+    means_ms: mean delay, (1,) or one a state. speeds: its inverse in 1/ns, inf where it is 0.
+    modulated: the work is served at the rate of each state passed through, not of the first one.
+    starts, states: all paths (see ``chain_path``); camera c's is starts[path_from[c] : path_to[c]], with one
+        entry of ``states`` unused at its end.
+    horizon_ns: frames due later are in flight.
     """
     count, cameras = len(arrive_ns), len(path_from)
     outcome = np.zeros(count, np.int8)
     started = np.full(count, -1, np.int64)
     due = np.full(count, -1, np.int64)
-    speeds = speeds_per_ns(means_ms)
+    if discipline == DROP_NEW and cameras == 1:
+        # The general loop below would decide the same; nothing waits here, which makes it twice as fast.
+        _drop_new(
+            arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
+        )
+        return outcome, started, due
     hints = path_from.copy()
     ticket = np.arange(count)
     head = np.full(cameras, -1, np.int64)  # of each camera's waiting frames, which ``follower`` links
@@ -81,6 +115,9 @@ def serve_shared(
     while True:
         at_ns = free_ns if waiting > 0 else NEVER_NS
         frame = -1
+        while n < count and arrive_ns[n] < 0:
+            outcome[n] = SKIPPED
+            n += 1
         if n < count and arrive_ns[n] < at_ns:
             at_ns, frame = arrive_ns[n], n
         if at_ns > horizon_ns or at_ns == NEVER_NS:

@@ -12,11 +12,11 @@ from edge_server.scheduler import (
     OFFERED,
     POLICIES,
     TREATMENTS,
-    VIRTUAL_ONLY,
     Epoch,
     make_policy,
     policy_help,
 )
+from edge_server.scheduler.registry import VIRTUAL_ONLY
 
 MS = 1_000_000
 AT = Epoch(200 * MS, 0, {"a": 190 * MS, "b": 80 * MS, "c": 150 * MS})

@@ -1,0 +1,44 @@
+"""A line that lets packets go at recorded instants: Mahimahi's traces (Netravali et al., USENIX ATC 2015)."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+from channel_emu.model.link import Fault, Transit
+
+PACKET_BYTES = 1500
+
+
+@dataclass(frozen=True)
+class Params:
+    opportunities_ms: list[int]
+    """Instants, ascending, at each of which PACKET_BYTES may leave; after the last the trace begins anew."""
+
+    def __post_init__(self) -> None:
+        times = self.opportunities_ms
+        if not times or times[0] < 0 or times[-1] <= 0 or sorted(times) != times:
+            raise ValueError("opportunities_ms: expected ascending instants, the last of them above 0")
+
+
+class Effect(Fault):
+    """A frame leaves with the last packet it needs. What an opportunity has left over is lost, and those of a
+    frame that was preempted are spent."""
+
+    def __init__(self, params: Params, seed: int, camera: str) -> None:
+        self.times_ns = [at * 10**6 for at in params.opportunities_ms]
+        self._next = 0
+        """Number of the first opportunity that is left."""
+
+    def extra_ns(self, transit: Transit) -> int:
+        start = transit.started_ns
+        assert start is not None
+        period, count = self.times_ns[-1], len(self.times_ns)
+        rounds, within = divmod(start, period)
+        first = max(self._next, rounds * count + bisect_left(self.times_ns, within))
+        # The end of a period is the beginning of the next one.
+        if within == 0 and rounds:
+            first = max(self._next, rounds * count - self.times_ns.count(period))
+        self._next = first + max(1, -(-transit.size_bytes // PACKET_BYTES))
+        rounds, place = divmod(self._next - 1, count)
+        return rounds * period + self.times_ns[place] - start

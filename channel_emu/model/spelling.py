@@ -1,0 +1,183 @@
+"""Reads short spellings, alike in a scenario and on the command line: ``exp:60ms``, ``poisson:1/30ms``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
+_LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
+         "trace": "trace", "none": "none"}  # fmt: skip
+_MAX_CHARS = 2**26  # of a file: millions of delays
+_PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
+
+
+class SpellingError(ValueError):
+    """A word that is not understood; the message says what was expected."""
+
+
+def span_ms(text: str) -> float:
+    """``30ms``, ``3s``, ``250us`` or a bare number of ms, in ms."""
+    found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(us|ms|s|min)?\s*", text)
+    try:
+        value = float(found[1]) * _UNITS_MS[found[2] or ""] if found else math.nan
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0):
+        raise SpellingError(f"{text!r} is not a span of time: expected something like 30ms or 3s")
+    return value
+
+
+def rate_per_ms(text: str) -> float:
+    """``1/30ms``, ``1/30`` or ``0.033/ms`` or a bare number per ms, in 1/ms."""
+    above, slash, below = text.partition("/")
+    try:
+        value = float(above)
+        if slash:
+            span = 1.0 if below.strip() == "ms" else 1e3 if below.strip() == "s" else span_ms(below)
+            value = value / span
+    except (ValueError, ZeroDivisionError):
+        raise SpellingError(f"{text!r} is not a rate: expected something like 1/30ms or 0.03/ms") from None
+    if not (math.isfinite(value) and value >= 0):
+        raise SpellingError(f"{text!r} is not a rate: expected a finite number of at least 0")
+    return value
+
+
+def section(key: str, text: str, folder: Path) -> dict[str, Any]:
+    """The mapping that a short ``text`` stands for: of ``arrivals``, ``service`` or ``chain``.
+
+    A text in braces is the section as YAML writes it. folder: that files are relative to.
+    Raises SpellingError.
+    """
+    if text.lstrip().startswith("{"):
+        try:
+            found = yaml.safe_load(text)
+        except yaml.YAMLError:
+            found = None
+        if not isinstance(found, dict):
+            raise SpellingError(f"{text!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
+        return found
+    if key == "service":
+        return service(text, folder)
+    return arrivals(text) if key == "arrivals" else chain(text)
+
+
+def fault(text: str) -> dict[str, Any]:
+    """``NAME:VALUE`` of a fault, the value as YAML writes it: its parameters, or the first of them."""
+    name, colon, value = text.partition(":")
+    try:
+        return {name: yaml.safe_load(value) if colon else {}}
+    except yaml.YAMLError:
+        raise SpellingError(f"fault {text!r}: expected something like loss:0.1 or loss:[0.01, 0.3]") from None
+
+
+def arrivals(text: str) -> dict[str, Any]:
+    """``as-offered``, ``periodic:30ms``, ``poisson:1/30ms``, or by state ``mmpp:1/120ms,1/30ms``; bare
+    ``mmpp`` is that, the thesis's rates (6.4.2)."""
+    kind, _, rest = text.partition(":")
+    if kind == "as-offered" and not rest:
+        return {"process": "as-offered"}
+    if kind == "periodic" and rest:
+        return {"process": "periodic", "period_ms": span_ms(rest)}
+    if text == "mmpp":
+        return {"process": "poisson", "rate_per_ms": [1 / 120, 1 / 30]}
+    if kind in ("poisson", "mmpp") and rest:
+        rates = [rate_per_ms(word) for word in rest.split(",")]
+        return {"process": "poisson", "rate_per_ms": rates if len(rates) > 1 else rates[0]}
+    raise SpellingError(
+        f"{text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or mmpp:1/120ms,1/30ms"
+    )
+
+
+def service(text: str, folder: Path) -> dict[str, Any]:
+    """``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE`` or none; for
+    each state of the chain the same law with another mean: ``exp:30ms,exp:60ms``."""
+    short, _, rest = text.partition(":")
+    law = _LAWS.get(short)
+    if law == "trace" and rest:
+        return {"law": "trace", "delays_ms": delays_ms(folder / rest)}
+    if "," in text:
+        parts = [service(word, folder) for word in text.split(",")]
+        if len({json.dumps({k: v for k, v in part.items() if k != "mean_ms"}) for part in parts}) != 1:
+            raise SpellingError(f"{text!r}: expected one law, with a mean for each state")
+        if "mean_ms" not in parts[0]:
+            raise SpellingError(f"{text!r}: expected laws with a mean")
+        return {**parts[0], "mean_ms": [part["mean_ms"] for part in parts]}
+    words = rest.split(":")
+    if law == "none":
+        return {"law": "none"}
+    if law in ("exponential", "deterministic") and len(words) == 1 and rest:
+        return {"law": law, "mean_ms": span_ms(rest)}
+    if law in _PARAMETER and len(words) == 2:
+        try:
+            return {"law": law, "mean_ms": span_ms(words[0]), _PARAMETER[law]: float(words[1])}
+        except ValueError:
+            pass
+    raise SpellingError(
+        f"{text!r}: expected exp:60ms, det:10ms, gamma:60ms:2, lognormal:60ms:0.5, trace:FILE or none"
+    )
+
+
+def chain(text: str) -> dict[str, Any]:
+    """``mu1=1/30,mu2=1/30``, optionally ``states=low/high``, ``scope=per-camera``, ``initial=low``,
+    ``slots=1ms``."""
+    found: dict[str, Any] = {}
+    for word in text.split(","):
+        key, _, value = (part.strip() for part in word.partition("="))
+        if key in ("mu1", "mu2") and value:
+            found[f"{key}_per_ms"] = rate_per_ms(value)
+        elif key in ("scope", "initial") and value:
+            found[key] = value
+        elif key == "states" and value:
+            found["states"] = value.split("/")
+        elif key == "slots" and value:
+            found |= {"sampled": "slots", "slot_ms": span_ms(value)}
+        else:
+            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1, slots=1ms)"
+            raise SpellingError(f"{text!r}: expected {expected}")
+    return found
+
+
+def read_text(path: Path) -> str:
+    """The text of a file that a spelling names. Raises SpellingError."""
+    try:
+        with path.open() as file:
+            text = file.read(_MAX_CHARS + 1)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpellingError(f"{path}: cannot be read: {error}") from None
+    if len(text) > _MAX_CHARS:
+        raise SpellingError(f"{path}: more than {_MAX_CHARS} characters")
+    return text
+
+
+def delays_ms(path: Path) -> list[float]:
+    """One-way delays from a file.
+
+    One number of ms a line; a CSV file whose first line names the columns, one of them ``delay_ms``,
+    ``delay_us`` or ``delay_s``; or a trace of this emulator (its drawn delays). Lines that start with # are
+    skipped. Raises SpellingError.
+    """
+    text = read_text(path)
+    if text.startswith("{"):
+        try:
+            records = [json.loads(line) for line in text.split("\n")[1:-1]]
+            return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
+        except (KeyError, TypeError, ValueError):
+            raise SpellingError(f"{path}: neither delays nor a trace of this emulator") from None
+    rows = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
+    names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}
+    columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ())
+               if word.strip() in names]  # fmt: skip
+    column, unit_ms = columns[0] if columns else (0, 1.0)
+    try:
+        return [float(row[column]) * unit_ms for row in rows[bool(columns) :]]
+    except (ValueError, IndexError) as error:
+        raise SpellingError(
+            f"{path}: expected a column delay_ms, or one delay in ms a line: {error}"
+        ) from None
