@@ -24,6 +24,7 @@ log = logging.getLogger("camera-node")
 
 FIRST_BACKOFF_S = 0.2
 MAX_BACKOFF_S = 1.0
+# How long one attempt waits for a peer that cannot be reached.
 CONNECT_S = 6.0
 # How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
 OFFSET_WAIT_S = 2.0
