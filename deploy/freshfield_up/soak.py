@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import shutil
 import signal
 import statistics
 import subprocess
@@ -76,7 +77,7 @@ class Soak:
         self.scenario = scenario
         tmpfs = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "freshfield", str(self.out)]
         self.has_disk = subprocess.run(tmpfs, capture_output=True).returncode == 0
-        found = process_set(scenario, self.out, *free_ports(1))
+        found = process_set(scenario, self.out, free_ports(1)[0])
         self.children: dict[str, Child] = dict(
             zip(ROLES, (found.nodes[0], found.emulator, found.edge), strict=True)
         )
@@ -115,10 +116,15 @@ class Soak:
         self._account()
 
     def _account(self) -> None:
-        if not self.frames:
-            report = [program("edge-server"), "report", str(self.out)]
-            subprocess.run(report, capture_output=True, check=True)
-            self.frames = read_json(self.out / "report.json")["frames"]
+        if self.frames:
+            return
+        (copy := self.out.parent / "account").mkdir()
+        # Receivers first: what they wrote, the senders' later copies explain.
+        for role in reversed(ROLES):
+            for path in self.out.glob(f"ledger-{role}-*.tsv"):
+                shutil.copy(path, copy)
+        subprocess.run([program("edge-server"), "report", str(copy)], capture_output=True, check=True)
+        self.frames = read_json(copy / "report.json")["frames"]
 
     def close(self) -> None:
         for wire in self.wires.values():
