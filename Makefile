@@ -22,6 +22,11 @@ DATA ?=
 # Options of `make bench`, for edge-server bench: --quick, or --resume to go on where Ctrl-C stopped it.
 BENCH ?=
 
+# Options of `make images`: docker or podman, and more for its build, such as --build-arg TORCH=cpu.
+ENGINE ?= docker
+BUILD ?=
+BASE := $(shell sed -n 's/^ARG BASE=//p' deploy/edge.Dockerfile)
+
 # Options of `make test`: which marks, and more for pytest.
 SELECT ?= not slow
 PYTEST ?=
@@ -36,7 +41,7 @@ INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
 WARM_UP := from edge_server.fields.registry import make_field; make_field("splat", {"layers": True}).warm_up()
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
-TORCH := $(call wanted,torch)
+TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' deploy/locks/torch-cuda.txt)
 # Into folder $(1), without the static methods that gRPC calls experimental and nobody here calls.
 define PROTOC
 cd proto && ../$(PY) -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1) \
@@ -46,7 +51,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format types bench proto proto-check clean
+.PHONY: help demo test lint format types bench proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -100,6 +105,17 @@ proto-check: .venv/.ok-test  ## fail where the generated code differs from its .
 	  { echo "proto/freshfield/v1 is not what its .proto files say: run 'make proto' and commit"; exit 1; }; \
 	done
 	@echo "generated code matches the .proto files"
+
+lock: .venv/.ok-venv  ## resolve the images' packages anew into deploy/locks; the CPU build of torch: TORCH_INDEX
+	TORCH_INDEX=$(TORCH_INDEX) $(PY) deploy/lock.py
+
+images:  ## build both images on the base image's newest digest: ENGINE=docker, BUILD for more options
+	$(ENGINE) pull -q $(BASE)
+	base=$$($(ENGINE) image inspect --format '{{index .RepoDigests 0}}' $(BASE)) && echo "on $$base" && \
+	for image in camera edge; do \
+	  $(ENGINE) build --build-arg BASE=$$base --label org.opencontainers.image.base.name=$$base $(BUILD) \
+	    -f deploy/$$image.Dockerfile -t localhost/freshfield-$$image . || exit 1; \
+	done
 
 clean:  ## remove the virtual environment and every cache (runs/ stays)
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -23,7 +23,9 @@ from freshfield.v1 import frames_pb2_grpc as rpc
 log = logging.getLogger("camera-node")
 
 FIRST_BACKOFF_S = 0.2
-MAX_BACKOFF_S = 3.0
+MAX_BACKOFF_S = 1.0
+# How long one attempt waits for a peer that cannot be reached.
+CONNECT_S = 6.0
 # How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
 OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
@@ -108,7 +110,7 @@ class Sender:
 
     async def _session(self) -> None:
         """One stream, from the moment the peer can be reached until it fails."""
-        async with asyncio.timeout(2 * MAX_BACKOFF_S):
+        async with asyncio.timeout(CONNECT_S):
             await self._channel.channel_ready()
         call = self._stub.Push(metadata=self._metadata)
         try:

@@ -1,26 +1,32 @@
 # The edge server: torch, kernels, page. Build from the repository's root:
 #   docker build -f deploy/edge.Dockerfile -t localhost/freshfield-edge .
-# Without a GPU, add --build-arg TORCH_INDEX=... with PyTorch's CPU wheel index: the image is 3 GB smaller.
-FROM docker.io/library/python:3.11-slim-bookworm AS build
-# One more package index for pip, where there is one; and the index that torch alone comes from.
+# Without a GPU, add --build-arg TORCH=cpu --build-arg TORCH_INDEX=... with PyTorch's CPU wheel index: the image is
+# 3 GB smaller. For a release, `make images` names the base image by its digest.
+ARG BASE=docker.io/library/python:3.11-slim-bookworm
+FROM ${BASE} AS build
+# One more package index for pip, where there is one; the build of torch, and one more index to find it.
 ARG PIP_EXTRA_INDEX_URL
+ARG TORCH=cuda
 ARG TORCH_INDEX
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PIP_QUIET=1
 WORKDIR /src
+# Exactly the wheels whose hashes deploy/lock.py wrote down.
+COPY deploy/locks deploy/locks
+RUN python -m venv /venv && python -m venv /build \
+ && /build/bin/pip install --no-deps --require-hashes -r deploy/locks/build.txt \
+ && /venv/bin/pip install --no-deps --require-hashes ${TORCH_INDEX:+--extra-index-url $TORCH_INDEX} \
+      -r deploy/locks/torch-$TORCH.txt -r deploy/locks/edge.txt
 COPY pyproject.toml README.md LICENSE ./
-# torch first: its layer is large and changes only with its version.
-RUN python -m venv /venv \
- && torch=$(sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml) \
- && /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q \
-      ${TORCH_INDEX:+--index-url $TORCH_INDEX} "$torch"
 COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
 COPY deploy/freshfield_up deploy/freshfield_up
 COPY deploy/scenarios deploy/scenarios
-RUN /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge,embed]'
+RUN /build/bin/hatchling build -t wheel -d /dist \
+ && /venv/bin/pip install --no-deps --no-index /dist/*.whl
 
-FROM docker.io/library/python:3.11-slim-bookworm
+FROM ${BASE}
 RUN useradd --system --create-home --uid 10001 freshfield \
  && install -d -o freshfield -g freshfield /runs
 COPY --from=build /venv /venv

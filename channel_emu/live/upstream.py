@@ -26,7 +26,7 @@ PUSH = "/freshfield.v1.FrameStreamService/Push"
 # added to the next frame's delay; few, so that a stalled edge shows at once.
 CREDITS = 8
 FIRST_BACKOFF_S = 0.1
-MAX_BACKOFF_S = 2.0
+MAX_BACKOFF_S = 1.0
 
 
 class Upstream:

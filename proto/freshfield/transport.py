@@ -40,7 +40,7 @@ CLIENT_OPTIONS = [
     # Senders pause by ``backoff_s``; gRPC's own back-off would add up to two minutes on top.
     ("grpc.initial_reconnect_backoff_ms", 200),
     ("grpc.min_reconnect_backoff_ms", 200),
-    ("grpc.max_reconnect_backoff_ms", 2_000),
+    ("grpc.max_reconnect_backoff_ms", 1_000),
     ("grpc.enable_http_proxy", 0),
 ]
 SERVER_OPTIONS = [

@@ -91,6 +91,8 @@ def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
 def test_files_and_modules_that_are_named_exist(page: Path) -> None:
     for code in code_of(page.read_text()):
         for path in re.findall(rf"(?<![\w/.-])((?:{'|'.join(TOP)})/[\w./*@-]*)", code):
+            test = re.search(rf"{re.escape(path)}::(\w+)", code)
+            assert not test or f"def {test[1]}(" in (ROOT / path).read_text(), f"{name(page)}: {code}"
             there = any(ROOT.glob(path.rstrip("./"))) or path.startswith("docs/results/")
             assert there, f"{name(page)}: {path}"
         for module in re.findall(

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 import itertools
 import os
 import re
 import shutil
 import subprocess
 import tomllib
+from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+import lock
 from tests.conftest import ROOT
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT, BUILD = DECLARED["project"], DECLARED["build-system"]["requires"]
+LOCKS = {
+    file.stem: dict(re.findall(r"^([\w.-]+)==(\S+)", file.read_text(), re.M))
+    for file in (ROOT / "deploy" / "locks").glob("*.txt")
+}
 GENERATED = ROOT / "proto" / "freshfield" / "v1"
 
 
@@ -69,7 +79,8 @@ def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() ->
     rest = plan.index("-e '.[edge,embed,up]'")
     assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
     assert "deploy/up.py deploy/scenarios/card.yaml --for 60s" in plan
-    assert requirement("torch").specifier == Requirement(torch[1]).specifier
+    assert requirement("torch").specifier.contains(LOCKS["torch-cuda"]["torch"])
+    assert torch[1] == f"torch=={LOCKS['torch-cuda']['torch']}"
     for early in re.findall(r"install .*'(numba\S+)' '(opencv\S+)'", plan)[0]:
         assert requirement(Requirement(early).name).specifier == Requirement(early).specifier
     assert "test,dev" not in plan
@@ -86,8 +97,67 @@ def test_the_options_of_the_demo_reach_the_launcher() -> None:
     assert "deploy/up.py s.yaml --for 5s --out o --port 8181 --data d" in plan
 
 
+def in_the_environment_of_an_image(texts: list[str]) -> list[Requirement]:
+    asked = {"python_version": "3.11", "sys_platform": "linux", "platform_system": "Linux", "extra": ""}
+    found = [Requirement(text) for text in texts]
+    return [each for each in found if each.marker is None or each.marker.evaluate(asked)]
+
+
+@pytest.mark.parametrize("locks", [("camera",), ("edge", "torch-cpu"), ("edge", "torch-cuda")])
+def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: tuple[str, ...]) -> None:
+    locked = {name: Version(version) for lock in locks for name, version in LOCKS[lock].items()}
+    assert len(locked) == sum(len(LOCKS[lock]) for lock in locks), "a package is in two locks"
+    extras = PROJECT["optional-dependencies"]
+    asked = PROJECT["dependencies"] + (extras["edge"] + extras["embed"] if "edge" in locks else [])
+    for name, version in locked.items():  # and what those ask for, as far as this machine has the same ones
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            if Version(importlib.metadata.version(name)) == version:
+                asked = asked + (importlib.metadata.requires(name) or [])
+    for each in in_the_environment_of_an_image(asked):
+        version = locked.get(canonicalize_name(each.name))
+        assert version is not None and each.specifier.contains(version), f"{each}: {version} is locked"
+    if "edge" in locks:
+        assert {str(locked["torch"]).partition("+")[0]} == {lock.TORCH}
+        assert LOCKS["camera"].items() <= LOCKS["edge"].items()
+    assert ("torch" in locked) == ("edge" in locks)
+
+
+def test_every_locked_wheel_has_its_hash() -> None:
+    for file in (ROOT / "deploy" / "locks").glob("*.txt"):
+        for line in file.read_text().splitlines()[1:]:
+            assert re.fullmatch(r"[a-z0-9.-]+==[\w.+]+( --hash=sha256:[0-9a-f]{64})+", line), line
+    asked = {Requirement(text).name for text in BUILD}
+    assert asked <= LOCKS["build"].keys()
+
+
+@pytest.mark.parametrize(
+    ("image", "locks"), [("camera", {"build", "camera"}), ("edge", {"build", "edge", "torch-$TORCH"})]
+)
+def test_an_image_installs_locked_wheels_and_the_project_alone(image: str, locks: set[str]) -> None:
+    text = (ROOT / "deploy" / f"{image}.Dockerfile").read_text().replace("\\\n", " ")
+    installs = re.findall(r"pip install ([^\n&]*)", text)
+    assert len(installs) == 3 and all("--no-deps" in words for words in installs)
+    assert all(("--require-hashes" in words) != ("--no-index /dist/" in words) for words in installs)
+    assert set(re.findall(r"-r deploy/locks/(\S+)\.txt", text)) == locks
+    assert "!deploy/locks" in (ROOT / ".dockerignore").read_text().splitlines()
+
+
+def test_a_release_builds_on_the_digest_of_the_base_image(tmp_path: Path) -> None:
+    engine = tmp_path / "engine"
+    engine.write_text('#!/bin/sh\n[ "$1" = image ] && echo base@sha256:12 || echo "$@"\n')
+    engine.chmod(0o755)
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    command = ["make", "images", f"ENGINE={engine}", "BUILD=--build-arg TORCH=cpu"]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
+    assert "pull -q docker.io/library/python:3.11-slim-bookworm" in said and "on base@sha256:12" in said
+    built = re.findall(r"^build --build-arg BASE=base@sha256:12 .*TORCH=cpu -f (\S+)", said, re.M)
+    assert built == ["deploy/camera.Dockerfile", "deploy/edge.Dockerfile"]
+
+
 def test_no_package_index_is_written_down() -> None:
     files = ["Makefile", "pyproject.toml", ".ci/run", "deploy/camera.Dockerfile", "deploy/edge.Dockerfile"]
+    files += ["deploy/lock.py", *(f"deploy/locks/{name}.txt" for name in LOCKS)]
     for name in files:
         assert "://" not in (ROOT / name).read_text(), f"{name} names a host"
 
