@@ -19,8 +19,9 @@ def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float
 
 
 def seen(
-    camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M,
+    radius_m: float = RADIUS_M,
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:  # fmt: skip
     """The picture (H, W, 3), and how far away in metres what it shows is (H, W), inf for the sky."""
     origin, rays = world_rays(camera, pose)
     color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
@@ -32,10 +33,10 @@ def seen(
     color[near] = np.where(check[near, None] > 0, [0.8, 0.8, 0.7], [0.3, 0.25, 0.2])
     offset = origin - ball_m
     b = rays @ offset
-    root = b * b - (offset @ offset - RADIUS_M**2)
+    root = b * b - (offset @ offset - radius_m**2)
     t_ball = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0.0)), np.inf)
     front = (t_ball > 0) & (t_ball < np.where(near, t_ground, np.inf))
-    normal = (origin + rays * np.where(front, t_ball, 0.0)[..., None] - ball_m) / RADIUS_M
+    normal = (origin + rays * np.where(front, t_ball, 0.0)[..., None] - ball_m) / radius_m
     stripe = 0.5 + 0.5 * np.sign(np.sin(8.0 * normal[..., 2]))
     paint = np.stack([0.9 - 0.5 * stripe, 0.2 + 0.4 * stripe, 0.2 + 0.2 * normal[..., 0]], axis=-1)
     color[front] = paint[front]

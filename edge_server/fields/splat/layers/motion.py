@@ -77,9 +77,10 @@ class Motion:
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
         self.pool: Pool = CallerPool()
-        self._clear()
+        self.forget()
 
-    def _clear(self) -> None:
+    def forget(self) -> None:
+        """Be without anchors, as at first."""
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
@@ -310,7 +311,7 @@ class Motion:
     def load_state(self, state: dict[str, NDArray]) -> None:
         """Continue from ``state``, bit for bit."""
         if not state:
-            self._clear()
+            self.forget()
             return
         self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
         self._first = int(state["first"])

@@ -37,6 +37,7 @@ CAMERA_SHARES = (0.58, 0.42)  # of the cameras, the first that is reached
 BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
 LEAST_FOREGROUND = 0.001  # share of all pixels
 KEEP_INSIDE, KEEP_MARGIN_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
+LOST_BELOW = 0.5  # share that lies inside, below which motion is lost
 SEED_INSIDE, SEED_MARGIN_PX = 0.7, 3  # the same for a new one
 MISSING_ERROR = 0.12  # color error, in the worst channel, above which foreground needs new Gaussians
 SEEDS_A_PIXEL = 0.1
@@ -189,10 +190,15 @@ class MovingSet:
         return []
 
     def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
-        """Remove the Gaussians that lie outside the foregrounds that should hold them."""
+        """Remove the Gaussians that lie outside the foregrounds that should hold them; all, and their motion,
+        where that is most of them. They are then seeded at rest."""
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
-            self._keep(self._inside(places, frames, cameras, KEEP_MARGIN_PX) >= KEEP_INSIDE)
+            keep = self._inside(places, frames, cameras, KEEP_MARGIN_PX) >= KEEP_INSIDE
+            if keep.mean() < LOST_BELOW:
+                keep[:] = False
+                self.motion.forget()
+            self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
         """Seed Gaussians in foreground that is not rendered as it is. Frames that show the moving set

@@ -21,7 +21,7 @@ from edge_server.fields.splat.layers.observations import (
     pixel_weights,
 )
 
-PASSES = 1  # of Gauss-Newton a fit
+PASSES, AGAIN_M = 3, 0.02  # of Gauss-Newton a fit, at most; movement of an anchor that calls for another one
 ALIGNING_SHARE = 0.5  # of a budget in seconds
 LEAST_ALIGNED = 4  # frames a pass, however short the budget is
 MOST_ALIGNED = 24  # frames a pass, newest first
@@ -79,8 +79,9 @@ class MotionTracker:
         if moving.alive:
             if newest_s - self.anchors_s >= ANCHORS_EVERY_S:
                 self._renew_anchors(newest_s)
-            for k in range(PASSES):
-                self._solve(pace, (k + 1) / PASSES, last=k == PASSES - 1)
+            for _ in range(PASSES):
+                if self._solve(pace) < AGAIN_M or not pace.within(ALIGNING_SHARE):
+                    break
             for o in self.observations:
                 o.fresh = False
             publish()
@@ -92,24 +93,24 @@ class MotionTracker:
             self._seed_time.add(self.times.add("seeding", begun) - begun)
         return self._train_appearance(pace, parameters)
 
-    def _solve(self, pace: StepBudget, share: float, last: bool) -> None:
-        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve.
-
-        share: of the time for aligning, at which this pass ends.
-        last: of this fit; what it explains is kept out of the plates.
-        """
+    def _solve(self, pace: StepBudget) -> float:
+        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve. Returns by
+        how many meters it has moved the newest places of anchors (median)."""
         motion, begun = self.moving.motion, self.times.now()
         newest = self.observations.newest_knot
         seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= motion.newest_s]
         due = [o for o in seen if o.row is None or o.fresh or o.knot >= newest]
         for k, o in enumerate(reversed(due)):
-            if k >= MOST_ALIGNED or not (k < LEAST_ALIGNED or pace.within(share * ALIGNING_SHARE)):
+            if k >= MOST_ALIGNED or not (k < LEAST_ALIGNED or pace.within(ALIGNING_SHARE)):
                 self.left_out += len(due) - k
                 break
-            self._align(o, exclude=last)
+            self._align(o, exclude=True)
         begun = self.times.add("alignment", begun)
+        before = motion.at(self.observations.newest_s)
         motion.solve([o.row for o in seen if o.row is not None])
         self.times.add("solving", begun)
+        apart = np.linalg.norm(motion.at(self.observations.newest_s) - before, axis=1)
+        return float(np.median(apart)) * motion.radius_m
 
     def _align(self, observation: Observation, exclude: bool) -> None:
         camera = self.cameras[observation.camera]
@@ -154,6 +155,8 @@ class MotionTracker:
         if pixels < LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
             return
         moving.remove_outside(frames, self.cameras)
+        if moving.motion.anchors is None:
+            self._forget_rows()
         if moving.alive:
             for o in frames:
                 self._align(o, exclude=False)
@@ -162,5 +165,8 @@ class MotionTracker:
     def _renew_anchors(self, instant_s: float) -> None:
         self.moving.renew_anchors(instant_s)
         self.anchors_s = instant_s
+        self._forget_rows()
+
+    def _forget_rows(self) -> None:
         for o in self.observations:
-            o.row = None
+            o.row = o.shown = None
