@@ -61,7 +61,8 @@ class Question:
 @dataclass(frozen=True)
 class PreferenceSession:
     """scenario: of the reconstructions. orders: the views of each, as in ``AnswersFile``. features: (N, d) of
-    them as trajectories. wanted: number of questions. seed: of the questions.
+    them as trajectories. wanted: number of questions. seed: of the questions. by: who answers, a person or
+    the label of a simulated expert.
 
     Raises ViewpointError where there is no pair to ask about.
     """
@@ -71,6 +72,7 @@ class PreferenceSession:
     features: NDArray[np.float64]
     wanted: int = 60
     seed: int = 0
+    by: str = PERSON
     answers: tuple[Given, ...] = ()
 
     def __post_init__(self) -> None:
@@ -109,12 +111,12 @@ class PreferenceSession:
         pairs = [(a.choice, self.answers[a.repeats].choice) for a in self.answers if a.repeats is not None]
         return sum(_SWAPPED[now] == before for now, before in pairs), len(pairs)
 
-    def answered(self, choice: Choice, by: str = PERSON) -> PreferenceSession:
+    def answered(self, choice: Choice) -> PreferenceSession:
         """The session after this answer to ``question``. ViewpointError where none is open."""
         asked = self.question
         if asked is None:
             raise ViewpointError("all questions are answered")
-        return self._with((*self.answers, Given(asked.left, asked.right, choice, by, asked.repeats)))
+        return self._with((*self.answers, Given(asked.left, asked.right, choice, self.by, asked.repeats)))
 
     def undone(self) -> PreferenceSession:
         """The session before the last answer, whose question is asked again; itself before the first."""
@@ -139,6 +141,10 @@ class PreferenceSession:
         for n, a in enumerate(file.answers):
             if not (0 <= a.left < len(self.orders) and 0 <= a.right < len(self.orders)) or a.left == a.right:
                 raise ViewpointError(f"answer {n}: {a.left} and {a.right} are no pair of reconstructions")
+            if a.by != self.by:
+                raise ViewpointError(
+                    f"answer {n} is by {a.by:.80}, the others by {self.by}: they are not mixed"
+                )
             if a.repeats is not None:
                 earlier = file.answers[a.repeats] if 0 <= a.repeats < n else None
                 if earlier is None or (earlier.left, earlier.right) != (a.right, a.left):

@@ -82,9 +82,10 @@ def test_a_session_goes_on_where_its_file_ends():
 
 
 def test_the_file_says_what_was_shown_and_who_answered():
-    file = NEW.answered("neither", by="simulated expert (edges)").answered("left").as_json()
+    simulated = PreferenceSession("tile", ORDERS, FEATURES, seed=3, by="simulated expert (edges)")
+    file = simulated.answered("neither").as_json()
     assert (file["version"], file["scenario"], file["reconstructions"][3]) == (1, "tile", (3, 4))
-    assert [a["by"] for a in file["answers"]] == ["simulated expert (edges)", "person"]
+    assert by_taste(NEW, 1).as_json()["answers"][0]["by"] == "person"
     assert file["answers"][0] == {
         "left": NEW.question.left, "right": NEW.question.right, "choice": "neither",
         "by": "simulated expert (edges)", "repeats": None,
@@ -106,6 +107,7 @@ def test_the_file_says_what_was_shown_and_who_answered():
         (lambda f: f["answers"][2].update(left=1, right=1), "no pair"),
         (lambda f: f["answers"][2].update(repeats=1), "answer 2: does not repeat answer 1"),
         (lambda f: f["answers"][2].update(repeats=2), "answer 2: does not repeat answer 2"),
+        (lambda f: f["answers"][2].update(by="simulated expert (edges)"), "they are not mixed"),
         (lambda f: f["answers"][2].pop("by"), "missing required field `by`"),
     ],
 )
