@@ -110,8 +110,8 @@ class PreferencePage:
         agreed, repeated = session.agreement
         return {
             "turn": self._turn, "answered": len(session.answers), "wanted": session.wanted,
-            "open": session.question is not None, "agreed": agreed, "repeated": repeated, "says": session.model.says(),
-            "finished": self.finished.is_set(), **self._layout,
+            "open": session.question is not None, "agreed": agreed, "repeated": repeated,
+            "says": session.model.says(), "finished": self.finished.is_set(), **self._layout,
         }  # fmt: skip
 
     def _change(self, path: str, body: bytes) -> None:

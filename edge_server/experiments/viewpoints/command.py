@@ -43,9 +43,9 @@ their poses, values and reasons) and OUT/plan.png (the candidates by value, and 
 printed is of a splat field fitted to the chosen views, on viewpoints held out.
 
 --ask plans by preferences instead of --selector: a page shows pairs of reconstructions of different views, a
-person (or a simulated expert) says which is better, the reward model learns from the answers and a policy from
-the reward. Writes OUT/answers.json after each answer, from which the next call goes on, and OUT/policy.npz for
---selector ppo:OUT/policy.npz.
+person (or a simulated expert) says which is better, the reward model learns from the answers and a policy
+from the reward. Writes OUT/answers.json after each answer, from which the next call goes on, and
+OUT/policy.npz for --selector ppo:OUT/policy.npz.
 
   edge-server viewpoints tile --budget 8 --ask
 

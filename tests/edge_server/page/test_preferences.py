@@ -1,4 +1,4 @@
-"""The preference page: a whole session in Chromium on a wide and a narrow screen, and what the server refuses."""
+"""The preference page: a whole session in Chromium, wide and narrow, and what the server refuses."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ def test_the_page_is_blind(asked):
     ("path", "body", "status"),
     [
         ("/answer", b"no json", 400), ("/answer", b"[1]", 400), ("/answer", {"choice": "left"}, 409),
-        ("/import", b"{}", 400), ("/import", b"x" * (MAX_BODY_BYTES + 1), 413), ("/answer", b"[" * 90_000, 400),
+        ("/import", b"{}", 400), ("/import", b"x" * (MAX_BODY_BYTES + 1), 413),
+        ("/answer", b"[" * 90_000, 400),
     ],
 )  # fmt: skip
 def test_bad_requests_change_nothing(asked, path, body, status):
