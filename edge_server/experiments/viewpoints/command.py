@@ -68,13 +68,13 @@ def _run(args: argparse.Namespace) -> None:
     selector = make_selector(args.selector, **({"embed": open_embedder()[0]} if learned else {}))
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
-    asking = transport.from_arguments(args)
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
         views = min(budget.views or VIEWS, int(stage.candidates.reachable.sum()))
-        about = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
-        session = compare(stage, about, args.ask, (args.page_host, args.page_port), asking)
+        page = (args.page_host, args.page_port)
+        comparison = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
+        session = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
         agreed, repeated = session.agreement
         print(
             f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}"
