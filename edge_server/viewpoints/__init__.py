@@ -4,6 +4,7 @@
     plan = plan_capture(candidates, make_selector("coverage"), Budget(views=8), capture)
 
 A selector is a name and one method, ``values`` (``selector.Selector``); a line in ``selector.SELECTORS``
-makes it known to the commands. Nothing here knows of a robot or a scene: what reaches a candidate, and what
-takes the picture, are arguments.
+makes it known to the commands. ``preferences`` asks people, ``reward`` learns from what they say, ``policy``
+plans by that. Nothing here knows of a robot or a scene: what reaches a candidate, and what takes the picture,
+are arguments.
 """

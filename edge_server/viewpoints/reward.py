@@ -31,11 +31,12 @@ _NODE_WEIGHTS = _NODE_WEIGHTS / _NODE_WEIGHTS.sum()
 
 @dataclass(frozen=True)
 class Answer:
-    """One comparison: whether trajectory ``first`` is preferred to ``second``, y_ij of (4.11)."""
+    """One comparison: whether trajectory ``first`` is preferred to ``second``, y_ij of (4.11). None: neither
+    is, half a vote for each, y = 1/2 in (4.13), which draws their rewards together and lowers the odds."""
 
     first: int
     second: int
-    prefers_first: bool
+    prefers_first: bool | None
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,12 @@ def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
     scale = np.where(spread > 1e-12, spread * usual, np.inf)
     first = np.array([a.first for a in answers], np.int64)
     second = np.array([a.second for a in answers], np.int64)
-    sign = np.where([a.prefers_first for a in answers], 1.0, -1.0) if answers else np.zeros(0)
-    x = (features[first] - features[second]) / scale * sign[:, None]
-    found = [(*_laplace(x, width), width) for width in WIDTHS]
+    # The share of the vote that is for the first, y of (4.13); the rest is for the second.
+    y = np.array([0.5 if a.prefers_first is None else float(a.prefers_first) for a in answers])
+    x = (features[first] - features[second]) / scale
+    votes = np.concatenate([y, 1.0 - y])
+    x, votes = np.concatenate([x, -x])[votes > 0.0], votes[votes > 0.0]
+    found = [(*_laplace(x, votes, width), width) for width in WIDTHS]
     evidence = np.array([log_evidence for _, _, log_evidence, _ in found])
     mean, covariance, _, _ = found[int(np.argmax(evidence))]
     # The widths are equally likely beforehand: the odds are those of their average.
@@ -130,21 +134,21 @@ def next_pair(
     return int(first[best]), int(second[best])
 
 
-def _laplace(x: Array, width: float) -> tuple[Array, Array, float]:
+def _laplace(x: Array, votes: Array, width: float) -> tuple[Array, Array, float]:
     """Best weights (d,), their covariance (d, d), and the log evidence of answers that all prefer what
-    ``x`` (M, d) says."""
+    ``x`` (M, d) says, with ``votes`` (M,)."""
     count = x.shape[1]
     precision = np.eye(count) / width**2
     w = np.zeros(count)
 
     def cost(w: Array) -> float:  # (4.13), and the prior
-        return float(np.logaddexp(0.0, -x @ w).sum() + 0.5 * w @ w / width**2)
+        return float(votes @ np.logaddexp(0.0, -x @ w) + 0.5 * w @ w / width**2)
 
     now = cost(w)
     for _ in range(_NEWTON_STEPS):
         p = 0.5 * (1.0 + np.tanh(0.5 * (x @ w)))
-        gradient = x.T @ (p - 1.0) + w / width**2
-        hessian = precision + (x * (p * (1.0 - p))[:, None]).T @ x
+        gradient = x.T @ (votes * (p - 1.0)) + w / width**2
+        hessian = precision + (x * (votes * p * (1.0 - p))[:, None]).T @ x
         step, share = np.linalg.solve(hessian, gradient), 1.0
         while (then := cost(w - share * step)) > now and share > 1e-6:
             share *= 0.5
@@ -152,7 +156,7 @@ def _laplace(x: Array, width: float) -> tuple[Array, Array, float]:
         if change < 1e-10:
             break
     p = 0.5 * (1.0 + np.tanh(0.5 * (x @ w)))
-    hessian = precision + (x * (p * (1.0 - p))[:, None]).T @ x
+    hessian = precision + (x * (votes * p * (1.0 - p))[:, None]).T @ x
     log_det = float(np.linalg.slogdet(hessian)[1])
     covariance = np.asarray(np.linalg.inv(hessian), np.float64)
     return w, covariance, -now - 0.5 * log_det - count * float(np.log(width))

@@ -69,7 +69,7 @@ MAX_SNAPSHOTS = 20
 """In the folder of one run: whoever asks for more is told to move some away."""
 
 MAX_SCRAPES = 8
-"""Connections open at once to the metrics: a new one ends the oldest."""
+"""Connections open at once to the metrics, or to the preference page: a new one ends the oldest."""
 
 SCRAPE_TIMEOUT_S = 5.0
 """How long one of them may say nothing."""

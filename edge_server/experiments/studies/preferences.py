@@ -15,16 +15,15 @@ from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
 from edge_server.experiments.studies.trial import Row
 from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Workload, plan
+from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
-from edge_server.fidelity.images import to_unit
 from edge_server.fidelity.scorer import Scorer
 from edge_server.report.style import figure, label_lines
-from edge_server.viewpoints.experts import TASTES, SimulatedExpert, judge
+from edge_server.viewpoints.experts import TASTES, SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
 from edge_server.viewpoints.plan import Budget, Plan, plan_capture
 from edge_server.viewpoints.policy import PolicyConfig, train_policy
 from edge_server.viewpoints.reward import RewardModel, fit_reward, next_pair
-from edge_server.viewpoints.selector import make_selector
 from freshfield.files import write_csv, write_text
 
 ASKED = (10, 20, 40, 60)
@@ -120,26 +119,14 @@ class Preferences:
 
 def reconstruct(stage: Stage, k: int, work: Workload) -> Row:
     """A reconstruction of the pool: its views, chosen in various ways, and the score of each taste."""
-    rng = np.random.default_rng(k)
-    candidates = stage.candidates
-    if k % 3 == 1:  # of one side only
-        angle = candidates.directions @ candidates.directions[rng.integers(len(candidates))]
-        nearest = np.argsort(-angle)[: int(rng.integers(len(candidates) // 5, len(candidates) // 2))]
-        candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
-    name = ("random", "random", "farthest", "random", "coverage", "uniform")[k % 6]
-    weight = float(rng.choice([0.0, 0.0, 0.5]))
-    made = plan_capture(
-        candidates, make_selector(name), Budget(views=JUDGED), stage.take, seed=k, travel_weight=weight
-    )
+    made = varied_plan(stage, k, JUDGED)
     return {"order": made.order, **_tastes(stage, made, work, k)}
 
 
 def _tastes(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
     """The score of each taste, of the field fitted to a plan's views."""
     field = stage.fit(made.views, work.steps, seed)
-    shown = [field.render(v.camera_to_world, v.intrinsics).color for v in stage.held_out]
-    truths = [to_unit(v.image, background=stage.background) for v in stage.held_out]
-    return {taste: judge(taste, shown, truths) for taste in TASTES}
+    return {taste: taste_score(stage, field, taste) for taste in TASTES}
 
 
 def _capture(stage: Stage, arm: str, seed: int, work: Workload) -> Row:

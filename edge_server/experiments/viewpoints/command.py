@@ -10,19 +10,25 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import (
     OptionError,
     add_folders,
+    at_least,
     command_parser,
     folders_of,
     run_command,
 )
+from edge_server.experiments.viewpoints.asking import ANSWERS, VIEWS, Comparison, compare, learn
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.experts import TASTES
 from edge_server.viewpoints.plan import Budget, plan_capture
+from edge_server.viewpoints.preferences import PERSON
 from edge_server.viewpoints.selector import SELECTORS, make_selector
+from freshfield import transport
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
+from freshfield.transport import TransportError
 
 DESCRIPTION = """\
 Chooses where a camera goes next around an object, view by view, within a budget (thesis 4.5).
@@ -36,6 +42,13 @@ of them it reaches. A recording's candidates are the views that it has. Writes O
 their poses, values and reasons) and OUT/plan.png (the candidates by value, and the path). The quality that is
 printed is of a splat field fitted to the chosen views, on viewpoints held out.
 
+--ask plans by preferences instead of --selector: a page shows pairs of reconstructions of different views, a
+person (or a simulated expert) says which is better, the reward model learns from the answers and a policy
+from the reward. Writes OUT/answers.json after each answer, from which the next call goes on, and
+OUT/policy.npz for --selector ppo:OUT/policy.npz.
+
+  edge-server viewpoints tile --budget 8 --ask
+
 selectors:
 """ + "\n".join(f"  {name:10} {text}" for name, (_, _, text) in SELECTORS.items())
 
@@ -43,8 +56,9 @@ selectors:
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    errors = (ScenarioError, DatasetError, ViewpointError, OptionError)
-    return run_command("viewpoints", lambda: _run(args), errors, "nothing was written")
+    errors = (ScenarioError, DatasetError, ViewpointError, OptionError, TransportError)
+    stopped = f"answers are kept in {args.out / ANSWERS}" if args.ask else "nothing was written"
+    return run_command("viewpoints", lambda: _run(args), errors, stopped)
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -55,6 +69,21 @@ def _run(args: argparse.Namespace) -> None:
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
+    if args.ask:
+        args.out.mkdir(parents=True, exist_ok=True)
+        views = min(budget.views or VIEWS, int(stage.candidates.reachable.sum()))
+        page = (args.page_host, args.page_port)
+        comparison = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
+        session = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
+        agreed, repeated = session.agreement
+        print(
+            f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}"
+        )
+        if session.model.knows:
+            selector = learn(stage, session, views, args.seed)
+            selector.save(args.out / "policy.npz")
+        else:
+            print(f"planned by {selector.name} instead")
     plan = plan_capture(
         stage.candidates, selector, budget, stage.take, seed=args.seed, travel_weight=args.travel,
         fit=lambda views: stage.fit(views, args.steps, args.seed),
@@ -102,6 +131,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--candidates", type=int, default=100, metavar="N", help="of a synthetic world [%(default)s]")
     add("--steps", type=int, default=400, metavar="N", help="of each fit [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="of the first view and what is drawn [%(default)s]")
+    add("--ask", nargs="?", const=PERSON, choices=[PERSON, *TASTES], metavar="WHO",
+        help=f"compare reconstructions first: {PERSON} (on the page, where no WHO is given), or a simulated "
+        f"expert: {', '.join(TASTES)}")  # fmt: skip
+    add("--questions", type=at_least(1), default=60, metavar="N", help="of --ask [%(default)s]")
+    add("--reconstructions", type=at_least(2), default=24, metavar="N", help="of --ask [%(default)s]")
+    add("--page-port", type=int, default=8080, metavar="PORT", help="of --ask's page [%(default)s]")
+    add("--page-host", default="127.0.0.1", metavar="HOST", help="of --ask's page [%(default)s]")
+    transport.add_arguments(parser)
     add_folders(parser)
     add("--out", type=Path, default=Path("runs/viewpoints"), metavar="DIR", help="[%(default)s]")
     return parser

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 from edge_server.cli import main
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.viewpoints.command import read_budget
+from edge_server.experiments.viewpoints.reconstructions import viewing_path
 from edge_server.experiments.viewpoints.stage import open_stage
+from edge_server.page.preferences import PreferencePage
+from edge_server.viewpoints.candidates import half_hemisphere
 from edge_server.viewpoints.plan import Budget
+from freshfield.geometry import Pinhole
 
 
 def test_a_capture_is_planned_and_written(tmp_path, capsys):
@@ -55,3 +60,60 @@ def test_an_arm_says_which_candidates_it_reaches():
     assert stage.take(int(np.flatnonzero(reached)[0])).image.shape == (16, 16, 3)
     far = np.linalg.norm(stage.candidates.poses[:, :3, 3] - stage.candidates.target, axis=1)
     np.testing.assert_allclose(far, 0.34)
+
+
+def test_a_simulated_expert_is_asked_and_a_policy_plans_by_its_answers(tmp_path, capsys):
+    words = ["viewpoints", "tile", "--budget", "3", "--candidates", "16", "--steps", "2"]
+    words += ["--out", str(tmp_path)]
+    few = ["--reconstructions", "5", "--ask", "object", "--questions"]
+    assert main([*words, *few, "4"]) == 0
+    said = capsys.readouterr().out
+    assert "it does not know" in said and "planned by coverage instead" in said  # four answers are too few
+    answers = json.loads((tmp_path / "answers.json").read_text())["answers"]
+    assert len(answers) == 4 and {a["by"] for a in answers} == {"simulated expert (object)"}
+    assert main([*words, *few, "60"]) == 0  # goes on
+    file = json.loads((tmp_path / "answers.json").read_text())
+    assert file["answers"][:4] == answers and len(file["answers"]) == 60
+    assert "planned by" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "plan.json").read_text())["selector"] == "ppo"
+    assert main([*words, "--selector", f"ppo:{tmp_path / 'policy.npz'}"]) == 0
+    assert main([*words, *few, "60", "--seed", "1"]) == 2
+    assert "about other reconstructions" in capsys.readouterr().err and len(file["answers"]) == 60
+
+
+def test_a_person_is_asked_on_the_page_and_the_next_call_goes_on(tmp_path, monkeypatch):
+    """The page's own tests answer; here somebody answers once and finishes."""
+    served = []
+
+    class Page(PreferencePage):
+        def serve(self, host, port, transport=None):
+            served.append(self)
+            self._keep(self.session.answered("left"))
+            self.session = self.session.answered("left")
+            self.finished.set()
+            return "http://here", lambda: None
+
+    monkeypatch.setattr("edge_server.page.preferences.PreferencePage", Page)
+    words = ["viewpoints", "tile", "--budget", "2", "--candidates", "12", "--steps", "2"]
+    words += ["--out", str(tmp_path)]
+    for call in (1, 2):
+        assert main([*words, "--ask", "--reconstructions", "3"]) == 0
+        answers = json.loads((tmp_path / "answers.json").read_text())["answers"]
+        assert [a["by"] for a in answers] == ["person"] * call
+    first = cv2.imdecode(np.frombuffer(served[0]._sprites[0], np.uint8), 1)
+    assert first.shape == (4 * 128, 6 * 128, 3) and served[0]._sprites == served[1]._sprites
+    assert np.abs(first[:128, :128].astype(int) - first[-128:, -128:]).mean() > 1.0  # the viewpoint moves
+
+
+def test_the_path_of_the_moving_viewpoint_stays_among_the_candidates():
+    target = np.array([0.5, 0.0, 1.0])
+    candidates = half_hemisphere(target, 0.7, Pinhole.from_fov(16, 16, 50.0), 60)
+    path = np.stack(viewing_path(candidates, 9))
+    away = path[:, :3, 3] - target
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.7)
+    np.testing.assert_allclose(np.einsum("nd,nd->n", path[:, :3, 2], away), -0.7, atol=1e-9)  # looks at it
+    nearest = (candidates.directions @ (away / 0.7).T).max(axis=0)
+    assert np.rad2deg(np.arccos(nearest)).max() < 20.0
+    # One short way, from the left to the right of the picture.
+    steps = np.diff(path[:, :3, 3], axis=0)
+    assert np.ptp(np.linalg.norm(steps, axis=1)) < 1e-9 and (steps[:, 0] > 0).all()

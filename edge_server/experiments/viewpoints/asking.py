@@ -1,0 +1,106 @@
+"""``edge-server viewpoints --ask``: comparisons by a person on the page, or by a simulated expert."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.viewpoints.reconstructions import (
+    COLUMNS,
+    FRAMES,
+    sprites,
+    taste_score,
+    varied_plans,
+)
+from edge_server.experiments.viewpoints.stage import Stage
+from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.experts import SimulatedExpert
+from edge_server.viewpoints.features import StepFeatures
+from edge_server.viewpoints.plan import Plan
+from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
+from edge_server.viewpoints.preferences import PERSON, PreferenceSession
+from freshfield.files import write_json
+from freshfield.transport import Transport
+
+ANSWERS = "answers.json"
+VIEWS = 8  # of a reconstruction, where the budget is of metres only
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """views: of each reconstruction. count: of them. questions: to ask. steps: of each fit. out: folder."""
+
+    views: int
+    count: int
+    questions: int
+    steps: int
+    seed: int
+    out: Path
+
+
+def compare(
+    stage: Stage, about: Comparison, who: str, page: tuple[str, int], transport: Transport
+) -> PreferenceSession:
+    """The session once it is finished. It goes on from OUT/answers.json, which is written after each answer.
+
+    who: PERSON, or the taste of a simulated expert. page: host and port. Raises ViewpointError for answers
+    of another session, OptionError and TransportError where the page cannot be served.
+    """
+    plans = varied_plans(stage, about.count, about.views, about.seed)
+    steps = StepFeatures(stage.candidates)
+    orders = tuple(tuple(plan.order) for plan in plans)
+    features = np.array([steps.trajectory(order) for order in orders])
+    by = PERSON if who == PERSON else SimulatedExpert(who, np.zeros(0), np.random.default_rng()).label
+    session = PreferenceSession(stage.name, orders, features, about.questions, about.seed, by)
+    path = about.out / ANSWERS
+    if path.exists():
+        try:
+            session = session.imported(path.read_bytes())
+        except (OSError, ViewpointError) as error:
+            raise ViewpointError(f"{path}: {error}; move it away, or name another --out") from None
+    if who == PERSON:
+        return _on_the_page(stage, about, plans, session, page, transport)
+    print(f"{len(plans)} reconstructions are made and compared by a {by}", flush=True)
+    scores = [taste_score(stage, stage.fit(plan.views, about.steps, about.seed), who) for plan in plans]
+    expert = SimulatedExpert(who, np.array(scores), np.random.default_rng(about.seed))
+    while (asked := session.question) is not None:
+        first = expert.answer(asked.left, asked.right).prefers_first
+        session = session.answered("left" if first else "right")
+        write_json(path, session.as_json())
+    return session
+
+
+def _on_the_page(
+    stage: Stage, about: Comparison, plans: list[Plan], session: PreferenceSession, page: tuple[str, int],
+    transport: Transport,
+) -> PreferenceSession:  # fmt: skip
+    from edge_server.page.preferences import PageError, PreferencePage
+
+    transport.guard(page[0], "preference page", http=True)  # before minutes are spent on fits
+
+    def told(k: int) -> None:
+        print(
+            f"\rreconstruction {k + 1} of {len(plans)}", end="\n" if k + 1 == len(plans) else "", flush=True
+        )
+
+    made = sprites(stage, plans, about.steps, about.seed, about.out / "reconstructions", told)
+    path = about.out / ANSWERS
+    asking = PreferencePage(session, made, FRAMES, COLUMNS, lambda s: write_json(path, s.as_json()))
+    try:
+        url, close = asking.serve(*page, transport)
+    except PageError as error:
+        raise OptionError(str(error)) from None
+    print(f"compare at {url}; Ctrl-C stops, and the next call goes on", flush=True)
+    try:
+        asking.finished.wait()
+    finally:
+        close()
+    return asking.session
+
+
+def learn(stage: Stage, session: PreferenceSession, views: int, seed: int) -> CandidatePolicy:
+    """The policy of what the answers say, trained by PPO (4.14)."""
+    return train_policy(stage.candidates, session.model.reward, PolicyConfig(views=views), seed)[0]

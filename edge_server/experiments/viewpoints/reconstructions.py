@@ -1,0 +1,106 @@
+"""Reconstructions of different views, for people and simulated experts to compare."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.experiments.viewpoints.stage import Stage
+from edge_server.fidelity.images import to_unit
+from edge_server.fields import Field
+from edge_server.live.scoring_thread import to_bytes
+from edge_server.viewpoints.candidates import Candidates
+from edge_server.viewpoints.experts import judge
+from edge_server.viewpoints.plan import Budget, Plan, plan_capture
+from edge_server.viewpoints.selector import make_selector
+from freshfield.files import write_bytes, write_json
+from freshfield.geometry import so3_exp
+
+Array = NDArray[np.float64]
+
+# Pictures of a reconstruction along the path, side by side in rows of one JPEG.
+FRAMES, COLUMNS = 24, 6
+_WIDEST_PX = 320
+_FARTHEST_DEG = 60.0  # from the middle of the path
+_QUALITY = 92  # of the JPEG: its own faults are not to be compared
+
+
+def varied_plan(stage: Stage, k: int, views: int) -> Plan:
+    """Plan ``k`` of many that differ: by several selectors, each third one of one side only."""
+    rng = np.random.default_rng(k)
+    candidates = stage.candidates
+    if k % 3 == 1:
+        angle = candidates.directions @ candidates.directions[rng.integers(len(candidates))]
+        nearest = np.argsort(-angle)[: int(rng.integers(len(candidates) // 5, len(candidates) // 2))]
+        candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
+    name = ("random", "random", "farthest", "random", "coverage", "uniform")[k % 6]
+    weight = float(rng.choice([0.0, 0.0, 0.5]))
+    return plan_capture(
+        candidates, make_selector(name), Budget(views=views), stage.take, seed=k, travel_weight=weight
+    )
+
+
+def taste_score(stage: Stage, field: Field, taste: str) -> float:
+    """The score of a taste (``experts.TASTES``), over the views held out."""
+    shown = [field.render(v.camera_to_world, v.intrinsics).color for v in stage.held_out]
+    return judge(taste, shown, [to_unit(v.image, background=stage.background) for v in stage.held_out])
+
+
+def viewing_path(candidates: Candidates, frames: int = FRAMES) -> list[Array]:
+    """Poses (4, 4) of a short way round the target, through the middle of the reachable candidates."""
+    reachable = np.flatnonzero(candidates.reachable)
+    away = candidates.directions[reachable]
+    pose = candidates.poses[reachable[np.argmax(away @ away.mean(axis=0))]]
+    right, up, back = pose[:3, 0], -pose[:3, 1], -pose[:3, 2]
+    low, high = np.quantile(np.arctan2(away @ right, away @ back), [0.1, 0.9])
+    farthest = np.deg2rad(_FARTHEST_DEG)
+    made = []
+    for angle in np.linspace(max(low, -farthest), min(high, farthest), frames):
+        turn = so3_exp(angle * up)
+        turned = np.eye(4)
+        turned[:3, :3] = turn @ pose[:3, :3]
+        turned[:3, 3] = candidates.target + turn @ (pose[:3, 3] - candidates.target)
+        made.append(turned)
+    return made
+
+
+def sprite(stage: Stage, field: Field) -> bytes:
+    """A reconstruction along the path: a JPEG with FRAMES pictures, COLUMNS in a row."""
+    lens = stage.candidates.lens
+    lens = lens.scaled(min(1.0, _WIDEST_PX / lens.width))
+    shown = [to_bytes(field.render(pose, lens).color) for pose in viewing_path(stage.candidates)]
+    rows = [np.concatenate(shown[k : k + COLUMNS], axis=1) for k in range(0, FRAMES, COLUMNS)]
+    bgr = np.concatenate(rows)[..., ::-1]
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+
+
+def varied_plans(stage: Stage, count: int, views: int, seed: int) -> list[Plan]:
+    """``count`` plans that differ, fewer where the candidates give no more."""
+    plans = [varied_plan(stage, seed * count + k, views) for k in range(count)]
+    return list({tuple(plan.order): plan for plan in plans}.values())
+
+
+def sprites(
+    stage: Stage, plans: list[Plan], steps: int, seed: int, folder: Path, told: Callable[[int], None]
+) -> list[bytes]:
+    """The ``sprite`` of each plan, kept in ``folder`` for the next time. told: is called with the number of
+    each that is made. Raises OSError."""
+    orders = [plan.order for plan in plans]
+    about = {"scenario": stage.name, "steps": steps, "seed": seed, "orders": orders}
+    files = [folder / f"{k:03d}.jpg" for k in range(len(plans))]
+    try:
+        if json.loads((folder / "about.json").read_text()) == about:
+            return [file.read_bytes() for file in files]
+    except (OSError, ValueError):
+        pass
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, plan in enumerate(plans):
+        write_bytes(files[k], sprite(stage, stage.fit(plan.views, steps, seed)))
+        told(k)
+    write_json(folder / "about.json", about)
+    return [file.read_bytes() for file in files]

@@ -1,0 +1,97 @@
+"""A small HTTP server for those who may: a WSGI application behind the access rules, with few connections."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import threading
+from collections.abc import Callable
+from socketserver import ThreadingMixIn
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
+
+from freshfield.access import HttpDoor, HttpRefused
+from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
+from freshfield.transport import Transport
+
+log = logging.getLogger(__name__)
+
+CALLER = "freshfield.caller"
+"""Key of the ``access.Caller`` in the environment of an application's requests."""
+
+
+class _Handler(WSGIRequestHandler):
+    timeout = SCRAPE_TIMEOUT_S  # of each read of the socket
+
+    def log_message(self, *_: Any) -> None:
+        """Requests are not worth a line."""
+
+
+class _Server(ThreadingMixIn, WSGIServer):
+    """A thread for each connection, of which there are at most MAX_SCRAPES: a new one ends the oldest."""
+
+    daemon_threads = True
+
+    def __init__(self, host: str, port: int) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._lock = threading.Lock()
+        self._open: list[socket.socket] = []
+        super().__init__((host, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        with self._lock:
+            self._open.append(request)
+            if len(self._open) > MAX_SCRAPES:
+                with contextlib.suppress(OSError):  # its thread reads the end of the request
+                    self._open.pop(0).shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock, contextlib.suppress(ValueError):
+            self._open.remove(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, *_: Any) -> None:
+        """A connection that broke is the client's matter."""
+
+
+def _guarded(inner: Any, door: HttpDoor) -> Any:
+    """The WSGI application for those who may look; it finds them at ``CALLER``."""
+
+    def application(environ: dict[str, Any], start_response: Any) -> Any:
+        try:
+            door.check_origin(environ.get("HTTP_HOST"), environ.get("HTTP_ORIGIN"))
+            environ[CALLER] = door.caller(environ.get("HTTP_AUTHORIZATION"))
+        except HttpRefused as error:
+            challenge = [("WWW-Authenticate", 'Basic realm="freshfield"')] if error.status == 401 else []
+            start_response(f"{error.status} Refused", [("Content-Type", "text/plain"), *challenge])
+            return [f"{error}\n".encode()]
+        return inner(environ, start_response)
+
+    return application
+
+
+def serve_guarded(
+    application: Any, what: str, host: str, port: int, transport: Transport | None = None
+) -> tuple[int, Callable[[], None]]:
+    """Serve a WSGI application on a thread; returns its port and what closes it.
+
+    what: the application's name for messages. port: 0 takes a free one. Raises TransportError if it would be
+    open to others (see ``Transport.guard``), OSError if the port is not available.
+    """
+    transport = transport or Transport()
+    if words := transport.guard(host, what, http=True):
+        log.warning("--insecure: %s", words)
+    door, tls = HttpDoor(transport.access, host), transport.tls(host)
+    server = _Server(host.strip("[]"), port)
+    server.set_app(_guarded(application, door))
+    if tls is not None:  # a connection's own thread does the handshake
+        server.socket = tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
+    threading.Thread(target=server.serve_forever, name=what, daemon=True).start()
+
+    def close() -> None:
+        server.shutdown()
+        server.server_close()
+
+    return server.server_port, close

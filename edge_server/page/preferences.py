@@ -1,0 +1,165 @@
+"""The preference page: two reconstructions side by side from one moving viewpoint, and which is better.
+
+The server holds the session, so that a reload and a second tab show the same question. The page learns
+neither which reconstructions it shows nor whether the pair is a repeated one.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from importlib.resources import files
+from typing import Any
+
+from edge_server.live.output.guarded_http import CALLER, serve_guarded
+from edge_server.page import PageError, page_url
+from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.preferences import PreferenceSession
+from freshfield.access import CHANGE
+from freshfield.transport import Transport
+
+# Of a file of answers: thousands of them.
+MAX_BODY_BYTES = 2**20
+_HEADERS = [
+    ("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"), ("Referrer-Policy", "no-referrer"),
+    ("Content-Security-Policy", "default-src 'none'; img-src 'self'; connect-src 'self'; style-src "
+     "'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"),
+]  # fmt: skip
+_REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 409: "Conflict",
+            413: "Too Large", 507: "Not Kept"}  # fmt: skip
+
+
+class _Refused(Exception):
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class PreferencePage:
+    """Asks the questions of ``session``.
+
+    sprites: of each reconstruction, a JPEG of its pictures along the path. frames, columns: of each of them.
+    keep: writes a session; what it cannot write (OSError) is not taken.
+    """
+
+    def __init__(
+        self, session: PreferenceSession, sprites: Sequence[bytes], frames: int, columns: int,
+        keep: Callable[[PreferenceSession], None],
+    ) -> None:  # fmt: skip
+        self.session = session
+        self.finished = threading.Event()
+        self._sprites, self._layout = sprites, {"frames": frames, "columns": columns}
+        self._keep = keep
+        self._lock = threading.Lock()
+        self._turn = secrets.token_hex(8)  # names the present state of the session; says nothing of the pair
+
+    def serve(
+        self, host: str, port: int, transport: Transport | None = None
+    ) -> tuple[str, Callable[[], None]]:
+        """Serve on a thread; returns the address and what closes it. Raises PageError if the port is not
+        available, TransportError if the page would be open to others."""
+        try:
+            port, close = serve_guarded(self, "preference page", host, port, transport)
+        except (OSError, OverflowError) as error:
+            raise PageError(f"page: cannot listen on {host}:{port} ({error}); see --page-port") from None
+        return page_url(host, port, bool(transport and transport.tls(host))), close
+
+    def __call__(self, environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
+        """The WSGI application."""
+        method, path = environ["REQUEST_METHOD"], environ.get("PATH_INFO", "/")
+        may_change = environ[CALLER].may(CHANGE)
+        more: list[tuple[str, str]] = []
+        try:
+            if method == "POST":
+                if not may_change:
+                    raise _Refused(403, "You logged in to look only.")
+                self._change(path, _body(environ))
+                path = "/state"
+            elif method != "GET":
+                raise _Refused(404, "Not found.")
+            with self._lock:
+                status, (kind, body) = 200, self._look(path, may_change)
+            if path == "/answers.json":
+                more = [("Content-Disposition", 'attachment; filename="answers.json"')]
+        except _Refused as error:
+            status, kind, body = error.status, "text/plain; charset=utf-8", str(error).encode()
+        about = [("Content-Type", kind), ("Content-Length", str(len(body)))]
+        start_response(f"{status} {_REASONS[status]}", [*about, *more, *_HEADERS])
+        return [body]
+
+    def _look(self, path: str, may_change: bool) -> tuple[str, bytes]:
+        """Content type and content of an address."""
+        session = self.session
+        if path == "/":
+            return "text/html; charset=utf-8", files(__package__).joinpath("preferences.html").read_bytes()
+        if path == "/state":
+            return "application/json", json.dumps(self.state(session) | {"may_change": may_change}).encode()
+        if path == "/answers.json":
+            return "application/json", json.dumps(session.as_json()).encode()
+        asked = session.question
+        found = re.fullmatch(r"/(left|right)/(\w+)\.jpg", path)
+        if asked is None or found is None or found[2] != self._turn:
+            raise _Refused(404, "Not found.")
+        return "image/jpeg", self._sprites[getattr(asked, found[1])]
+
+    def state(self, session: PreferenceSession) -> dict[str, Any]:
+        """What the page knows."""
+        agreed, repeated = session.agreement
+        return {
+            "turn": self._turn, "answered": len(session.answers), "wanted": session.wanted,
+            "open": session.question is not None, "agreed": agreed, "repeated": repeated,
+            "says": session.model.says(), "finished": self.finished.is_set(), **self._layout,
+        }  # fmt: skip
+
+    def _change(self, path: str, body: bytes) -> None:
+        """An answer, an undo, an import or the end. What a tab sends about an earlier turn is refused: two
+        tabs, or two fingers, answer nothing twice."""
+        with self._lock:
+            session = self.session
+            if self.finished.is_set():
+                raise _Refused(409, "The session has ended.")
+            if path == "/import":
+                try:
+                    session = session.imported(body)
+                except ViewpointError as error:
+                    raise _Refused(400, f"Not imported: {error}") from None
+            else:
+                told = _told(body)
+                if told.get("turn") != self._turn:
+                    raise _Refused(409, "This was answered elsewhere; now see the present pair.")
+                if path == "/answer" and told.get("choice") in ("left", "right", "neither"):
+                    if session.question is None:
+                        raise _Refused(409, "All questions are answered.")
+                    session = session.answered(told["choice"])
+                elif path == "/undo":
+                    session = session.undone()
+                elif path == "/finish":
+                    self.finished.set()
+                    return
+                else:
+                    raise _Refused(404, "Not found.")
+            try:
+                self._keep(session)
+            except OSError as error:
+                raise _Refused(507, f"Not kept: {error.strerror or error}") from None
+            self.session, self._turn = session, secrets.token_hex(8)
+
+
+def _told(body: bytes) -> dict[str, Any]:
+    try:
+        told = json.loads(body)
+    except (ValueError, RecursionError):
+        told = None
+    if not isinstance(told, dict):
+        raise _Refused(400, "Expected a JSON object.")
+    return told
+
+
+def _body(environ: dict[str, Any]) -> bytes:
+    length = environ.get("CONTENT_LENGTH") or "0"
+    if not length.isdigit() or int(length) > MAX_BODY_BYTES:
+        raise _Refused(413, f"At most {MAX_BODY_BYTES // 2**10} KiB.")
+    return environ["wsgi.input"].read(int(length))  # type: ignore[no-any-return]

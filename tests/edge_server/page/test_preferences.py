@@ -1,0 +1,249 @@
+"""The preference page: a whole session in Chromium, wide and narrow, and what the server refuses."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.page import PageError
+from edge_server.page.preferences import MAX_BODY_BYTES, PreferencePage
+from edge_server.viewpoints.preferences import PreferenceSession
+from freshfield.transport import Transport, TransportError
+from tests.edge_server.page.browser import Browser
+
+COUNT, FRAMES, COLUMNS, SIDE = 6, 6, 3, 48
+NEW = PreferenceSession(
+    "tile",
+    tuple((k, k + 1) for k in range(COUNT)),
+    np.random.default_rng(0).normal(size=(COUNT, 3)),
+    wanted=9,
+)
+
+
+def sprite(k):
+    """Of reconstruction k: its grey level says which it is."""
+    return cv2.imencode(".jpg", np.full((2 * SIDE, 3 * SIDE, 3), 30 * k + 40, np.uint8))[1].tobytes()
+
+
+@pytest.fixture
+def asked():
+    """(page, its address, the sessions that it kept)."""
+    kept = []
+    page = PreferencePage(NEW, [sprite(k) for k in range(COUNT)], FRAMES, COLUMNS, kept.append)
+    url, close = page.serve("127.0.0.1", 0)
+    yield page, url, kept
+    close()
+
+
+def request(url, method, path, body=None, **headers):
+    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=10)
+    connection.request(
+        method, path, body if body is None or isinstance(body, bytes) else json.dumps(body), headers
+    )
+    answer = connection.getresponse()
+    return answer.status, answer.read(), answer
+
+
+def state(url):
+    return json.loads(request(url, "GET", "/state")[1])
+
+
+def level(jpeg):
+    return round((int(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0)[5, 5]) - 40) / 30)
+
+
+def test_answers_are_of_the_pair_that_was_shown_and_nothing_is_answered_twice(asked):
+    page, url, kept = asked
+    turn = state(url)["turn"]
+    shown = [level(request(url, "GET", f"/{side}/{turn}.jpg")[1]) for side in ("left", "right")]
+    assert request(url, "POST", "/answer", {"turn": turn, "choice": "right"})[0] == 200
+    (given,) = page.session.answers
+    assert [given.left, given.right] == shown and given.choice == "right" and kept == [page.session]
+    assert request(url, "POST", "/answer", {"turn": turn, "choice": "right"})[0] == 409
+    assert request(url, "POST", "/undo", {"turn": turn})[0] == 409
+    assert request(url, "GET", f"/left/{turn}.jpg")[0] == 404 and len(kept) == 1
+
+
+def test_the_page_is_blind(asked):
+    """Neither addresses nor state say which reconstructions are shown, or that a pair is a repeated one."""
+    _, url, _ = asked
+    expected = {"turn", "answered", "wanted", "open", "agreed", "repeated", "says", "finished", "frames",
+                "columns", "may_change"}  # fmt: skip
+    turns = set()
+    for _ in range(9):
+        now = state(url)
+        assert set(now) == expected
+        turns.add(now["turn"])
+        request(url, "POST", "/answer", {"turn": now["turn"], "choice": "left"})
+    assert len(turns) == 9 and not state(url)["open"] and state(url)["repeated"] == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status"),
+    [
+        ("/answer", b"no json", 400), ("/answer", b"[1]", 400), ("/answer", {"choice": "left"}, 409),
+        ("/import", b"{}", 400), ("/import", b"x" * (MAX_BODY_BYTES + 1), 413),
+        ("/answer", b"[" * 90_000, 400),
+    ],
+)  # fmt: skip
+def test_bad_requests_change_nothing(asked, path, body, status):
+    _, url, kept = asked
+    found, text, _ = request(url, "POST", path, body)
+    assert found == status and len(text.splitlines()) == 1 and not kept
+    turn = state(url)["turn"]
+    assert request(url, "POST", "/answer", {"turn": turn, "choice": "both"})[0] == 404 and not kept
+
+
+def test_a_foreign_web_site_answers_nothing(asked):
+    _, url, kept = asked
+    body = {"turn": state(url)["turn"], "choice": "left"}
+    assert request(url, "POST", "/answer", body, Origin="http://evil.example")[0] == 403
+    assert request(url, "GET", "/state", Host="evil.example:80")[0] == 403 and not kept
+    policy = request(url, "GET", "/")[2].getheader("Content-Security-Policy")
+    assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy
+
+
+def test_viewers_look_and_operators_answer():
+    tokens = Transport(tokens={"operator": "op-token", "viewer": "view-token"})
+    page = PreferencePage(NEW, [sprite(k) for k in range(COUNT)], FRAMES, COLUMNS, lambda s: None)
+    with pytest.raises(TransportError, match="nothing is encrypted"):
+        page.serve("0.0.0.0", 0, tokens)
+    url, close = page.serve("0.0.0.0", 0, Transport(tokens=tokens.tokens, insecure=True))
+    try:
+        assert request(url, "GET", "/state")[0] == 401
+        body = {"turn": page._turn, "choice": "left"}
+        for token, may in (("view-token", False), ("op-token", True)):
+            login = {"Authorization": f"Bearer {token}"}
+            assert json.loads(request(url, "GET", "/state", **login)[1])["may_change"] == may
+            assert request(url, "POST", "/answer", body, **login)[0] == (200 if may else 403)
+        with pytest.raises(PageError, match="--page-port"):
+            page.serve("0.0.0.0", int(url.rpartition(":")[2]), Transport(insecure=True))
+    finally:
+        close()
+
+
+def test_an_answer_that_cannot_be_written_is_not_taken(asked):
+    page, url, _ = asked
+
+    def full(session):
+        raise OSError(28, "No space left on device")
+
+    page._keep = full
+    status, text, _ = request(url, "POST", "/answer", {"turn": state(url)["turn"], "choice": "left"})
+    assert status == 507 and b"No space left" in text and state(url)["answered"] == 0
+
+
+def press(browser, key, code):
+    for kind in ("keyDown", "keyUp"):
+        browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+
+def swipe(browser, dx):
+    box = browser.evaluate("(({x, y, width, height}) => [x + width / 2, y + height / 2])"
+                           "(document.getElementById('pair').getBoundingClientRect())")  # fmt: skip
+    points = [{"x": box[0] + share * dx, "y": box[1]} for share in (0, 0.5, 1)]
+    browser.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=points[:1])
+    for point in points[1:]:
+        browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[point])
+    browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+
+def grey(browser):
+    """Reconstructions that the two canvases show."""
+    return browser.evaluate(
+        "['leftView', 'rightView'].map(id => {const c = document.getElementById(id);"
+        "return Math.round((c.getContext('2d').getImageData(5, 5, 1, 1).data[0] - 40) / 30)})"
+    )
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(("width", "height"), [(1200, 900), (360, 740)], ids=["wide", "narrow"])
+def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
+    page, url, kept = asked
+    with Browser(url, width, height) as browser:
+
+        def ready(answered):
+            browser.wait_for_text(f"{answered} of 9 answered")
+            browser.wait_for(
+                lambda: not browser.evaluate("document.getElementById('left').disabled"), "a pair"
+            )
+            asked = page.session.question
+            assert grey(browser) == [asked.left, asked.right]
+
+        browser.call("Emulation.setTouchEmulationEnabled", enabled=True)
+        ready(0)
+        fits = "document.documentElement.scrollWidth <= innerWidth && document.querySelector('#right')"
+        assert browser.evaluate(f"{fits}.getBoundingClientRect().bottom <= innerHeight")
+        assert browser.evaluate("[...document.querySelectorAll('button')].every(b => b.offsetHeight >= 44)")
+        moving = "document.getElementById('place').value"
+        was = browser.evaluate(moving)
+        browser.wait_for(lambda: browser.evaluate(moving) != was, "the movement of the viewpoint")
+        browser.screenshot(tmp_path / "asking.png")
+        press(browser, "ArrowLeft", 37)
+        ready(1)
+        press(browser, "ArrowDown", 40)
+        ready(2)
+        swipe(browser, 90)
+        ready(3)
+        browser.click_text("← Left")
+        ready(4)
+        assert [a.choice for a in page.session.answers] == ["left", "neither", "right", "left"]
+        press(browser, "z", 90)
+        ready(3)
+        browser.click_text("Undo")
+        ready(2)
+        browser.call("Page.reload")
+        ready(2)
+        # A second tab answered: this one shows the next pair by itself.
+        request(url, "POST", "/answer", {"turn": page._turn, "choice": "right"})
+        ready(3)
+        # The arrows of the slider move the slider.
+        browser.evaluate("document.getElementById('place').focus()")
+        press(browser, "ArrowRight", 39)
+        browser.wait_for_text("Play")
+        time.sleep(0.3)
+        assert len(page.session.answers) == 3
+        browser.evaluate("document.activeElement.blur()")
+        for k in range(4, 9):
+            press(browser, "ArrowRight", 39)
+            ready(k)
+        assert "repeated pairs answered alike: 0 of 1" in browser.text()  # always right, sides swapped
+        press(browser, "ArrowRight", 39)
+        browser.wait_for_text("All questions are answered")
+        assert "it does not know" in browser.text()
+        export = browser.evaluate("fetch('answers.json').then(a => a.text())")
+        assert json.loads(export) == json.loads(json.dumps(kept[-1].as_json()))
+        load = (
+            "(text) => {const d = new DataTransfer(); d.items.add(new File([text], 'a.json'));"
+            "const f = document.getElementById('file'); f.files = d.files; window.confirm = () => true;"
+            "f.dispatchEvent(new Event('change'))}"
+        )
+        browser.evaluate(f"({load})('{{}}')")
+        browser.wait_for_text("Not imported: not a file of answers")
+        assert len(page.session.answers) == 9
+        part = json.loads(export)
+        part["answers"] = part["answers"][:5]
+        browser.evaluate(f"({load})({json.dumps(json.dumps(part))})")
+        ready(5)
+        browser.click_text("Finish and plan")
+        browser.wait_for_text("Finished")
+        assert page.finished.is_set() and len(page.session.answers) == 5 and browser.errors == []
+        assert all(address.startswith(url) for address in browser.requests)
+
+
+@pytest.mark.browser
+def test_who_wants_less_motion_moves_the_viewpoint_by_hand(asked):
+    _, url, _ = asked
+    with Browser("about:blank") as browser:
+        less = [{"name": "prefers-reduced-motion", "value": "reduce"}]
+        browser.call("Emulation.setEmulatedMedia", features=less)
+        browser.call("Page.navigate", url=url)
+        browser.wait_for_text("0 of 9 answered")
+        browser.wait_for_text("Play")
+        time.sleep(0.5)
+        assert browser.evaluate("document.getElementById('place').value") == "0"
