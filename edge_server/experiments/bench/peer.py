@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,35 +61,23 @@ def nerfacto_missing() -> str | None:
 
 
 def _race(still: MultiviewStill, limit_s: float) -> dict[str, Any]:
-    contestants: dict[str, Callable[[MultiviewStill], Contestant]] = {
-        "ngp": _ngp,
-        "plain_torch": _plain_torch,
-    }
-    if nerfacto_missing() is None:
-        contestants["nerfacto"] = _nerfacto
-    rows: dict[str, Any] = {}
-    for name, enter in contestants.items():
-        train, render = enter(still)
-        slice_s = _FIRST_SLICE_S if name == "ngp" else _FIRST_PEER_SLICE_S
-        rows[name] = _seconds_to(train, render, still.held_out[0], limit_s, slice_s)
-    for name in contestants:
-        if name == "ngp":
-            continue
+    ours = _seconds_to(*_ngp(still), still.held_out[0], limit_s, _FIRST_SLICE_S)
+    rows: dict[str, Any] = {"ngp": ours}
+    peers = {"plain_torch": _plain_torch, **({} if nerfacto_missing() else {"nerfacto": _nerfacto})}
+    for name, enter in peers.items():
+        row = rows[name] = _seconds_to(*enter(still), still.held_out[0], limit_s, _FIRST_PEER_SLICE_S)
         for target in TARGETS_DB:
-            ours, theirs = rows["ngp"][f"{target}_db_s"], rows[name][f"{target}_db_s"]
-            if ours is not None:
-                rows[name][f"{target}_db_ratio"] = (theirs or rows[name]["within_s"]) / ours
-                rows[name][f"{target}_db_reached"] = theirs is not None
+            mine, theirs = ours[f"{target}_db_s"], row[f"{target}_db_s"]
+            if mine is not None:
+                row[f"{target}_db_ratio"] = (theirs or row["within_s"]) / mine
+                row[f"{target}_db_reached"] = theirs is not None
     return rows
 
 
 def _seconds_to(
-    train: Callable[[float], float],
-    render: Callable[[View], np.ndarray],
-    truth: View,
-    limit_s: float,
+    train: Callable[[float], float], render: Callable[[View], np.ndarray], truth: View, limit_s: float,
     slice_s: float,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     load = LoadMeter()
     reached: dict[int, float | None] = dict.fromkeys(TARGETS_DB)
     spent, best = 0.0, 0.0
@@ -139,6 +126,7 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
     from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
     from nerfstudio.cameras.cameras import Cameras, CameraType
     from nerfstudio.data.scene_box import SceneBox
+    from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
     from nerfstudio.models import nerfacto
 
     # The model makes an LPIPS network for its own evaluation, which needs torchvision and a download.
@@ -154,14 +142,12 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
         lenses = [v.intrinsics for v in views]
         return Cameras(
             camera_to_worlds=torch.tensor(poses[:, :3], dtype=torch.float32),
-            fx=torch.tensor([k.fx for k in lenses], dtype=torch.float32),
-            fy=torch.tensor([k.fy for k in lenses], dtype=torch.float32),
-            cx=torch.tensor([k.cx for k in lenses], dtype=torch.float32),
-            cy=torch.tensor([k.cy for k in lenses], dtype=torch.float32),
+            **{n: torch.tensor([getattr(k, n) for k in lenses], dtype=torch.float32)
+               for n in ("fx", "fy", "cx", "cy")},
             width=lenses[0].width,
             height=lenses[0].height,
             camera_type=CameraType.PERSPECTIVE,
-        )
+        )  # fmt: skip
 
     plain = still.training[0].image.shape[2] == 4
     model = nerfacto.NerfactoModelConfig(
@@ -180,7 +166,8 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
     pixels = torch.tensor(np.stack([_on_white(v.image) for v in still.training]))
     count, height, width = pixels.shape[:3]
     generator = torch.Generator().manual_seed(0)
-    callbacks = _callbacks(model)
+    nothing = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)
+    callbacks = model.get_training_callbacks(nothing)  # the annealing of its proposals
     steps = 0
 
     def train(seconds: float) -> float:
@@ -188,8 +175,8 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
         began = time.perf_counter()
         model.train()
         while (spent := time.perf_counter() - began) < seconds:
-            for before, _ in callbacks:
-                before(steps)
+            for callback in callbacks:
+                callback.run_callback_at_location(steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
             k = torch.randint(count, (_RAYS, 1), generator=generator)
             y = torch.randint(height, (_RAYS,), generator=generator)
             x = torch.randint(width, (_RAYS,), generator=generator)
@@ -201,8 +188,8 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
             optimizer.zero_grad()
             sum(losses.values()).backward()
             optimizer.step()
-            for _, after in callbacks:
-                after(steps)
+            for callback in callbacks:
+                callback.run_callback_at_location(steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
             steps += 1
         return spent
 
@@ -214,20 +201,6 @@ def _nerfacto(still: MultiviewStill) -> Contestant:
         return out
 
     return train, render
-
-
-def _callbacks(model: Any) -> list[tuple[Callable[[int], None], Callable[[int], None]]]:
-    """Callbacks of nerfacto before and after a step: the annealing of its proposals."""
-    from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-
-    attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)
-    return [
-        (
-            partial(c.run_callback_at_location, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION),
-            partial(c.run_callback_at_location, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION),
-        )
-        for c in model.get_training_callbacks(attributes)
-    ]
 
 
 def _normalisation(views: Sequence[View]) -> tuple[np.ndarray, float]:
