@@ -4,37 +4,22 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from freshfield.frame import Frame
 
+if TYPE_CHECKING:
+    from edge_server.embed.embedder import Embedder
+    from edge_server.fields import View
+
 # Number of embeddings to keep: several rounds of the largest rigs.
 CAPACITY = 1024
 
 _Key = tuple[str, str, int]
 _Row = NDArray[np.float32] | None
-
-
-class EmbedderLike(Protocol):
-    """The part of an Embedder that the cache uses."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def dim(self) -> int: ...
-
-    def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]: ...
-
-
-class HasImage(Protocol):
-    """A decoded frame."""
-
-    @property
-    def image(self) -> NDArray[np.uint8]: ...
 
 
 class HasFrame(Protocol):
@@ -54,7 +39,7 @@ class EmbeddingCache(Generic[Item]):
     """
 
     def __init__(
-        self, embedder: EmbedderLike, decode: Callable[[Item], HasImage | None], capacity: int = CAPACITY
+        self, embedder: Embedder, decode: Callable[[Item], View | None], capacity: int = CAPACITY
     ) -> None:
         """decode: gives a frame's view, None if it is damaged. Share it with the field, so that a frame that
         both use is decoded once."""

@@ -22,7 +22,7 @@ from typing import Any
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_recording, result_settings
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
-from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import grouped, markdown_table, number
 from edge_server.experiments.scenes.multiview_still import (
     MultiviewStill,
@@ -76,7 +76,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
         store.get("start", name, compute=start, settings=settings)
     stills = {scene: synthetic_still(scene, cameras=VIEWS + 1, size=SIZE) for scene in ("tile", "room")}
     for scene, still in (*stills.items(), *_recorded_stills()):
-        _describe(store, scene, still)
+        base = partial(mean_baselines, still.training, still.held_out, still.background)
+        store.get(scene, "baseline", compute=base)
+        store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
         for name in names:
             if scene in stills:
                 work = partial(_curve_and_rates, name, still, workload, lpips)
@@ -85,13 +87,6 @@ def measure(run: BenchRun) -> dict[str, Any]:
             settings = result_settings(workload, name, lpips=lpips is not None)
             store.get(scene, name, compute=work, settings=settings)
     return store.results
-
-
-def _describe(store: ResultStore, scene: str, still: MultiviewStill) -> None:
-    store.get(
-        scene, "baseline", compute=partial(mean_baselines, still.training, still.held_out, still.background)
-    )
-    store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
 
 
 def _curve_and_rates(name: str, still: MultiviewStill, workload: Workload, lpips: Any) -> dict[str, Any]:

@@ -40,6 +40,10 @@ class Interval:
         mean, low, high = (number(v, digits) for v in (self.mean, self.low, self.high))
         return f"{mean} [{low}, {high}]"
 
+    def rounded(self, digits: int) -> list[float | None]:
+        """Mean, low and high as JSON values, None for NaN."""
+        return [None if np.isnan(v) else round(v, digits) for v in (self.mean, self.low, self.high)]
+
     def above(self, bound: float) -> bool | None:
         """Whether the mean lies above ``bound``; None where the interval contains it."""
         if self.low > bound:

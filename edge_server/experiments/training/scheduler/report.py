@@ -59,16 +59,16 @@ def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
     return {
         "seeds": evaluation.seeds(trained)[1],
         "seeds_without_value": evaluation.seeds(trained)[0] - evaluation.seeds(trained)[1],
-        "reward": _as_list(interval(list(mine.values()))),
-        "rewards": {n: _as_list(interval(list(evaluation.rewards(n).values())))
+        "reward": interval(list(mine.values())).rounded(6),
+        "rewards": {n: interval(list(evaluation.rewards(n).values())).rounded(6)
                     for n in (*evaluation.outcomes, HINDSIGHT)},
-        "over_random": _as_list(paired(mine, evaluation.rewards("random"))),
-        "over_best_fixed": _as_list(paired(mine, best)),
+        "over_random": paired(mine, evaluation.rewards("random")).rounded(6),
+        "over_best_fixed": paired(mine, best).rounded(6),
         "best_fixed": name,
-        "share": _as_list(evaluation.share(mine)),
-        "best_fixed_share": _as_list(evaluation.share(best)),
+        "share": evaluation.share(mine).rounded(6),
+        "best_fixed_share": evaluation.share(best).rounded(6),
         "best_value_by_decision": best_values["quartiles"],
-        "knowing_it_is_worth": _as_list(best_values["gain"]),
+        "knowing_it_is_worth": best_values["gain"].rounded(6),
     }  # fmt: skip
 
 
@@ -110,10 +110,6 @@ def span(i: Interval, digits: int = 4) -> str:
     if i.count < 2 or np.isnan(i.low):
         return f"{i.mean:.{digits}f}"
     return f"{i.mean:.{digits}f} [{i.low:.{digits}f}, {i.high:.{digits}f}]"
-
-
-def _as_list(i: Interval) -> list[float | None]:
-    return [None if np.isnan(v) else round(v, 6) for v in (i.mean, i.low, i.high)]
 
 
 def _numbers(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
