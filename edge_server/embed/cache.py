@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from freshfield.frame import Frame
 
 if TYPE_CHECKING:
     from edge_server.embed.embedder import Embedder
-    from edge_server.fields import View
 
 # Number of embeddings to keep: several rounds of the largest rigs.
 CAPACITY = 1024
@@ -38,11 +37,9 @@ class EmbeddingCache(Generic[Item]):
     computed, failed: number of frames. A failure is remembered, so that a frame is tried and counted once.
     """
 
-    def __init__(
-        self, embedder: Embedder, decode: Callable[[Item], View | None], capacity: int = CAPACITY
-    ) -> None:
-        """decode: gives a frame's view, None if it is damaged. Share it with the field, so that a frame that
-        both use is decoded once."""
+    def __init__(self, embedder: Embedder, decode: Callable[[Item], Any], capacity: int = CAPACITY) -> None:
+        """decode: gives a frame's view with its ``image``, None if it is damaged. Share it with the field, so
+        that a frame that both use is decoded once."""
         self._embedder, self._decode, self._capacity = embedder, decode, capacity
         # None: the frame has no embedding.
         self._rows: OrderedDict[_Key, _Row] = OrderedDict()

@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_recording, result_settings
+from edge_server.experiments.bench.run import BenchRun, open_recording, result_settings
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
 from edge_server.experiments.common.result_store import settings_digest
-from edge_server.experiments.common.tables import grouped, markdown_table, number
+from edge_server.experiments.common.tables import grouped, markdown_table, median_or_none, number
 from edge_server.experiments.scenes.multiview_still import (
     MultiviewStill,
+    mean_baselines,
     score_views,
     smallest_angle_deg,
     synthetic_still,
@@ -144,8 +145,7 @@ def _curve(
         points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
         row: dict[str, Any] = {"seconds": seconds}
         for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
-            known = [p[name] for p in points if p[name] is not None]
-            row[name] = statistics.median(known) if known else None
+            row[name] = median_or_none(p[name] for p in points)
         row["psnr_db_range"] = max(p["psnr_db"] for p in points) - min(p["psnr_db"] for p in points)
         series.append(row)
         print(f"  {field:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)

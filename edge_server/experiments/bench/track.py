@@ -25,7 +25,6 @@ from edge_server.experiments.bench.run import (
     BenchError,
     BenchRun,
     data_file,
-    mean_baselines,
     result_settings,
 )
 from edge_server.experiments.common.progress import Progress
@@ -36,6 +35,7 @@ from edge_server.experiments.scenes.multiview_sequence import (
     recorded_sequence,
     synthetic_sequence,
 )
+from edge_server.experiments.scenes.multiview_still import mean_baselines
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
@@ -106,7 +106,8 @@ def measure(run: BenchRun) -> dict[str, Any]:
     todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
     progress = Progress(workload.seconds_or_steps() * len(todo))
     for scene, sequence in sequences.items():
-        store.get(scene, "baseline", compute=partial(_baselines, sequence))
+        of_first = partial(mean_baselines, sequence.training(0), sequence.truth(0))
+        store.get(scene, "baseline", compute=of_first)
         store.results[scene] |= {"scene": sequence.describe(), "frame_ms": sequence.period_ms}
         for name in names:
             follow = partial(_follow, name, sequence, workload, progress)
@@ -230,11 +231,6 @@ def _amount(budget: Budget) -> float:
 
 def _row(score: Score) -> dict[str, Any]:
     return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
-
-
-def _baselines(sequence: MultiviewSequence) -> dict[str, Any]:
-    """Of the first frame."""
-    return mean_baselines(sequence.training(0), sequence.truth(0))
 
 
 def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:

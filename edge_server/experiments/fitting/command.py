@@ -19,9 +19,8 @@ from camera_node.synthetic import SCENES
 from camera_node.synthetic.source import WORLD_FPS
 from edge_server.experiments.common.arguments import OptionError, command_parser, parse_options
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
-from edge_server.experiments.scenes.multiview_still import score_views, synthetic_still
+from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
-from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
@@ -153,13 +152,8 @@ class _Run:
     def __init__(
         self, request: argparse.Namespace, options: dict[str, Any], data: Recorded, model: Field
     ) -> None:
-        self.request, self.options, self.data, self.model, self.out = (
-            request,
-            options,
-            data,
-            model,
-            request.out,
-        )
+        self.request, self.options, self.data, self.model = request, options, data, model
+        self.out = request.out
         metric, self.lpips_missing = open_lpips(request.lpips)
         self.background = BACKGROUNDS[request.background]
         self.scorer = Scorer(metric, background=self.background)
@@ -249,7 +243,6 @@ class _Run:
 
     def _status(self) -> dict[str, Any]:
         d = self.data
-        found = [baseline(d.training, v.image, v.camera_to_world, self.background) for v in d.held_out]
         return {
             **self._about(),
             "kind": "fit",
@@ -257,10 +250,7 @@ class _Run:
                 "file": d.file.name, "instant": d.instant, "training": len(d.training),
                 "held_out": [v.camera for v in d.held_out], "missing": d.missing,
             },
-            "baseline": {
-                name: float(np.mean([getattr(b, name) for b in found])) if found else None
-                for name in ("mean_colour_db", "nearest_view_db")
-            },
+            "baseline": mean_baselines(d.training, d.held_out, self.background),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
         }  # fmt: skip

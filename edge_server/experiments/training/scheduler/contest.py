@@ -56,7 +56,7 @@ def contest(
     for who, of in runs.items():
         for m in ("psnr_db", "psnr_moving_db"):
             values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
-            found[who][m] = interval(list(values[who].values())).rounded(4)
+            found[who][m] = interval(values[who].values()).rounded(4)
             found[who][f"{m}_over_{REFERENCE}"] = paired(values[who], values[REFERENCE]).rounded(4)
         if who == LEARNT:
             found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
