@@ -271,13 +271,13 @@ def _shape_of(
     elif size is not None:
         height = width = size
     else:
-        height, width = _exported_for(meta)
+        height, width = exported_size(meta)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
         raise EmbeddingError(f"{path}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
     return batch or None, (height, width)
 
 
-def _exported_for(meta: dict[str, str]) -> tuple[int, int]:
+def exported_size(meta: dict[str, str]) -> tuple[int, int]:
     """(height, width) in the exporter's metadata, such as ``[640, 640]``, else USUAL_SIDE."""
     try:
         height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))

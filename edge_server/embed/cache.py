@@ -4,37 +4,21 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from freshfield.frame import Frame
 
+if TYPE_CHECKING:
+    from edge_server.embed.embedder import Embedder
+
 # Number of embeddings to keep: several rounds of the largest rigs.
 CAPACITY = 1024
 
 _Key = tuple[str, str, int]
 _Row = NDArray[np.float32] | None
-
-
-class EmbedderLike(Protocol):
-    """The part of an Embedder that the cache uses."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def dim(self) -> int: ...
-
-    def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]: ...
-
-
-class HasImage(Protocol):
-    """A decoded frame."""
-
-    @property
-    def image(self) -> NDArray[np.uint8]: ...
 
 
 class HasFrame(Protocol):
@@ -53,11 +37,9 @@ class EmbeddingCache(Generic[Item]):
     computed, failed: number of frames. A failure is remembered, so that a frame is tried and counted once.
     """
 
-    def __init__(
-        self, embedder: EmbedderLike, decode: Callable[[Item], HasImage | None], capacity: int = CAPACITY
-    ) -> None:
-        """decode: gives a frame's view, None if it is damaged. Share it with the field, so that a frame that
-        both use is decoded once."""
+    def __init__(self, embedder: Embedder, decode: Callable[[Item], Any], capacity: int = CAPACITY) -> None:
+        """decode: gives a frame's view with its ``image``, None if it is damaged. Share it with the field, so
+        that a frame that both use is decoded once."""
         self._embedder, self._decode, self._capacity = embedder, decode, capacity
         # None: the frame has no embedding.
         self._rows: OrderedDict[_Key, _Row] = OrderedDict()

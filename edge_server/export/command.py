@@ -159,19 +159,12 @@ class Export:
             raise ExportError(f"--voxel {a.voxel:g}: expected more than 0 mm")
         box = None if a.bounds is None else (tuple(a.bounds[:3]), tuple(a.bounds[3:]))
         return MeshSettings(
-            method=a.method,
-            sharpen=not a.no_sharpen,
+            method=a.method, sharpen=not a.no_sharpen,
             carve=a.mesh is not None and not a.no_carve,  # points need no more than the field has
-            voxel_m=None if a.voxel is None else 1e-3 * a.voxel,
-            truncation=a.truncation,
-            bounds=box,
-            watertight=a.watertight,
-            min_weight=a.min_weight,
-            solid=a.solid,
-            keep_share=a.keep,
-            most=a.pieces,
+            voxel_m=None if a.voxel is None else 1e-3 * a.voxel, truncation=a.truncation, bounds=box,
+            watertight=a.watertight, min_weight=a.min_weight, solid=a.solid, keep_share=a.keep, most=a.pieces,
             memory_mb=a.memory,
-        )
+        )  # fmt: skip
 
     def _mesh(self, path: Path) -> None:
         from edge_server.surface.reconstruct import mesh_from_depth_maps
@@ -194,15 +187,11 @@ class Export:
         if self.args.json is None:
             return
         about = {
-            "file": path.name,
-            "triangles": len(mesh.faces),
-            "vertices": len(mesh.vertices),
-            "watertight": mesh.watertight,
-            "cameras": len(self.source.views),
-            "seconds": round(spent_s, 3),
+            "file": path.name, "triangles": len(mesh.faces), "vertices": len(mesh.vertices),
+            "watertight": mesh.watertight, "cameras": len(self.source.views), "seconds": round(spent_s, 3),
             "stages_s": {name: round(end - start, 3) for name, (start, end) in self._stages.items()},
             "measured": found,
-        }
+        }  # fmt: skip
         write_json(self.args.json, about, indent=1)
 
     def _points(self, path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, model_path
-from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, USUAL_SIDE, parse_model
+from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, parse_model
 from edge_server.embed.embedder import open_session
 from edge_server.embed.letterbox import blob, checked
 from edge_server.foreground import ForegroundError
@@ -57,9 +57,8 @@ class Detector:
         YOLO head."""
         whole = checked(image, 0)
         try:
-            out = self._session.run(None, {self._input: blob([whole], self.height, self.width, self._dtype)})[
-                0
-            ]
+            given = blob([whole], self.height, self.width, self._dtype)
+            out = self._session.run(None, {self._input: given})[0]
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             reason = " ".join(str(error).split())[:160]
             raise ForegroundError(f"{self.name}: ONNX Runtime cannot run it: {reason}") from None
@@ -123,17 +122,13 @@ def open_model(file: Path, provider: str, threads: int) -> Any:
 
 
 def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:
-    """(height, width) of the input: fixed by the model, else from the exporter's metadata, else
-    USUAL_SIDE."""
-    sides = [side if isinstance(side, int) else 0 for side in shape[2:]]
-    if not all(sides):
-        try:
-            sides = [int(side) for side in ast.literal_eval(meta["imgsz"])]
-        except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            sides = [USUAL_SIDE, USUAL_SIDE]
-    if len(sides) != 2 or not all(1 <= side <= MAX_SIDE for side in sides):
-        raise ForegroundError(f"{file}: images of {sides} pixels are not within 1 to {MAX_SIDE} a side")
-    return sides[0], sides[1]
+    """(height, width) of the input: fixed by the model, else those of ``exported_size``."""
+    height, width = (side if isinstance(side, int) else 0 for side in shape[2:])
+    if not (height and width):
+        height, width = exported_size(meta)
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
+        raise ForegroundError(f"{file}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
+    return height, width
 
 
 def _kinds(meta: dict[str, str]) -> dict[int, str]:

@@ -46,15 +46,15 @@ class Foreground:
         as motion. Transparent pixels stay transparent. Without a mask, return ``image`` itself."""
         begun = time.perf_counter()
         try:
-            found = self.mask(camera, image)
+            found = self._mask(camera, image)
         except (ForegroundError, EmbeddingError):
-            self.counts.failed += 1
-            found = None
+            found = "failed"
         self.seconds += time.perf_counter() - begun
-        if found is None:
+        counted = found if isinstance(found, str) else "masked"
+        setattr(self.counts, counted, getattr(self.counts, counted) + 1)
+        if isinstance(found, str):
             return image, None
         mask, box = found
-        self.counts.masked += 1
         out = np.empty((*image.shape[:2], 4), np.uint8)
         out[..., :3] = np.where(mask[..., None], image[..., :3], 0)
         out[..., 3] = np.where(mask, image[..., 3] if image.shape[2] == 4 else 255, 0)
@@ -67,25 +67,19 @@ class Foreground:
         inside[~mask[box[1] : box[3], box[0] : box[2]]] = doubt
         return out, weight
 
-    def mask(self, camera: str, image: Image) -> tuple[NDArray[np.bool_], Box] | None:
-        """Object mask (H, W) and box; None, counted, if the image passes unchanged."""
+    def _mask(self, camera: str, image: Image) -> tuple[NDArray[np.bool_], Box] | str:
+        """Object mask (H, W) and box; if the image passes unchanged, why: a name of ``Counts``."""
         height, width = image.shape[:2]
         found = self._boxes.of(camera, image)
         if found is None:
-            self.counts.not_detected += 1
-            return None
+            return "not_detected"
         box = clipped(found, width, height)
         if box is None:
-            self.counts.empty_box += 1
-            return None
+            return "empty_box"
         mask = self._segmenter.mask(np.ascontiguousarray(image[..., :3]), box)
         if not mask.any():
-            self.counts.empty_mask += 1
-            return None
-        if mask.all():
-            self.counts.full_mask += 1
-            return None
-        return mask, box
+            return "empty_mask"
+        return "full_mask" if mask.all() else (mask, box)
 
     def status(self) -> dict[str, Any]:
         """Counts, and milliseconds per image."""

@@ -22,7 +22,8 @@ from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it
-    from edge_server.embed.cache import EmbedderLike, EmbeddingCache
+    from edge_server.embed import Embedder
+    from edge_server.embed.cache import EmbeddingCache
     from edge_server.foreground.foreground import Foreground
     from edge_server.live.keyframes import Keyframes
     from edge_server.scheduler.learned.state import State
@@ -82,7 +83,7 @@ class FieldUpdater:
         policy: Policy,
         field: Field,
         start_ns: int,
-        embedder: EmbedderLike | None = None,
+        embedder: Embedder | None = None,
         keyframes: Keyframes | None = None,
         foreground: Foreground | None = None,
         on_arrivals: bool = False,
@@ -265,7 +266,7 @@ def open_updater(
     field: Field,
     start_ns: int,
     resumed: bool = False,
-    embedder: EmbedderLike | None = None,
+    embedder: Embedder | None = None,
 ) -> FieldUpdater:
     """The updater of a scenario's training cameras, with what its edge section asks for.
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.report.run_files import Row, RunFiles
@@ -46,15 +47,12 @@ def draw_all(report: Report, files: RunFiles) -> dict[str, Path]:
 def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
     """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication."""
     series, found = report["fidelity"]["series"], report["fidelity"]
-    psnr, moving = _points(series, "psnr_db"), _points(series, "psnr_moving_db")
-    ssim, lpips = _points(series, "ssim"), _points(series, "lpips")
-    if not len(psnr[0]):
+    if not _points(series, "psnr_db")[0]:
         return False
     with figure(path, 2, height_inch=2.5, sharex=True) as (_, axes):
         top, bottom = axes[:, 0]
-        top.plot(*psnr, color=BLUE, label="whole image")
-        if len(moving[0]):
-            top.plot(*moving, color=VERMILION, label="moving pixels")
+        _plot(top, series, "psnr_db", BLUE, "whole image")
+        _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
         flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
         for (key, label), dash in zip(flat.items(), ("--", ":")):
             if found["baseline"].get(key) is not None:
@@ -64,13 +62,10 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         if fit and SELECTED not in found["scored_on"]:
             title = "Fidelity on held-out views"
         label_lines(top, "PSNR (dB)", title=title)
-        bottom.plot(*ssim, color=GREEN, label="SSIM (higher is better)")
-        if len(lpips[0]):
-            network = found.get("lpips_network") or "network unknown"
-            bottom.plot(*lpips, color=ORANGE, label=f"LPIPS-{network} (lower is better)")
-        stand_in = _points(series, "perceptual")
-        if len(stand_in[0]):
-            bottom.plot(*stand_in, color=GREY, label="perceptual, not LPIPS (lower is better)")
+        _plot(bottom, series, "ssim", GREEN, "SSIM (higher is better)")
+        network = found.get("lpips_network") or "network unknown"
+        _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
+        _plot(bottom, series, "perceptual", GREY, "perceptual, not LPIPS (lower is better)")
         bottom.set_ylim(0.0, 1.02)
         label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
     return True
@@ -114,7 +109,7 @@ def draw_updates(report: Report, files: RunFiles, path: Path) -> bool:
     spent = _points(series, "update_ms")
     if not len(spent[0]) or report["kind"] == "fit":
         return False
-    counts = [(r["t_s"], _count(r.get("selected"))) for r in series]
+    counts = [(r["t_s"], len(used) if isinstance(used := r.get("selected"), list) else 0) for r in series]
     with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
         top, bottom = axes[:, 0]
         top.plot(*spent, ".", color=BLUE, markersize=4, label="each update")
@@ -131,7 +126,8 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
     """Share of time in each state of the chain, and the histogram of drawn delays."""
     if report["channel"] is None:
         return False
-    shares = _shares(report["channel"].get("state_share"))
+    shares = report["channel"].get("state_share")
+    shares = shares if isinstance(shares, dict) else {}
     drawn = report["channel"].get("drawn_delay_ms")
     edges, counts = _histogram(drawn.get("histogram") if isinstance(drawn, dict) else None)
     if not shares and not len(counts):
@@ -224,19 +220,16 @@ def _points(series: list[Row], name: str) -> tuple[list[float], list[float]]:
     return [r["t_s"] for r in rows], [r[name] for r in rows]
 
 
+def _plot(axes: Axes, series: list[Row], name: str, color: str, label: str) -> None:
+    """Draw the values of a row's entry over time, where there are any."""
+    points = _points(series, name)
+    if points[0]:
+        axes.plot(*points, color=color, label=label)
+
+
 def _robust_top(values: list[float]) -> float:
     """An axis limit that a single outlier (a start, a kill) does not set."""
     return 1.25 * float(np.percentile(values, 99)) + 1e-9 if len(values) else 1.0
-
-
-def _count(selected: Any) -> int:
-    return len(selected) if isinstance(selected, list) else int(selected or 0)
-
-
-def _shares(found: Any) -> dict[str, float]:
-    if isinstance(found, dict):
-        return {str(k): float(v) for k, v in found.items()}
-    return {str(i): float(v) for i, v in enumerate(found)} if isinstance(found, list) else {}
 
 
 def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -122,7 +122,7 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "refused": dict(sorted((refused | Counter(edge.get("refused") or {})).items())),
     }
     if deadline_ms is not None:
-        met = float(np.mean([ms <= deadline_ms for ms in spent])) if spent else None
+        met = _mean(float(ms <= deadline_ms) for ms in spent)
         if edge.get("count") and (within := _number(edge.get("within_deadline"))) is not None:
             met = within / edge["count"]
         result |= {"deadline_ms": deadline_ms, "met_share": met}
@@ -135,8 +135,8 @@ def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]
     late = [row for row in series if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
     baseline = edge.get("baseline") or {}
     return {
-        "final": _mean_scores(late),
-        "mean": _mean_scores(series),
+        "final": _means(late, METRICS),
+        "mean": _means(series, METRICS),
         "baseline": {name: baseline.get(name) for name in ("mean_colour_db", "nearest_view_db")},
         "lpips_missing": edge.get("lpips_missing"),
         "lpips_network": edge.get("lpips_network"),
@@ -151,27 +151,23 @@ def shown(rows: Sequence[Row], seconds: float) -> dict[str, Any]:
     of the instants, and age_ms {network, waiting, computing, display}: what the mean age of the views that
     were shown consists of."""
     late = [row for row in rows if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
-
-    def mean(values: Iterable[Any]) -> float | None:
-        known = _known(values)
-        return float(np.mean(known)) if known else None
-
     return {
-        **{name: mean(row.get(name) for row in late) for name in SHOWN},
+        **_means(late, SHOWN),
         "count": len(late),
         "age_ms": {
-            part: mean((row.get("age_ms") or {}).get(part) for row in late)
+            part: _mean((row.get("age_ms") or {}).get(part) for row in late)
             for part in ("network", "waiting", "computing", "display")
         },
     }
 
 
-def _mean_scores(rows: Sequence[Row]) -> dict[str, float | None]:
-    scores: dict[str, float | None] = {}
-    for name in METRICS:
-        values = _known(row.get(name) for row in rows)
-        scores[name] = float(np.mean(values)) if values else None
-    return scores
+def _means(rows: Sequence[Row], names: Sequence[str]) -> dict[str, float | None]:
+    return {name: _mean(row.get(name) for row in rows) for name in names}
+
+
+def _mean(values: Iterable[Any]) -> float | None:
+    known = _known(values)
+    return float(np.mean(known)) if known else None
 
 
 def _spread(values: Sequence[float]) -> dict[str, float | None] | None:

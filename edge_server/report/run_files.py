@@ -47,10 +47,9 @@ def read_run_files(out: Path) -> RunFiles:
     files.channel = _read_json(out / "channel.json", files.notes)
     files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
     files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
-    if (out / "shown.jsonl").exists():  # not of a fit
-        files.shown = _continuous(_read_lines(out / "shown.jsonl", files.notes))
-    if (out / "processes.jsonl").exists():  # written only where one command started all processes
-        files.processes = _continuous(_read_lines(out / "processes.jsonl", files.notes))
+    # Not of a fit, and only where one command started all processes.
+    for name in [n for n in ("shown", "processes") if (out / f"{n}.jsonl").exists()]:
+        setattr(files, name, _continuous(_read_lines(out / f"{name}.jsonl", files.notes)))
     if (out / "mesh.json").exists():  # only where the scenario asks for one
         files.mesh = _mesh(_read_json(out / "mesh.json", files.notes), files.notes)
     for name in ("truth", "rendered"):

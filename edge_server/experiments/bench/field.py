@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_recording, result_settings
+from edge_server.experiments.bench.run import BenchRun, open_recording, result_settings
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
-from edge_server.experiments.common.result_store import ResultStore, settings_digest
-from edge_server.experiments.common.tables import grouped, markdown_table, number
+from edge_server.experiments.common.result_store import settings_digest
+from edge_server.experiments.common.tables import grouped, markdown_table, median_or_none, number
 from edge_server.experiments.scenes.multiview_still import (
     MultiviewStill,
+    mean_baselines,
     score_views,
     smallest_angle_deg,
     synthetic_still,
@@ -76,7 +77,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
         store.get("start", name, compute=start, settings=settings)
     stills = {scene: synthetic_still(scene, cameras=VIEWS + 1, size=SIZE) for scene in ("tile", "room")}
     for scene, still in (*stills.items(), *_recorded_stills()):
-        _describe(store, scene, still)
+        base = partial(mean_baselines, still.training, still.held_out, still.background)
+        store.get(scene, "baseline", compute=base)
+        store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
         for name in names:
             if scene in stills:
                 work = partial(_curve_and_rates, name, still, workload, lpips)
@@ -85,13 +88,6 @@ def measure(run: BenchRun) -> dict[str, Any]:
             settings = result_settings(workload, name, lpips=lpips is not None)
             store.get(scene, name, compute=work, settings=settings)
     return store.results
-
-
-def _describe(store: ResultStore, scene: str, still: MultiviewStill) -> None:
-    store.get(
-        scene, "baseline", compute=partial(mean_baselines, still.training, still.held_out, still.background)
-    )
-    store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
 
 
 def _curve_and_rates(name: str, still: MultiviewStill, workload: Workload, lpips: Any) -> dict[str, Any]:
@@ -149,8 +145,7 @@ def _curve(
         points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
         row: dict[str, Any] = {"seconds": seconds}
         for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
-            known = [p[name] for p in points if p[name] is not None]
-            row[name] = statistics.median(known) if known else None
+            row[name] = median_or_none(p[name] for p in points)
         row["psnr_db_range"] = max(p["psnr_db"] for p in points) - min(p["psnr_db"] for p in points)
         series.append(row)
         print(f"  {field:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)

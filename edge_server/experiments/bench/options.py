@@ -8,9 +8,8 @@ option has no rows for it.
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 from edge_server.experiments.bench.option_ablation import MOVING, OPTIONS, SCENES, Scene, missing
 from edge_server.experiments.bench.run import BenchError, BenchRun, result_settings
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.common.tables import markdown_table, median_or_none
 from edge_server.experiments.common.tables import number as _db
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
@@ -122,12 +121,12 @@ def _point(
     }
     same_steps = next(iter(runs.values()))
     figures: dict[str, Any] = {
-        key: {run: _median([getattr(p, key) for p in found]) for run, found in runs.items()}
+        key: {run: median_or_none([getattr(p, key) for p in found]) for run, found in runs.items()}
         for key in ("psnr_db", "psnr_moving_db")
     }
-    figures["steps"] = {run: _median([p.steps for p in found]) for run, found in runs.items()}
-    figures["ms_per_step"] = _median([1e3 * p.seconds / p.steps for p in same_steps])
-    figures["cpu_ms_per_step"] = _median([1e3 * p.cpu_s / p.steps for p in same_steps])
+    figures["steps"] = {run: median_or_none([p.steps for p in found]) for run, found in runs.items()}
+    figures["ms_per_step"] = median_or_none([1e3 * p.seconds / p.steps for p in same_steps])
+    figures["cpu_ms_per_step"] = median_or_none([1e3 * p.cpu_s / p.steps for p in same_steps])
     return {**figures, "outside_cores": load.outside_cores()}
 
 
@@ -166,11 +165,6 @@ def _updates(where: Scene, workload: Workload, model: Field, budget: Budget) -> 
         scores.append(sequence.score(model, frame, scorer))
     score = mean_score(scores)
     return _Fitted(score.psnr_db, score.psnr_moving_db, steps, seconds, cpu_s)
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(statistics.median(known)) if known else None
 
 
 def rows(points: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,6 @@ from typing import Any
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
-from edge_server.fidelity.baselines import baseline
-from edge_server.fidelity.images import BLACK, Color
-from edge_server.fields import View
 
 # Recordings below the data folder: what is opened, and what is held out.
 RECORDINGS = {
@@ -81,12 +77,3 @@ def open_recording(name: str, scale: float) -> MultiviewStill:
     """One of ``RECORDINGS``, its images divided by ``scale``. DatasetError where it is not there."""
     path, holdout = RECORDINGS[name]
     return open_still(str(data_file(path)), holdout=holdout, scale=scale)
-
-
-def mean_baselines(
-    training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
-) -> dict[str, Any]:
-    """PSNR of the baselines without a field, means over the held-out cameras. color: the background."""
-    found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
-    names = ("mean_colour_db", "nearest_view_db")
-    return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -26,11 +25,9 @@ from edge_server.experiments.bench.run import (
     BenchError,
     BenchRun,
     data_file,
-    mean_baselines,
     result_settings,
 )
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.result_store import Interrupted
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db
 from edge_server.experiments.scenes.multiview_sequence import (
@@ -38,6 +35,7 @@ from edge_server.experiments.scenes.multiview_sequence import (
     recorded_sequence,
     synthetic_sequence,
 )
+from edge_server.experiments.scenes.multiview_still import mean_baselines
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
@@ -108,7 +106,8 @@ def measure(run: BenchRun) -> dict[str, Any]:
     todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
     progress = Progress(workload.seconds_or_steps() * len(todo))
     for scene, sequence in sequences.items():
-        store.get(scene, "baseline", compute=partial(_baselines, sequence))
+        of_first = partial(mean_baselines, sequence.training(0), sequence.truth(0))
+        store.get(scene, "baseline", compute=of_first)
         store.results[scene] |= {"scene": sequence.describe(), "frame_ms": sequence.period_ms}
         for name in names:
             follow = partial(_follow, name, sequence, workload, progress)
@@ -119,12 +118,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _sequences(workload: Workload, scenes: Sequence[str]) -> Iterable[tuple[str, MultiviewSequence]]:
     for scene in scenes or SCENES:
         if scene == "room":
-            yield (
-                scene,
-                synthetic_sequence(
-                    scene, workload.cameras, workload.size, workload.fps, speed_m_per_s=workload.speed_m_per_s
-                ),
-            )
+            w = workload
+            made = synthetic_sequence(scene, w.cameras, w.size, w.fps, speed_m_per_s=w.speed_m_per_s)
+            yield scene, made
             continue
         path, holdout = RECORDINGS[scene]
         try:
@@ -136,40 +132,34 @@ def _sequences(workload: Workload, scenes: Sequence[str]) -> Iterable[tuple[str,
 
 
 def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress: Progress) -> dict[str, Any]:
-    """One representation on one scene. Raises Interrupted with what there is by then."""
+    """One representation on one scene."""
     load, scorer = LoadMeter(), Scorer()
     figures: dict[str, Any] = {"fresh": {}}
     make_field(name, workload.options).warm_up()
     start: Field | None = None
     known: dict[int, dict[str, Any]] = {}  # a repeated frame is not fitted twice
-    try:
-        for frame in workload.sampled():
-            key = sequence.key(frame)
-            if key not in known:
-                field = make_field(name, workload.options)
-                report = field.fit(sequence.training(frame), workload.fresh())
-                start = start or field  # the first frame comes first
-                score = _row(sequence.score(field, frame, scorer))
-                known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
-            # For comparison: the field of the first frame, never updated.
-            assert start is not None
-            stayed = _row(sequence.score(start, frame, scorer))
-            stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
-            figures["fresh"][str(frame)] = {**known[key], **stale}
-            progress.advance(_amount(workload.fresh()))
-            progress.report(f"{name} {sequence.name}", f"fresh at frame {frame}", _score_text(known[key]))
+    for frame in workload.sampled():
+        key = sequence.key(frame)
+        if key not in known:
+            field = make_field(name, workload.options)
+            report = field.fit(sequence.training(frame), workload.fresh())
+            start = start or field  # the first frame comes first
+            score = _row(sequence.score(field, frame, scorer))
+            known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
+        # For comparison: the field of the first frame, never updated.
         assert start is not None
-        warm = start.state()
-        for run, budget in workload.budgets().items():
-            start.load_state(warm)
-            figures[run] = _run(
-                start, sequence, workload, budget, figures["fresh"], scorer, progress, f"{name} {run}"
-            )
-    except Interrupted as stopped:
-        figures[run] = stopped.result
-        raise Interrupted({**figures, "outside_cores": load.outside_cores()}) from None
-    except KeyboardInterrupt:
-        raise Interrupted({**figures, "outside_cores": load.outside_cores()}) from None
+        stayed = _row(sequence.score(start, frame, scorer))
+        stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
+        figures["fresh"][str(frame)] = {**known[key], **stale}
+        progress.advance(_amount(workload.fresh()))
+        progress.report(f"{name} {sequence.name}", f"fresh at frame {frame}", _score_text(known[key]))
+    assert start is not None
+    warm = start.state()
+    for run, budget in workload.budgets().items():
+        start.load_state(warm)
+        figures[run] = _run(
+            start, sequence, workload, budget, figures["fresh"], scorer, progress, f"{name} {run}"
+        )
     return {**figures, "outside_cores": load.outside_cores()}
 
 
@@ -179,22 +169,15 @@ def _run(
 ) -> dict[str, Any]:  # fmt: skip
     """Updates of one length, one frame after the other."""
     rows: list[dict[str, Any]] = []
-    stopped = True
-    with suppress(KeyboardInterrupt):
-        for frame in range(1, workload.updates + 1):
-            report = field.fit(sequence.training(frame), budget)
-            score = _row(sequence.score(field, frame, scorer))
-            rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
-            progress.advance(_amount(budget))
-            if frame % max(1, workload.updates // 10) == 0:
-                progress.report(
-                    f"{label} {sequence.name}", f"update {frame} of {workload.updates}", _score_text(score)
-                )
-        stopped = False
-    figures = summary(rows, fresh)
-    if stopped:
-        raise Interrupted(figures)
-    return figures
+    for frame in range(1, workload.updates + 1):
+        report = field.fit(sequence.training(frame), budget)
+        score = _row(sequence.score(field, frame, scorer))
+        rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
+        progress.advance(_amount(budget))
+        if frame % max(1, workload.updates // 10) == 0:
+            at = f"update {frame} of {workload.updates}"
+            progress.report(f"{label} {sequence.name}", at, _score_text(score))
+    return summary(rows, fresh)
 
 
 def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -248,11 +231,6 @@ def _amount(budget: Budget) -> float:
 
 def _row(score: Score) -> dict[str, Any]:
     return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
-
-
-def _baselines(sequence: MultiviewSequence) -> dict[str, Any]:
-    """Of the first frame."""
-    return mean_baselines(sequence.training(0), sequence.truth(0))
 
 
 def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:

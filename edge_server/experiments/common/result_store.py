@@ -20,14 +20,6 @@ from freshfield.files import Lines
 Result = dict[str, Any]
 
 
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C in the midst of a computation. result: what it has by now."""
-
-    def __init__(self, result: Result) -> None:
-        super().__init__()
-        self.result = result
-
-
 class ResultStore:
     """Results by path, a name or several nested ones.
 
@@ -67,13 +59,13 @@ class ResultStore:
             self._lines.close()
 
     def find(self, *path: str, settings: Mapping[str, Any] | None = None) -> Result | None:
-        """The result at ``path`` if it is there, whole, and was computed with the same settings on the same
-        kind of processor."""
+        """The result at ``path`` if it is there, and was computed with the same settings on the same kind of
+        processor."""
         found: Any = self.results
         for name in path:
             found = found.get(name) if isinstance(found, dict) else None
-        whole = isinstance(found, dict) and not found.get("interrupted")
-        return found if whole and found.get("settings") == _as_json(settings) else None
+        known = isinstance(found, dict) and found.get("settings") == _as_json(settings)
+        return found if known else None
 
     def put(self, *path: str, result: Result) -> Result:
         """Keep and save a result."""
@@ -91,18 +83,14 @@ class ResultStore:
     ) -> Result:
         """The result at ``path``, computed where ``find`` does not find it.
 
-        compute: called for a missing result. What an ``Interrupted`` one has is kept and marked as such.
+        compute: called for a missing result.
         settings: JSON values; results of other settings count as missing.
         """
         known = self.find(*path, settings=settings)
         if known is not None:
             return known
         about = {} if settings is None else {"settings": _as_json(settings)}
-        try:
-            return self.put(*path, result={**compute(), **about})
-        except Interrupted as stopped:
-            self.put(*path, result={**stopped.result, **about, "interrupted": True})
-            raise
+        return self.put(*path, result={**compute(), **about})
 
 
 def content_key(parts: Any, length: int = 16) -> str:

@@ -5,7 +5,7 @@ Resampling draws from a fixed random stream, so the same values give the same in
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,10 @@ class Interval:
         mean, low, high = (number(v, digits) for v in (self.mean, self.low, self.high))
         return f"{mean} [{low}, {high}]"
 
+    def rounded(self, digits: int) -> list[float | None]:
+        """Mean, low and high as JSON values, None for NaN."""
+        return [None if np.isnan(v) else round(v, digits) for v in (self.mean, self.low, self.high)]
+
     def above(self, bound: float) -> bool | None:
         """Whether the mean lies above ``bound``; None where the interval contains it."""
         if self.low > bound:
@@ -47,7 +51,7 @@ class Interval:
         return False if self.high < bound else None
 
 
-def interval(values: Sequence[float | None]) -> Interval:
+def interval(values: Iterable[float | None]) -> Interval:
     """Student's t interval of the mean of the known values."""
     known = np.array([v for v in values if v is not None], float)
     if not len(known):
@@ -62,6 +66,17 @@ def interval(values: Sequence[float | None]) -> Interval:
 def negated(answer: bool | None) -> bool | None:
     """The negation; unknown (None) stays unknown."""
     return None if answer is None else not answer
+
+
+def all_of(answers: Iterable[bool | None]) -> bool | None:
+    """Whether every answer is yes: a single no decides, otherwise one unknown (None) leaves it unknown."""
+    found = list(answers)
+    return False if False in found else None if None in found else True
+
+
+def any_of(answers: Iterable[bool | None]) -> bool | None:
+    """Whether some answer is yes, likewise."""
+    return negated(all_of(map(negated, answers)))
 
 
 def paired(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> Interval:
@@ -123,10 +138,7 @@ class Optimum:
 
     def interior(self, least: float = 0.0) -> bool | None:
         """Whether the curve rises and falls by more than ``least``; None where that is undecided."""
-        sides = (self.over_first.above(least), self.over_last.above(least))
-        if False in sides:
-            return False
-        return None if None in sides else True
+        return all_of(side.above(least) for side in (self.over_first, self.over_last))
 
 
 def optimum(curve: _Curve, lower_is_better: bool = False) -> Optimum:
@@ -141,7 +153,7 @@ def optimum(curve: _Curve, lower_is_better: bool = False) -> Optimum:
     if len(seeds) >= FEWEST:
         bests = np.array(xs)[table[_picks(len(seeds))].mean(1).argmax(1)]
         low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
-    over_first, over_last = (interval(list(_chosen(table) - table[:, end])) for end in (0, -1))
+    over_first, over_last = (interval(_chosen(table) - table[:, end]) for end in (0, -1))
     return Optimum(float(xs[int(table.mean(0).argmax())]), float(low), float(high), over_first, over_last)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -27,6 +28,12 @@ def number(value: float | None, digits: int = 2, sign: str = "") -> str:
 def grouped(value: float | None, digits: int = 2) -> str:
     """As ``number``, but from 1000 on whole and with commas between thousands."""
     return f"{value:,.0f}" if value is not None and abs(value) >= 1000 else number(value, digits)
+
+
+def median_or_none(values: Iterable[float | None]) -> float | None:
+    """The median of the values that are known; None where none is."""
+    known = [v for v in values if v is not None]
+    return float(statistics.median(known)) if known else None
 
 
 def mean_or_none(values: Iterable[float | None]) -> float | None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
+import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,12 @@ from camera_node.synthetic import SCENES
 from camera_node.synthetic.source import WORLD_FPS
 from edge_server.experiments.common.arguments import OptionError, command_parser, parse_options
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
-from edge_server.experiments.scenes.multiview_still import score_views, synthetic_still
+from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
-from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
-from edge_server.fields import Field, View, checkpoint
+from edge_server.fields import Field, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import write_json
@@ -55,22 +53,6 @@ BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0
 _SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
 # Number of training views that are scored where no view is held out.
 _SCORED_OF_TRAINING = 8
-
-
-@dataclass(frozen=True)
-class FitRequest:
-    """What the command asks for. options: of the field, as in a scenario."""
-
-    data: Path
-    field: str = "ngp"
-    seconds: float = 60.0
-    holdout: str = "8"
-    scale: float = 1.0
-    frame: int = 0
-    background: str = "white"
-    seed: int = 0
-    format: str | None = None
-    options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -111,24 +93,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
-    request = FitRequest(
-        args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background, args.seed,
-        args.format,
-    )  # fmt: skip
-    out = args.out or Path("runs") / f"fit-{_data_name(args.data)}"
+    args.out = args.out or Path("runs") / f"fit-{_data_name(args.data)}"
     try:
-        request.options.update(parse_options(args.option))
-        run(request, out, args.lpips, args.resume)
+        run(args)
     except (DatasetError, OptionError) as error:
         print(f"edge-server fit: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def run(
-    request: FitRequest, out: Path, lpips_folder: Path | None = None, resume: bool = False
-) -> dict[str, Any]:
-    """Fit, measure and write everything to ``out``; returns the contents of report.json.
+def run(request: argparse.Namespace) -> dict[str, Any]:
+    """Fit, measure and write everything to ``request.out``; returns the contents of report.json. request: of
+    the command line.
 
     Raises DatasetError or OptionError for input that cannot be used.
     """
@@ -136,16 +112,17 @@ def run(
 
     if not 0.0 < request.seconds <= 1e6:
         raise OptionError(f"--seconds {request.seconds:g}: expected more than 0")
+    options = parse_options(request.option)
     data = _open(request)
-    transparent = any(v.image.shape[2] == 4 for v in data.training)
-    options = {"background": request.background, **request.options} if transparent else request.options
+    if any(v.image.shape[2] == 4 for v in data.training):
+        options = {"background": request.background, **options}
     try:
         model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
         raise OptionError(f"--field {request.field}: {error}") from None
-    out.mkdir(parents=True, exist_ok=True)
-    run_ = _Run(request, options, data, model, out, lpips_folder)
-    if resume:
+    request.out.mkdir(parents=True, exist_ok=True)
+    run_ = _Run(request, options, data, model)
+    if request.resume:
         run_.load()
     print(run_.headline(), flush=True)
     print(f"kernels ready after {model.warm_up():.1f} s", flush=True)
@@ -161,7 +138,7 @@ def _data_name(data: Path) -> str:
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 
-def _open(request: FitRequest) -> Recorded:
+def _open(request: argparse.Namespace) -> Recorded:
     if not _is_scene(request.data):
         return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
     t_s = request.frame / WORLD_FPS
@@ -170,14 +147,14 @@ def _open(request: FitRequest) -> Recorded:
 
 
 class _Run:
-    """A fit in progress: its files in ``out`` and its lines on the terminal."""
+    """A fit in progress: its files in ``request.out`` and its lines on the terminal."""
 
     def __init__(
-        self, request: FitRequest, options: dict[str, Any], data: Recorded, model: Field, out: Path,
-        lpips: Path | None,
-    ) -> None:  # fmt: skip
-        self.request, self.options, self.data, self.model, self.out = request, options, data, model, out
-        metric, self.lpips_missing = open_lpips(lpips)
+        self, request: argparse.Namespace, options: dict[str, Any], data: Recorded, model: Field
+    ) -> None:
+        self.request, self.options, self.data, self.model = request, options, data, model
+        self.out = request.out
+        metric, self.lpips_missing = open_lpips(request.lpips)
         self.background = BACKGROUNDS[request.background]
         self.scorer = Scorer(metric, background=self.background)
         self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
@@ -211,17 +188,11 @@ class _Run:
             )
 
     def go(self) -> dict[str, Any]:
-        marks = marks_s(self.request.seconds)
         try:
             done = fit_in_slices(
-                self.model,
-                self.data.training,
-                self._score,
-                marks,
-                self._scored,
-                self.spent_s,
-                self.spent_steps,
-            )
+                self.model, self.data.training, self._score, marks_s(self.request.seconds), self._scored,
+                self.spent_s, self.spent_steps,
+            )  # fmt: skip
         except KeyboardInterrupt:  # during an evaluation: the last one scored stands
             done = False
         if not done:
@@ -240,38 +211,19 @@ class _Run:
         self.processes[-1]["t_s"] = round(at.seconds, 3)
         outside = outside_cores(self.processes[-1])
         self.load_meter.row(0.0)  # the evaluation is not measured
-        self.rows.append(
-            {
-                "number": len(self.rows),
-                "t_s": at.seconds,
-                "psnr_db": score.psnr_db,
-                "psnr_moving_db": None,
-                "ssim": score.ssim,
-                "lpips": score.lpips,
-                "aaoi_ms": None,
-                "selected": len(self.data.training),
-                "update_ms": at.slice_s * 1e3,
-                "truth_gap_ms": None,
-                "steps": at.steps,
-                "loss": at.loss,
-                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
-            }
-        )
+        self.rows.append({
+            "number": len(self.rows), "t_s": at.seconds, "psnr_db": score.psnr_db, "psnr_moving_db": None,
+            "ssim": score.ssim, "lpips": score.lpips, "aaoi_ms": None, "selected": len(self.data.training),
+            "update_ms": at.slice_s * 1e3, "truth_gap_ms": None, "steps": at.steps, "loss": at.loss,
+            "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
+        })  # fmt: skip
         print(progress_line(at, outside, bool(self.data.held_out)), flush=True)
 
     def finish(self) -> dict[str, Any]:
         """Write checkpoint, images and report; returns report.json."""
         from edge_server.report import build_report  # draws with matplotlib
 
-        about = {
-            "field": self.request.field,
-            "options": self.options,
-            "scenario": self._name(),
-            "seed": self.request.seed,
-            "seconds": self.spent_s,
-            "steps": self.spent_steps,
-        }
-        checkpoint.save(self.out / "field", self.model.state(), about)
+        checkpoint.save(self.out / "field", self.model.state(), {**self._about(), "steps": self.spent_steps})
         _write_lines(self.out / "series.jsonl", self.rows)
         _write_lines(self.out / "processes.jsonl", self.processes)
         write_json(self.out / "edge.json", self._status())
@@ -283,35 +235,25 @@ class _Run:
         print(self.out / "report.html", flush=True)
         return report
 
-    def _status(self) -> dict[str, Any]:
-        found = [self._baseline(view) for view in self.data.held_out]
+    def _about(self) -> dict[str, Any]:
         return {
+            "field": self.request.field, "options": self.options, "seed": self.request.seed,
+            "scenario": f"fit {_data_name(self.request.data)}", "seconds": self.spent_s,
+        }  # fmt: skip
+
+    def _status(self) -> dict[str, Any]:
+        d = self.data
+        return {
+            **self._about(),
             "kind": "fit",
-            "scenario": self._name(),
-            "seed": self.request.seed,
-            "field": self.request.field,
-            "options": self.options,
             "data": {
-                "file": self.data.file.name,
-                "instant": self.data.instant,
-                "training": len(self.data.training),
-                "held_out": [v.camera for v in self.data.held_out],
-                "missing": self.data.missing,
+                "file": d.file.name, "instant": d.instant, "training": len(d.training),
+                "held_out": [v.camera for v in d.held_out], "missing": d.missing,
             },
-            "seconds": self.spent_s,
-            "baseline": {
-                name: float(np.mean([getattr(b, name) for b in found])) if found else None
-                for name in ("mean_colour_db", "nearest_view_db")
-            },
+            "baseline": mean_baselines(d.training, d.held_out, self.background),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
-        }
-
-    def _baseline(self, view: View) -> Baseline:
-        return baseline(self.data.training, view.image, view.camera_to_world, self.background)
-
-    def _name(self) -> str:
-        return f"fit {_data_name(self.request.data)}"
+        }  # fmt: skip
 
 
 def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ class MultiviewSequence:
     cameras: name -> (intrinsics, camera-to-world), in the order of training.
     held_out: those of them that are scored and not trained on.
     key: frame -> identity of its images; equal keys, equal images.
-    image: (camera, key) -> image.
+    image: (camera, key) -> image, the same object whenever it is asked for.
     before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
     bounds: held-out camera -> by how much a pixel differs at least where it moves.
     """
@@ -44,7 +45,6 @@ class MultiviewSequence:
     image: Callable[[str, int], Image]
     before: Callable[[str, int], list[Image]]
     bounds: Mapping[str, float]
-    _known: dict[tuple[str, int], Image] = field(default_factory=dict, repr=False, compare=False)
 
     def describe(self) -> str:
         lens = next(iter(self.cameras.values()))[0]
@@ -77,10 +77,8 @@ class MultiviewSequence:
 
     def _view(self, camera: str, frame: int) -> View:
         lens, pose = self.cameras[camera]
-        at = (camera, self.key(frame))
-        if at not in self._known:
-            self._known[at] = self.image(*at)
-        return View(camera, self._known[at], pose, lens, round(frame * self.period_ms * 1e6))
+        image = self.image(camera, self.key(frame))
+        return View(camera, image, pose, lens, round(frame * self.period_ms * 1e6))
 
 
 def synthetic_sequence(
@@ -90,25 +88,17 @@ def synthetic_sequence(
     camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size, **params})
     loop = max(1, round(scene.period_s * fps))  # a scene repeats after a whole number of frames
-    known: dict[tuple[str, int], list[Image]] = {}
 
-    def before(camera: str, frame: int) -> list[Image]:
+    @cache
+    def before(camera: str, key: int) -> list[Image]:
         # An analytic scene is known at any instant, before the first frame and between two frames too.
-        at = (camera, frame % loop)
-        if at not in known:
-            known[at] = [scene.render(camera, frame % loop / fps - lag / 1e3) for lag in LAGS_MS]
-        return known[at]
+        return [scene.render(camera, key / fps - lag / 1e3) for lag in LAGS_MS]
 
     return MultiviewSequence(
-        name=name,
-        period_ms=1e3 / fps,
-        cameras=scene.cameras,
-        held_out=(HELD_OUT,),
-        key=lambda frame: frame % loop,
-        image=lambda camera, key: scene.render(camera, key / fps),
-        before=before,
-        bounds={HELD_OUT: BOUND},
-    )
+        name, 1e3 / fps, scene.cameras, (HELD_OUT,), bounds={HELD_OUT: BOUND},
+        key=lambda frame: frame % loop, image=cache(lambda camera, key: scene.render(camera, key / fps)),
+        before=lambda camera, frame: before(camera, frame % loop),
+    )  # fmt: skip
 
 
 def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> MultiviewSequence:
@@ -139,24 +129,14 @@ def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> Multiview
         found = frames_at_lags([round(f * period_ms * 1e6) for f in frames], round(frame * period_ms * 1e6))
         return [read(camera, key(frames[i])) for i in found]
 
-    known: dict[tuple[str, int], Image] = {}
-
+    @cache
     def read(camera: str, at: int) -> Image:
-        if (camera, at) not in known:
-            known[camera, at] = records[camera][at].read()
-        return known[camera, at]
+        return records[camera][at].read()
 
     names = tuple(view.camera for view in held_out)
-    return MultiviewSequence(
-        name=file.resolve().parent.name,
-        period_ms=period_ms,
-        cameras=cameras,
-        held_out=names,
-        key=key,
-        image=read,
-        before=before,
-        bounds={c: noise_bound(read(c, k) for k in range(min(count, NOISE_FRAMES))) for c in names},
-    )
+    bounds = {c: noise_bound(read(c, k) for k in range(min(count, NOISE_FRAMES))) for c in names}
+    name = file.resolve().parent.name
+    return MultiviewSequence(name, period_ms, cameras, names, key, read, before, bounds)
 
 
 def _fps(times_s: Sequence[float | None]) -> float:

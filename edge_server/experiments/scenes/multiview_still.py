@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.scene import HELD_OUT, SCENES
+from camera_node.synthetic.scene import HELD_OUT, SCENES, Scene
 from edge_server.experiments.scenes.recorded import load_recorded
+from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Field, View
@@ -61,6 +64,26 @@ def smallest_angle_deg(still: MultiviewStill) -> float:
         np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
     ]
     return float(np.rad2deg(np.arccos(np.clip(forward[0] @ forward[1].T, -1.0, 1.0)).min()))
+
+
+def mean_baselines(
+    training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
+) -> dict[str, float | None]:
+    """PSNR of the baselines without a field, means over the held-out views, None without any. color: the
+    background."""
+    found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
+    names = ("mean_colour_db", "nearest_view_db")
+    return {name: statistics.fmean(getattr(b, name) for b in found) if found else None for name in names}
+
+
+def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
+    """Settings of a field of whoever knows where a scene is, what is behind it, and how near cameras come."""
+    low, high = scene.bounds
+    return {
+        "centre_m": [float(c) for c in 0.5 * (low + high)],
+        "radius_m": float(0.5 * (high - low).max()) + 0.01, "near_m": nearest_m, "contracted": False,
+        "background": "#" + "".join(f"{round(255 * c):02x}" for c in scene.world.background),
+    }  # fmt: skip
 
 
 def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:

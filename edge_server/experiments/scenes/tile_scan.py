@@ -16,6 +16,7 @@ from camera_node.synthetic.camera_rig import on_sphere
 from camera_node.synthetic.placement import PlacedParts, place_static
 from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
+from edge_server.experiments.scenes.multiview_still import known_options
 from edge_server.fields import View
 from edge_server.surface.metrics import STEEPEST_DEG, Truth, thin_points
 from freshfield.geometry import Pinhole, world_rays
@@ -39,16 +40,8 @@ class Scan:
 
     @property
     def options(self) -> dict[str, object]:
-        """Settings of a field that a robot cell knows: where the scene is and what is behind it."""
-        low, high = self.scene.bounds
-        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.world.background)
-        return {
-            "centre_m": [float(c) for c in 0.5 * (low + high)],
-            "radius_m": float(0.5 * (high - low).max()) + 0.01,
-            "near_m": 0.3 * DISTANCE_M,
-            "contracted": False,
-            "background": behind,
-        }
+        """Settings of a field that a robot cell knows."""
+        return known_options(self.scene, 0.3 * DISTANCE_M)
 
 
 def scan(size: int = 256, raster: tuple[tuple[float, float, float], ...] = RASTER_M) -> Scan:

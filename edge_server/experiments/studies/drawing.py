@@ -24,7 +24,7 @@ def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
 
     place: number of the curve in its panel, which chooses its colour and line style.
     """
-    xs, ys = list(curve), [interval(list(values.values())) for values in curve.values()]
+    xs, ys = list(curve), [interval(values.values()) for values in curve.values()]
     colour = CYCLE[place % len(CYCLE)]
     axes.plot(xs, [y.mean for y in ys], marker="o", markersize=3, color=colour, label=label,
               linestyle="-" if place < len(CYCLE) else "--")  # fmt: skip
@@ -52,7 +52,7 @@ def draw_metrics(
                 if curve:
                     draw_curve(at, curve, label, k)
             for k, (label, labels) in enumerate(levels):
-                level = interval(list(table.values(metric, **labels).values()))
+                level = interval(table.values(metric, **labels).values())
                 if level.count:
                     style = (":", "--", "-.")[k % 3]
                     at.axhline(level.mean, color=GREY, linestyle=style, linewidth=1.2, label=label)

@@ -12,7 +12,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import get_context
@@ -113,10 +113,8 @@ class Engine:
             running: dict[Future[list[Row]], list[str]] = {
                 pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)
             }
-            while running:
-                finished, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    yield running.pop(future), future.result()
+            for future in as_completed(running):
+                yield running[future], future.result()
         except BaseException:
             end_at_once(pool)
             raise

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from edge_server.experiments.common.statistics import interval, negated, paired
+from edge_server.experiments.common.statistics import Interval, all_of, interval, negated, paired
 from edge_server.experiments.studies.drawing import draw_images
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -103,24 +103,19 @@ class Metrics:
             print(f"  LPIPS is left out: {missing}")
             return verdicts
         order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
-        steps = [paired(dict(enumerate(b)), dict(enumerate(a))).above(0.0) for a, b in pairwise(order)]
-        rising = False if False in steps else None if None in steps else True
+        rising = all_of(_gap(b, a).above(0.0) for a, b in pairwise(order))
         text = ", ".join(f"{interval(values).mean:.3f}" for values in order)
-        verdicts.append(
-            Verdict(
-                "LPIPS",
-                "brightness shift < ghosting < blur (figure 3.6's table).",
-                text + ".",
-                by_bool(rising),
-            )
-        )
-        return verdicts
+        claim = "brightness shift < ghosting < blur (figure 3.6's table)."
+        return [*verdicts, Verdict("LPIPS", claim, text + ".", by_bool(rising))]
 
     def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
         mine = scores[case][metric]
-        others = [v[metric] for c, v in scores.items() if c != case]
-        gaps = [paired(dict(enumerate(other)), dict(enumerate(mine))) for other in others]
-        answers = [g.above(0.0) if lowest else negated(g.above(0.0)) for g in gaps]
-        answer = False if False in answers else None if None in answers else True
+        above = [_gap(v[metric], mine).above(0.0) for c, v in scores.items() if c != case]
+        answer = all_of(above if lowest else map(negated, above))
         text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
         return Verdict(metric.upper(), f"{claim} (figure 3.6's table).", text + ".", by_bool(answer))
+
+
+def _gap(a: list[float | None], b: list[float | None]) -> Interval:
+    """a - b, seed by seed."""
+    return paired(dict(enumerate(a)), dict(enumerate(b)))

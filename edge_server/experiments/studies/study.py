@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -166,7 +165,7 @@ def no_delay_gain(table: Table, metric: str, **labels: Any) -> str:
     _, lower, digits = METRICS[metric]
     gap = paired(use_all, limit) if lower else paired(limit, use_all)
     if metric == "aaoi_ms":
-        return f"with no delay it is {number(interval(list(limit.values())).mean, digits)}"
+        return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
     nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
     return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
 
@@ -200,16 +199,26 @@ def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
     return Trial(scene=scene, **{**sized, **more})
 
 
-def policy_points(base: Trial, labels: Row, x: str, values: Mapping[str, Sequence[float]]) -> list[Point]:
-    """A point for every value of every policy.
+def sweep(
+    request: StudyRequest, scene: str, seeds: Iterable[int], conditions: Sequence[tuple[Row, Row]], x: str,
+    values: Mapping[str, Sequence[float]], ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
+) -> list[Point]:  # fmt: skip
+    """For every seed: use-all and each value of each policy in every condition, and points without delay.
 
-    base: the trial, of which only the policy is replaced.
-    labels: of all the points.
+    conditions, ideals: (labels in the table, settings of the trial) of each.
     x: label that holds the value.
     values: policy -> its values.
     """
-    return [
-        Point({**labels, "policy": policy, x: value}, dataclasses.replace(base, policy=policy, value=value))
-        for policy, some in values.items()
-        for value in some
-    ]
+    found = []
+    for seed in seeds:
+        for labels, settings in conditions:
+            base, labels = trial_of(request, scene, seed=seed, **settings), {"scene": scene, **labels}
+            found.append(Point({**labels, "policy": "all"}, base))
+            found += [
+                Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
+                for policy, some in values.items() for value in some
+            ]  # fmt: skip
+        for labels, settings in ideals:
+            ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"}, **settings)
+            found.append(Point({"scene": scene, **labels, "policy": "no delay"}, ideal))
+    return found

@@ -183,7 +183,7 @@ def tables(rows: list[Row], counts: tuple[int, ...]) -> str:
     """PSNR against the number of views, and all metrics at ``JUDGED`` views, in Markdown."""
 
     def at(arm: str, metric: str, count: int) -> Interval:
-        return interval(list(curve(rows, arm, metric).get(count, {}).values()))
+        return interval(curve(rows, arm, metric).get(count, {}).values())
 
     by_count = [[arm, *(at(arm, "psnr_db", c).text(1) for c in counts)] for arm in ARMS]
     kinds = (("psnr_db", 2), ("ssim", 3), ("lpips", 3), ("path_m", 2))

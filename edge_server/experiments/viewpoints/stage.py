@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from camera_node.config import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
-from edge_server.experiments.scenes.multiview_still import WHITE, score_views
+from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color
@@ -110,13 +110,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
         reached = tests.within(_arm_reaches(scenario, source, tests)).reachable
         tests = Candidates(tests.poses[reached], lens, target, reached[reached])
     held_out = tuple(_render(scene, f"test{k:02d}", tests, k) for k in range(len(tests)))
-    low, high = scene.bounds
-    options = {
-        "centre_m": [float(c) for c in 0.5 * (low + high)],
-        "radius_m": float(0.5 * (high - low).max()) + 0.01, "near_m": 0.3 * radius_m, "contracted": False,
-        "background": "#" + "".join(f"{round(255 * c):02x}" for c in scene.world.background),
-    }  # fmt: skip
-    return Stage(scenario.name, candidates, held_out, options, scene=scene)
+    return Stage(scenario.name, candidates, held_out, known_options(scene, 0.3 * radius_m), scene=scene)
 
 
 def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidates) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from edge_server.scheduler import make_policy
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
-    from edge_server.embed.cache import EmbedderLike
+    from edge_server.embed import Embedder
 
 # Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
 _CACHE_BYTES = 512 * 2**20
@@ -39,7 +39,7 @@ def build_deployment(
     data: Path | None = None,
     on_published: Callable[[Publication], None] | None = None,
     truth: Truth | None = None,
-    embedder: EmbedderLike | None = None,
+    embedder: Embedder | None = None,
 ) -> VirtualDeployment:
     """``scenario`` in virtual time, from its seed.
 

@@ -12,16 +12,27 @@ RNG = np.random.default_rng(4)
 CHANNELS = 6
 
 
+def save(
+    path: Path, nodes, images: list, output: tuple[str, list | None], constants: dict[str, np.ndarray],
+    weights: tuple[onnx.TensorProto, ...] = (), opset: int = 17, meta: dict[str, str] | None = None,
+) -> Path:  # fmt: skip
+    """Write a graph from ``images`` (of this shape) to ``output`` (name and shape)."""
+    graph = helper.make_graph(
+        nodes, path.stem, [helper.make_tensor_value_info("images", TensorProto.FLOAT, images)],
+        [helper.make_tensor_value_info(output[0], TensorProto.FLOAT, output[1])],
+        [*(numpy_helper.from_array(value, name) for name, value in constants.items()), *weights],
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+    helper.set_model_props(model, meta or {})
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
 def detector(
-    path: Path,
-    size: int | None = 32,
-    batch: int | None = None,
-    gain: float = 1.0,
-    neck: bool = True,
-    extra: tuple[onnx.NodeProto, ...] = (),
-    weights: tuple[onnx.TensorProto, ...] = (),
+    path: Path, size: int | None = 32, batch: int | None = None, gain: float = 1.0, neck: bool = True,
+    extra: tuple[onnx.NodeProto, ...] = (), weights: tuple[onnx.TensorProto, ...] = (),
     meta: dict[str, str] | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Two convolutions, and where ``neck``, an enlargement that is joined with the finer map.
 
     size, batch: None makes them free. gain: factor on the second map. extra: nodes behind the backbone's
@@ -47,28 +58,12 @@ def detector(
             # A head that cannot run shows that it is not run.
             helper.make_node("Reshape", ["joined", "impossible"], ["output0"], name="/model.4/Reshape"),
         ]
-    graph = helper.make_graph(
-        nodes,
-        "detector",
-        [
-            helper.make_tensor_value_info(
-                "images", TensorProto.FLOAT, [batch or "n", 3, size or "h", size or "w"]
-            )
-        ],
-        [helper.make_tensor_value_info("output0" if neck else last, TensorProto.FLOAT, None)],
-        [
-            numpy_helper.from_array(first, "a"),
-            numpy_helper.from_array(second, "b"),
-            numpy_helper.from_array(np.float32(gain), "gain"),
-            numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), "scales"),
-            numpy_helper.from_array(np.array([7, 11, 13], np.int64), "impossible"),
-            *weights,
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(model, meta or {})
-    path.write_bytes(model.SerializeToString())
-    return path
+    constants = {
+        "a": first, "b": second, "gain": np.float32(gain), "scales": np.array([1, 1, 2, 2], np.float32),
+        "impossible": np.array([7, 11, 13], np.int64),
+    }  # fmt: skip
+    images, output = [batch or "n", 3, size or "h", size or "w"], "output0" if neck else last
+    return save(path, nodes, images, (output, None), constants, weights, meta=meta)
 
 
 def expected(images: np.ndarray) -> np.ndarray:

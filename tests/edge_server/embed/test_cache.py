@@ -32,13 +32,17 @@ class NanForTheFirst(Means):
         return rows
 
 
+def cached(**more) -> tuple[Means, EmbeddingCache]:
+    means = Means()
+    return means, EmbeddingCache(means, ViewDecoder().view, **more)
+
+
 def buffered(camera: str = "cam01", sequence: int = 0, **other) -> BufferedFrame:
     return BufferedFrame(frame(camera, sequence, **other), sequence, sequence)
 
 
 def test_a_frame_is_embedded_once_whoever_asks_again():
-    means = Means()
-    cache = EmbeddingCache(means, ViewDecoder().view)
+    means, cache = cached()
     items = [buffered("cam01"), buffered("cam02", 3)]
     first, ok = cache.of(items)
     again, _ = cache.of(list(reversed(items)))
@@ -50,22 +54,21 @@ def test_a_frame_is_embedded_once_whoever_asks_again():
 
 
 def test_another_session_with_the_same_number_is_another_frame():
-    means = Means()
-    cache = EmbeddingCache(means, ViewDecoder().view)
+    means, cache = cached()
     cache.of([buffered("cam01", 1)])
     cache.of([buffered("cam01", 1, session="s2")])
     assert means.asked == [1, 1]
 
 
 def test_the_same_frame_twice_in_one_question_is_embedded_once():
-    means = Means()
-    rows, ok = EmbeddingCache(means, ViewDecoder().view).of([buffered()] * 3)
+    means, cache = cached()
+    rows, ok = cache.of([buffered()] * 3)
     assert means.asked == [1] and ok.all() and (rows == rows[0]).all()
 
 
 def test_nothing_is_embedded_for_nothing():
-    means = Means()
-    rows, ok = EmbeddingCache(means, ViewDecoder().view).of([])
+    means, cache = cached()
+    rows, ok = cache.of([])
     assert rows.shape == (0, DIM) and ok.shape == (0,) and means.asked == []
 
 
@@ -89,8 +92,7 @@ def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
 
 
 def test_memory_is_bounded_and_the_latest_used_stay():
-    means = Means()
-    cache = EmbeddingCache(means, ViewDecoder().view, capacity=4)
+    means, cache = cached(capacity=4)
     kept = buffered("cam02")
     for k in range(20):
         cache.of([buffered("cam01", k), kept])
@@ -99,7 +101,7 @@ def test_memory_is_bounded_and_the_latest_used_stay():
 
 
 def test_a_decision_larger_than_the_cache_is_answered_whole():
-    cache = EmbeddingCache(Means(), ViewDecoder().view, capacity=2)
+    _, cache = cached(capacity=2)
     items = [buffered(f"cam{k:02d}") for k in range(9)]
     for _ in range(2):
         rows, ok = cache.of(items)
@@ -108,7 +110,7 @@ def test_a_decision_larger_than_the_cache_is_answered_whole():
 
 
 def test_a_caller_that_writes_into_its_rows_does_not_change_the_cache():
-    cache = EmbeddingCache(Means(), ViewDecoder().view)
+    _, cache = cached()
     rows, _ = cache.of([buffered()])
     rows[:] = np.nan
     again, ok = cache.of([buffered()])

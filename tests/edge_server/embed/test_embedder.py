@@ -38,10 +38,8 @@ def test_the_backbones_end_is_what_the_neck_enlarges_and_the_head_is_not_run(tmp
 @pytest.mark.parametrize("batch", [None, 1, 4])
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_fixed_and_free_batches_give_one_result(tmp_path, batch, count):
-    free, fixed = (
-        embedder(detector(tmp_path / "a.onnx")),
-        embedder(detector(tmp_path / "b.onnx", batch=batch)),
-    )
+    free = embedder(detector(tmp_path / "a.onnx"))
+    fixed = embedder(detector(tmp_path / "b.onnx", batch=batch))
     images = [image(20 + k, 40) for k in range(count)]
     rows = fixed.embed(images)
     assert rows.shape == (count, CHANNELS) and rows.dtype == np.float32
@@ -87,12 +85,8 @@ def test_the_size_is_the_files_or_the_scenarios_or_the_exporters(tmp_path):
 def test_names_tell_embeddings_apart(tmp_path):
     path = detector(tmp_path / "d.onnx", size=None)
     other = detector(tmp_path / "e.onnx", size=None, gain=2.0)
-    made = [
-        embedder(path, size=64),
-        embedder(path, size=96),
-        embedder(path, size=64, dim=4),
-        embedder(other, size=64),
-    ]
+    made = [embedder(path, size=64), embedder(path, size=96), embedder(path, size=64, dim=4),
+            embedder(other, size=64)]  # fmt: skip
     assert len({m.name for m in made}) == 4
     assert embedder(path, size=64).name == made[0].name
 
@@ -133,18 +127,14 @@ def test_the_real_yolo11n_works_unchanged():
         embedder(path, tap="/model.9/cv2/act/Mul_output_0_quantized")
 
 
-@pytest.mark.parametrize("file", ["detector_fp32.onnx", "detector_int8.onnx"])
+@pytest.mark.parametrize("file", [MODELS / "detector_fp32.onnx", MODELS / "detector_int8.onnx", "default"])
 def test_the_shipped_detectors_go_the_same_way(file):
-    made = embedder(MODELS / file, dim=32)
+    made = embedder(file, dim=32)
     assert made.backbone.tap.startswith("/model.7/") and made.backbone.projection is not None
     rows = made.embed([image(128, 128), image(480, 640), image(33, 17)])
     assert np.isfinite(rows).all() and np.ptp(rows, axis=0).min() > 0
     with pytest.raises(EmbeddingError, match="dim: "):
-        embedder(MODELS / file, dim=4096)
-
-
-def test_the_default_is_shipped():
-    assert make_embedder(EmbeddingConfig()).embed([image(64, 64)]).shape == (1, 32)
+        embedder(file, dim=4096)
 
 
 def test_a_provider_that_is_not_there_is_named_with_those_that_are(tmp_path):
@@ -171,10 +161,8 @@ def test_loading_needs_no_torch_and_no_camera_code(tmp_path):
 
 
 def test_a_library_that_is_missing_is_named_with_what_installs_it(monkeypatch):
-    for name in [
-        m for m in sys.modules if m.startswith(("edge_server.embed.backbone", "edge_server.embed.embedder"))
-    ]:
-        monkeypatch.delitem(sys.modules, name)
+    for name in ("backbone", "embedder"):
+        monkeypatch.delitem(sys.modules, f"edge_server.embed.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(EmbeddingError, match=r"embedding needs onnx, .*freshfield\[embed\]"):
         make_embedder(EmbeddingConfig())

@@ -42,9 +42,8 @@ def write_recording(folder: Path, cameras: int = 5, instants: int = 3, size: int
         for k in range(instants):
             name = f"images/{camera}/{k:04d}.png"
             _write(folder / name, scene.render(camera, k / 10.0))
-            frames.append(
-                {"file_path": name, "transform_matrix": _opengl(pose), "camera": camera, "time": k / 10.0}
-            )
+            about = {"camera": camera, "time": k / 10.0}
+            frames.append({"file_path": name, "transform_matrix": _opengl(pose), **about})
     return _save(folder / "transforms.json", scene.cameras["cam00"][0], frames)
 
 
@@ -60,13 +59,7 @@ def _write(path: Path, image: Any) -> None:
 
 
 def _save(path: Path, lens: Pinhole, frames: list[dict[str, Any]]) -> Path:
-    facts = {
-        "fl_x": lens.fx,
-        "fl_y": lens.fy,
-        "cx": lens.cx,
-        "cy": lens.cy,
-        "w": lens.width,
-        "h": lens.height,
-    }
+    facts = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width,
+             "h": lens.height}  # fmt: skip
     path.write_text(json.dumps({**facts, "frames": frames}))
     return path

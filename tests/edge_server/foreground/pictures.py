@@ -35,8 +35,9 @@ def box_of(truth: NDArray[np.bool_], margin: int = 3) -> tuple[float, float, flo
 def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed: bool = False) -> Path:
     """An ONNX with a YOLO head's output: one cell a pixel of an 8 x 8 grid, of which those on orange score,
     with boxes of 40 pixels around them."""
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import helper
+
+    from tests.edge_server.embed.graphs import save
 
     grid = 8
     step = side // grid
@@ -58,53 +59,33 @@ def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed:
     ]
     spread = np.zeros((1, kinds, 1), np.float32)
     spread[0, 1] = 1.0
-    constants = {
-        "weight": weight,
-        "flat": np.array([1, 1, grid * grid], np.int64),
-        "spread": spread,
-        "boxes": boxes[None].astype(np.float32),
-    }
+    constants = {"weight": weight, "flat": np.array([1, 1, grid * grid], np.int64), "spread": spread,
+                 "boxes": boxes[None].astype(np.float32)}  # fmt: skip
     shape = [1, grid * grid, 4 + kinds] if transposed else [1, 4 + kinds, grid * grid]
-    graph = helper.make_graph(
-        nodes,
-        "orange",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, side, side])],
-        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, shape)],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     names = {k: name for k, name in enumerate(["apple", "orange", "pear"][:kinds])}
-    helper.set_model_props(model, {"names": str(names)})
-    onnx.save(model, str(path))
-    return path
+    meta = {"names": str(names)}
+    return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta)
 
 
 def save_orange_segmenter(path: Path, logits: bool = False) -> Path:
     """An ONNX that maps red minus blue to a share of foreground, or to logits."""
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import helper
+
+    from tests.edge_server.embed.graphs import save
 
     gain = 20.0 if logits else 1.0
     weight = (gain * np.array([1.0, 0.0, -1.0], np.float32)).reshape(1, 3, 1, 1)
     nodes = [helper.make_node("Conv", ["images", "weight"], ["map" if logits else "raw"])]
     if not logits:
         nodes.append(helper.make_node("Sigmoid", ["raw"], ["map"]))
-    graph = helper.make_graph(
-        nodes,
-        "segment",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])],
-        [helper.make_tensor_value_info("map", TensorProto.FLOAT, [1, 1, 64, 64])],
-        [numpy_helper.from_array(weight, "weight")],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    onnx.save(model, str(path))
-    return path
+    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), {"weight": weight}, opset=13)
 
 
 def save_endless_loop(path: Path) -> Path:
     """A segmentation ONNX that goes round 2^62 times before it answers."""
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import TensorProto, helper
+
+    from tests.edge_server.embed.graphs import save
 
     value, image, truth = helper.make_tensor_value_info, [1, 3, 64, 64], TensorProto.BOOL
     body = helper.make_graph(
@@ -115,16 +96,6 @@ def save_endless_loop(path: Path) -> Path:
     )
     weight = np.ones((1, 3, 1, 1), np.float32)
     constants = {"rounds": np.array(2**62), "true": np.array(True), "weight": weight}
-    graph = helper.make_graph(
-        [
-            helper.make_node("Loop", ["rounds", "true", "images"], ["turned"], body=body),
-            helper.make_node("Conv", ["turned", "weight"], ["map"]),
-        ],
-        "endless",
-        [value("images", TensorProto.FLOAT, image)],
-        [value("map", TensorProto.FLOAT, [1, 1, 64, 64])],
-        [numpy_helper.from_array(v, name) for name, v in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    onnx.save(model, str(path))
-    return path
+    nodes = [helper.make_node("Loop", ["rounds", "true", "images"], ["turned"], body=body),
+             helper.make_node("Conv", ["turned", "weight"], ["map"])]  # fmt: skip
+    return save(path, nodes, image, ("map", [1, 1, 64, 64]), constants, opset=13)

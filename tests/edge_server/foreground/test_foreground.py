@@ -86,13 +86,11 @@ def test_what_is_cut_out_within_the_box_supervises_as_much_as_it_is_trusted():
 def test_the_loop_fits_to_cut_views(tmp_path):
     """From the scenario to what the field is given, in virtual time."""
     data = {
-        "name": "cut",
-        "seed": 3,
-        "cameras": {"count": 3, "held_out": ["cam00"]},
+        "name": "cut", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]},
         "source": {"kind": "world", "scene": "tile", "width": 32, "height": 32, "fps": 5},
         "channel": {"preset": "ch5"},
         "edge": {"field": "voxel", "foreground": {"box": [0.25, 0.25, 0.75, 0.75], "segment": "box"}},
-    }
+    }  # fmt: skip
     deployment = build_deployment(
         parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None)
     )

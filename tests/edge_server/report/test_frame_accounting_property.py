@@ -9,7 +9,7 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.report.frame_accounting import ENDS, account_frames
+from edge_server.report.frame_accounting import ENDS, LINK_ENDS, account_frames
 from tests.edge_server.report.ledgers import write
 
 EVENTS = {
@@ -61,17 +61,15 @@ def ledger_lines(fate):
     """The lines (role, event, detail) that processes write about a frame with this fate, in order of time,
     where all of them end in order."""
     node = [("node", "captured", "")]
-    if fate == "waiting":
-        return [*node, ("node", "waiting", "")]
-    if fate == "replaced":
-        return [*node, ("node", "replaced", "")]
+    if fate in ("waiting", "replaced"):
+        return [*node, ("node", fate, "")]
     lines = [*node, ("node", "sent", "")]
     if fate == "sent":
         return [*lines, ("node", "broken", "")]
     lines.append(("emulator", "received", ""))
     if fate == "received":
         return [*lines, ("emulator", "in_flight", "")]
-    if fate in ("skipped", "dropped_busy", "superseded", "lost"):
+    if fate in LINK_ENDS:
         return [*lines, ("emulator", fate, "")]
     if fate == "doubled":
         lines.append(("emulator", "duplicated", ""))
@@ -116,11 +114,7 @@ def test_counts_are_true_even_if_every_process_is_killed(fates, data):
         if not beyond and ("node", "sent") not in wrote:
             truth["replaced" if ("node", "replaced") in wrote else "waiting"] += 1
             continue
-        ends = [
-            e
-            for e in beyond
-            if e in ("skipped", "dropped_busy", "superseded", "lost", "delivered", "rejected", "in_flight")
-        ]
+        ends = [e for e in beyond if e in (*LINK_ENDS, "delivered", "rejected")]
         copies = max(1 + beyond.count("duplicated"), len(ends))
         truth["sent"] += 1
         truth["duplicated"] += copies - 1

@@ -100,23 +100,17 @@ def test_updates_that_had_no_time_to_learn_are_counted():
     assert counted["without_step"] == 40 and counted["refused"] == {"cam01": 3}
 
 
-def test_the_report_shows_frames_that_were_left_out(tmp_path):
+def test_the_report_shows_frames_that_were_left_out_and_updates_that_made_no_step(tmp_path):
     write_run(tmp_path)
-    file = tmp_path / "edge.json"
-    edge = json.loads(file.read_text())
-    file.write_text(json.dumps(edge | {"updates": edge["updates"] | {"shed": 17}}))
-    assert build_report(tmp_path)["updates"]["shed"] == 17
-    assert "left out for lack of time: 17" in (tmp_path / "report.html").read_text()
-
-
-def test_the_report_shows_updates_that_made_no_step(tmp_path):
-    write_run(tmp_path)
+    edge = json.loads((tmp_path / "edge.json").read_text())
+    (tmp_path / "edge.json").write_text(json.dumps(edge | {"updates": edge["updates"] | {"shed": 17}}))
     file = tmp_path / "series.jsonl"
     lines = file.read_text().splitlines()
     idle = [json.dumps(json.loads(line) | {"steps": 0}) for line in lines[:3]]
     file.write_text("\n".join([*idle, *lines[3:]]) + "\n")
-    assert build_report(tmp_path)["updates"]["without_step"] == 3
-    assert "without time for a step: 3" in (tmp_path / "report.html").read_text()
+    found, page = build_report(tmp_path)["updates"], (tmp_path / "report.html").read_text()
+    assert (found["shed"], found["without_step"]) == (17, 3)
+    assert "left out for lack of time: 17" in page and "without time for a step: 3" in page
 
 
 def test_every_figure_is_drawn_and_inside_the_page(run):

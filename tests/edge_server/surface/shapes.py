@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.fuse import CLOSE, FAR, FREE
-from edge_server.surface.volume import Grid
+from edge_server.surface.kernels.fuse import CLOSE, FAR, FREE, SIDE
+from edge_server.surface.volume import Grid, Volume
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 RADIUS_M = 0.1
@@ -43,6 +43,14 @@ def ball_maps(count: int = 20, camera: Pinhole = LENS) -> list[DepthMap]:
         color = np.where(up[..., None], np.array([200, 20, 20]), 90).astype(np.uint8)
         maps.append(depth_map(depth, color, pose, camera))
     return maps
+
+
+def voxel_points(volume: Volume) -> NDArray:
+    """World places (blocks, voxels of a block, 3) of a volume's voxels."""
+    cell = np.arange(SIDE**3)
+    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
+    grid = volume.grid
+    return np.array(grid.lower) + grid.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
 
 
 def plain_fuse(grid: Grid, maps: list[DepthMap], points: NDArray) -> tuple[NDArray, NDArray]:

@@ -41,13 +41,10 @@ def test_half_a_sheet_is_accurate_and_half_complete():
 
 
 def test_only_what_two_cameras_see_is_asked_for():
-    with pytest.raises(SurfaceError, match="nothing to compare"):
-        compare(sheet(0.0), truth(cameras=1))
-    with pytest.raises(SurfaceError, match="nothing to compare"):
-        compare(
-            Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)),
-            truth(),
-        )
+    none = Mesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int32, np.uint8)))
+    for mesh, seen in ((sheet(0.0), truth(cameras=1)), (none, truth())):
+        with pytest.raises(SurfaceError, match="nothing to compare"):
+            compare(mesh, seen)
 
 
 def test_points_are_spread_evenly_and_repeatably():
@@ -61,11 +58,8 @@ def test_thinning_leaves_one_a_cell():
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (5000, 3))
     kept = points[thin_points(points, 0.25)]
-    assert (
-        len(np.unique(np.floor(kept / 0.25), axis=0))
-        == len(kept)
-        == len(np.unique(np.floor(points / 0.25), axis=0))
-    )
+    cells, of_kept = (len(np.unique(np.floor(some / 0.25), axis=0)) for some in (points, kept))
+    assert of_kept == len(kept) == cells
 
 
 def test_depth_error_tells_bias_from_spread():
@@ -84,8 +78,7 @@ def test_the_truth_is_on_what_the_cameras_see():
     # What a camera's own rays meet is part of it.
     view = close.views[3]
     depth, pose = exact_depth(close.scene, view), view.camera_to_world
-    points = depth_map(
-        depth.astype(np.float32), view.image, pose, view.intrinsics, steepest_deg=70.0
-    ).points()
+    shown = depth_map(depth.astype(np.float32), view.image, pose, view.intrinsics, steepest_deg=70.0)
+    points = shown.points()
     away, _ = cKDTree(found.points).query(points)
     assert len(points) > 100 and np.percentile(away, 98) < 0.004

@@ -68,9 +68,8 @@ def test_agreement_is_the_correlation_of_two_patches():
     patch = rng.uniform(0, 255, (5, 5)).astype(np.float32)
     u, v, ux, vx, uy, vy = 20.3, 14.8, 1.1, 0.2, -0.3, 0.9
     j, i = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
-    other = map_coordinates(
-        grey.astype(float), [v - 0.5 + i * vx + j * vy, u - 0.5 + i * ux + j * uy], order=1
-    )
+    at = [v - 0.5 + i * vx + j * vy, u - 0.5 + i * ux + j * uy]
+    other = map_coordinates(grey.astype(float), at, order=1)
     centred = (patch - patch.mean()).ravel()
     found = correlation(centred, np.float32(centred @ centred), others, 0, u, v, ux, vx, uy, vy)
     assert found == pytest.approx(np.corrcoef(patch.ravel(), other.ravel())[0, 1], abs=1e-4)

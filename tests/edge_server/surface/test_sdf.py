@@ -11,17 +11,14 @@ from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_small_components
 from edge_server.surface.sdf import SdfSettings, fit_sdf, gradient_norm, sample_grid
 from edge_server.surface.volume import Grid
-from tests.edge_server.surface.shapes import RADIUS_M, ball_maps
+from tests.edge_server.surface.shapes import RADIUS_M, ball_maps, voxel_points
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 SHORT = SdfSettings(levels=2, steps=60, points=4000)
 
 
 def exact(volume) -> np.ndarray:
-    cell = np.arange(SIDE**3)
-    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
-    points = np.array(GRID.lower) + GRID.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
-    return np.linalg.norm(points, axis=-1) - RADIUS_M
+    return np.linalg.norm(voxel_points(volume), axis=-1) - RADIUS_M
 
 
 def test_the_distances_are_those_of_the_ball():

@@ -9,7 +9,14 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.volume import BLOCK_BYTES, Grid, bounding_box, fuse_maps
-from tests.edge_server.surface.shapes import DISTORTED_LENS, LENS, RADIUS_M, ball_maps, plain_fuse
+from tests.edge_server.surface.shapes import (
+    DISTORTED_LENS,
+    LENS,
+    RADIUS_M,
+    ball_maps,
+    plain_fuse,
+    voxel_points,
+)
 
 BOX = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 
@@ -20,9 +27,7 @@ def test_the_kernel_fuses_as_the_equations_say(camera):
     volume = fuse_maps(BOX, maps)
     rng = np.random.default_rng(0)
     number, cell = rng.integers(0, len(volume.blocks.place), 400), rng.integers(0, SIDE**3, 400)
-    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
-    points = np.array(BOX.lower) + BOX.voxel_m * (SIDE * volume.blocks.place[number] + inside)
-    distance, weight = plain_fuse(BOX, maps, points)
+    distance, weight = plain_fuse(BOX, maps, voxel_points(volume)[number, cell])
     assert (weight > 0).mean() > 0.3
     np.testing.assert_allclose(volume.blocks.weight[number, cell], weight, atol=2e-5)
     np.testing.assert_allclose(volume.blocks.distance[number, cell], distance, atol=1e-6)
@@ -39,10 +44,7 @@ def test_blocks_hold_every_voxel_near_the_surface():
 
 def test_distances_are_those_of_the_ball():
     volume = fuse_maps(BOX, ball_maps())
-    cell = np.arange(SIDE**3)
-    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
-    points = np.array(BOX.lower) + BOX.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
-    exact = np.linalg.norm(points, axis=-1) - RADIUS_M
+    exact = np.linalg.norm(voxel_points(volume), axis=-1) - RADIUS_M
     near = (np.abs(exact) < 0.01) & (volume.blocks.weight > 0.5)
     assert near.sum() > 1000
     assert np.abs(volume.blocks.distance - exact)[near].mean() < 0.0012
@@ -58,16 +60,16 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_too_fine_a_grid_says_what_would_do():
     maps = ball_maps(4)
-    with pytest.raises(
-        SurfaceError, match=r"2 mm voxels need \d+ MB, more than the 5 allowed: take [\d.]+ mm"
-    ):
+    needs = r"2 mm voxels need \d+ MB, more than the 5 allowed: take [\d.]+ mm"
+    with pytest.raises(SurfaceError, match=needs):
         fuse_maps(Grid((-0.13,) * 3, (0.13,) * 3, 0.002, 0.008), maps, memory_mb=5)
-    with pytest.raises(SurfaceError, match="voxels are too many"):
-        Grid((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004)
-    with pytest.raises(SurfaceError, match="at least one voxel"):
-        Grid((0, 0, 0), (1, 1, 1), 0.1, 0.05)
-    with pytest.raises(SurfaceError, match="lower corner"):
-        Grid((0, 0, 1), (1, 1, 1), 0.1, 0.4)
+    for grid, said in (
+        (((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004), "voxels are too many"),
+        (((0, 0, 0), (1, 1, 1), 0.1, 0.05), "at least one voxel"),
+        (((0, 0, 1), (1, 1, 1), 0.1, 0.4), "lower corner"),
+    ):
+        with pytest.raises(SurfaceError, match=said):
+            Grid(*grid)
     assert BLOCK_BYTES == SIDE**3 * 24
 
 

@@ -67,13 +67,9 @@ def test_the_number_of_threads_changes_no_bit(close):
 def test_what_pictures_know_stays_and_the_rest_is_filled():
     (start,) = ball_maps(1)
     rows = np.arange(64)[:, None] * np.ones((1, 64), np.int64)
-    sharp = replace(
-        start,
-        depth=np.where(rows < 32, np.where(start.seen, start.depth - 0.01, start.depth), 0).astype(
-            np.float32
-        ),
-        trust=np.where(rows < 32, start.trust, 0).astype(np.float32),
-    )
+    nearer = np.where(start.seen, start.depth - 0.01, start.depth)
+    depth, trust = (np.where(rows < 32, x, 0).astype(np.float32) for x in (nearer, start.trust))
+    sharp = replace(start, depth=depth, trust=trust)
     (found,) = fill_depth([sharp], [start])
     known = start.seen & (rows < 32)
     np.testing.assert_array_equal(found.depth[known], sharp.depth[known])

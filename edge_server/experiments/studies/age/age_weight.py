@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from edge_server.experiments.common.statistics import Interval, move_of_optimum, optimum
@@ -15,9 +17,8 @@ from edge_server.experiments.studies.study import (
     Verdict,
     by_bool,
     no_delay_gain,
-    policy_points,
     scenes_of,
-    trial_of,
+    sweep,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
@@ -27,6 +28,8 @@ WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
 QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
 # Ages that count: those of all cameras at the edge, as (5.8) is printed, or of the used views, as (6.35).
 SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
+PIXELS = (("psnr_moving_db", "where it moves"), ("psnr_db", "whole image"))
+POLICIES = ("threshold", "wait")
 CLAIM = "a larger lambda buys freshness: the best omega falls (5.8)."
 
 
@@ -35,22 +38,14 @@ class Weighing:
     title = "The weight of timeliness in the objective (equation 5.8)"
 
     def points(self, request: StudyRequest) -> list[Point]:
-        found = []
-        for scene in scenes_of(request, ("room",)):
-            for seed in request.repeats(10, 40):
-                # The thresholds are the trials of ``mat`` and known where that study has been run.
-                base = trial_of(
-                    request, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"}
-                )
-                found.append(Point({"scene": scene, "policy": "all"}, base))
-                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
-                found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
-                values = {
-                    "threshold": QUICK_GAMMAS if request.quick else GAMMAS,
-                    "wait": QUICK_WAITS if request.quick else WAITS,
-                }
-                found += policy_points(base, {"scene": scene}, "omega_ms", values)
-        return found
+        # The thresholds are the trials of ``mat`` and known where that study has been run.
+        settings = {"channel": {"preset": "ch5", "discipline": "drop-new"}}
+        omegas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS,
+                  "wait": QUICK_WAITS if request.quick else WAITS}  # fmt: skip
+        return [
+            point for scene in scenes_of(request, ("room",))
+            for point in sweep(request, scene, request.repeats(10, 40), [({}, settings)], "omega_ms", omegas)
+        ]  # fmt: skip
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         for row in table.rows:
@@ -58,25 +53,20 @@ class Weighing:
         verdicts = []
         for scene in table.distinct("scene"):
             best: dict[tuple[str, str], list[float]] = {}
-            for metric, where in (("psnr_moving_db", "where it moves"), ("psnr_db", "whole image")):
-                for policy in ("threshold", "wait"):
-                    for label, column in SUMS.items():
-                        curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
-                        if not all(curves.values()):
-                            continue
-                        found = [optimum(curve, True).x for curve in curves.values()]
-                        best[f"{policy}, {where}", label] = found
-                        _, move = move_of_optimum(curves, lower_is_better=True)
-                        text = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
-                        verdicts.append(
-                            Verdict(
-                                f"{scene}, {policy}, {where}, ages of {label}",
-                                CLAIM,
-                                f"best omega in ms by lambda {text}; it moves by {move} ms; "
-                                f"{no_delay_gain(table, metric, scene=scene)}.",
-                                by_bool(_falls(move)),
-                            )
-                        )
+            for (metric, where), policy, (label, column) in product(PIXELS, POLICIES, SUMS.items()):
+                curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
+                if not all(curves.values()):
+                    continue
+                found = [optimum(curve, True).x for curve in curves.values()]
+                best[f"{policy}, {where}", label] = found
+                _, move = move_of_optimum(curves, lower_is_better=True)
+                by_lambda = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
+                text = (
+                    f"best omega in ms by lambda {by_lambda}; it moves by {move} ms; "
+                    f"{no_delay_gain(table, metric, scene=scene)}."
+                )
+                about = f"{scene}, {policy}, {where}, ages of {label}"
+                verdicts.append(Verdict(about, CLAIM, text, by_bool(_falls(move))))
             with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
                 at = axes[0, 0]
                 for k, ((policy, label), xs) in enumerate(best.items()):
@@ -85,9 +75,8 @@ class Weighing:
                         linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
                     )  # fmt: skip
                 at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
-                label_lines(
-                    at, "best omega (ms)", "lambda (per 0.01 of squared error and second of age)", scene
-                )
+                per = "lambda (per 0.01 of squared error and second of age)"
+                label_lines(at, "best omega (ms)", per, scene)
         return verdicts
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
@@ -16,6 +14,7 @@ from edge_server.experiments.studies.study import (
     no_delay_gain,
     number,
     scenes_of,
+    sweep,
     trial_of,
 )
 
@@ -36,16 +35,12 @@ class Images:
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
         for scene in scenes_of(request, tuple(SCENES)):
-            field = SCENES[scene][0] if scene in SCENES and not request.quick else "splat"
-            for seed in request.repeats(6, 40):
-                base = trial_of(request, scene, seed=seed, channel={"preset": "ch5"}, field=field)
-                cameras = len(base.scenario().training)
-                found.append(Point({"scene": scene, "field": field, "policy": "all"}, base))
-                ideal = dataclasses.replace(base, channel={"preset": "ideal"})
-                found.append(Point({"scene": scene, "field": field, "policy": "no delay"}, ideal))
-                for count in [c for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]:
-                    trial = dataclasses.replace(base, policy="freshest-k", value=float(count))
-                    found.append(Point({"scene": scene, "field": field, "images": count}, trial))
+            of = {"field": SCENES[scene][0] if scene in SCENES and not request.quick else "splat"}
+            settings = {"channel": {"preset": "ch5"}, **of}
+            cameras = len(trial_of(request, scene, seed=0, **settings).scenario().training)
+            counts = [float(c) for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]
+            seeds, freshest = request.repeats(6, 40), {"freshest-k": counts}
+            found += sweep(request, scene, seeds, [(of, settings)], "images", freshest, [(of, of)])
         return found
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
@@ -57,27 +52,19 @@ class Images:
                 request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
                 [(field, {"scene": scene})], f"{scene}, cameras {way}",
             )  # fmt: skip
-            for metric, rises in (
-                ("lpips", False),
-                ("psnr_db", True),
-                ("psnr_moving_db", True),
-                ("aaoi_ms", True),
-            ):
+            for metric in ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms"):
                 curve = table.curve("images", metric, scene=scene)
                 if not curve:
                     continue
                 name, _, digits = METRICS[metric]
-                xs = list(curve)
+                xs, rises = list(curve), metric != "lpips"
                 change = paired(curve[xs[-1]], curve[xs[0]])
-                first, last = (interval(list(curve[x].values())).mean for x in (xs[0], xs[-1]))
-                verdicts.append(
-                    Verdict(
-                        f"{scene}, {name}",
-                        f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
-                        f"from {xs[0]:g} to {xs[-1]:g} images {number(first, digits)} "
-                        f"to {number(last, digits)}, "
-                        f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}.",
-                        by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
-                    )
+                first, last = (number(interval(curve[x].values()).mean, digits) for x in (xs[0], xs[-1]))
+                claim = f"more images: {'higher' if rises else 'lower'} (thesis: {thesis})."
+                text = (
+                    f"from {xs[0]:g} to {xs[-1]:g} images {first} to {last}, "
+                    f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}."
                 )
+                answer = change.above(0.0) if rises else negated(change.above(0.0))
+                verdicts.append(Verdict(f"{scene}, {name}", claim, text, by_bool(answer)))
         return verdicts

@@ -16,8 +16,8 @@ from edge_server.experiments.studies.study import (
     Verdict,
     by_bool,
     no_delay_gain,
-    policy_points,
     scenes_of,
+    sweep,
     trial_of,
 )
 
@@ -34,19 +34,15 @@ class Mat:
     title = "Fidelity against the maximum age of used views (figures 5.6, 5.7)"
 
     def points(self, request: StudyRequest) -> list[Point]:
-        gammas = QUICK_GAMMAS if request.quick else GAMMAS
         found = []
         for scene in scenes_of(request, ("room", "kitchen", "people")):
             ours = scene not in RECORDED
-            for seed in request.repeats(10 if ours else 4, 40):
-                for discipline in DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]:
-                    channel = {"preset": "ch5", "discipline": discipline}
-                    base = trial_of(request, scene, seed=seed, channel=channel)
-                    labels = {"scene": scene, "discipline": discipline}
-                    found.append(Point({**labels, "policy": "all", "gamma_ms": None}, base))
-                    found += policy_points(base, labels, "gamma_ms", {"threshold": gammas})
-                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
-                found.append(Point({"scene": scene, "discipline": "-", "policy": "no delay"}, ideal))
+            disciplines = DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]
+            channels = [({"discipline": d}, {"channel": {"preset": "ch5", "discipline": d}})
+                        for d in disciplines]  # fmt: skip
+            gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
+            seeds = request.repeats(10 if ours else 4, 40)
+            found += sweep(request, scene, seeds, channels, "gamma_ms", gammas, [({"discipline": "-"}, {})])
         return found
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
@@ -74,17 +70,14 @@ class Mat:
             name, lower, digits = METRICS[metric]
             best = optimum(curve, lower)
             counts = table.curve("gamma_ms", "views", policy="threshold", **labels)
-            views = interval(list(counts[best.x].values()))
-            found.append(
-                Verdict(
-                    f"{scene}, {discipline}, {name}",
-                    CLAIM,
-                    f"best at {best.x:g} ms{best.spread} with {views.mean:.1f} views; "
-                    f"{best.over_last.text(digits)} better than the largest threshold; "
-                    f"{no_delay_gain(table, metric, **labels)}.",
-                    by_bool(best.interior(LEAST[metric])),
-                )
+            views = interval(counts[best.x].values()).mean
+            text = (
+                f"best at {best.x:g} ms{best.spread} with {views:.1f} views; "
+                f"{best.over_last.text(digits)} better than the largest threshold; "
+                f"{no_delay_gain(table, metric, **labels)}."
             )
+            about = f"{scene}, {discipline}, {name}"
+            found.append(Verdict(about, CLAIM, text, by_bool(best.interior(LEAST[metric]))))
         return found
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:

@@ -7,15 +7,15 @@ from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
+    Curve,
     Point,
     StudyRequest,
     Table,
     Verdict,
     by_bool,
     no_delay_gain,
-    policy_points,
     scenes_of,
-    trial_of,
+    sweep,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
@@ -28,48 +28,46 @@ CLAIM = "the best threshold grows with the mean delay (5.8)."
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 
 
+def _curve(table: Table, scene: str, metric: str, delay: float) -> Curve:
+    return table.curve("gamma_ms", metric, scene=scene, delay_ms=delay, policy="threshold")
+
+
 class MatDelay:
     name = "mat-delay"
     title = "The best maximum age against the mean delay (figure 5.8)"
 
     def points(self, request: StudyRequest) -> list[Point]:
-        found = []
-        for scene in scenes_of(request, ("room",)):
-            for seed in request.repeats(8, 40):
-                for delay in QUICK_DELAYS_MS if request.quick else DELAYS_MS:
-                    channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": delay}}
-                    base = trial_of(request, scene, seed=seed, channel=channel, every_ms=1500.0)
-                    labels = {"scene": scene, "delay_ms": delay}
-                    found.append(Point({**labels, "policy": "all"}, base))
-                    gammas = QUICK_GAMMAS if request.quick else GAMMAS
-                    found += policy_points(base, labels, "gamma_ms", {"threshold": gammas})
-                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"}, every_ms=1500.0)
-                found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
-        return found
+        every = {"every_ms": 1500.0}
+        delays = [
+            ({"delay_ms": ms},
+             {"channel": {"preset": "ch5", "service": {"law": "exponential", "mean_ms": ms}}, **every})
+            for ms in (QUICK_DELAYS_MS if request.quick else DELAYS_MS)
+        ]  # fmt: skip
+        gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
+        seeds = request.repeats(8, 40)
+        return [
+            point for scene in scenes_of(request, ("room",))
+            for point in sweep(request, scene, seeds, delays, "gamma_ms", gammas, [({}, every)])
+        ]  # fmt: skip
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
         for scene in table.distinct("scene"):
             best: dict[str, dict[float, Optimum]] = {}
             for metric in _METRICS:
-                best[metric] = {}
-                for delay in table.distinct("delay_ms"):
-                    curve = table.curve("gamma_ms", metric, scene=scene, delay_ms=delay, policy="threshold")
-                    if curve:
-                        best[metric][delay] = optimum(curve, METRICS[metric][1])
-                if len(best[metric]) > 1:
-                    verdicts.append(self._judge(table, scene, metric, best[metric]))
+                curves = {delay: _curve(table, scene, metric, delay) for delay in table.distinct("delay_ms")}
+                curves = {delay: curve for delay, curve in curves.items() if curve}
+                best[metric] = {delay: optimum(curve, METRICS[metric][1]) for delay, curve in curves.items()}
+                if len(curves) > 1:
+                    verdicts.append(self._judge(table, scene, metric, curves, best[metric]))
             self._draw(request, table, scene, best)
         return verdicts
 
-    def _judge(self, table: Table, scene: str, metric: str, best: dict[float, Optimum]) -> Verdict:
-        curves = {
-            delay: table.curve("gamma_ms", metric, scene=scene, delay_ms=delay, policy="threshold")
-            for delay in best
-        }
+    def _judge(
+        self, table: Table, scene: str, metric: str, curves: dict[float, Curve], best: dict[float, Optimum]
+    ) -> Verdict:
         slope, _ = move_of_optimum(curves, METRICS[metric][1])
-        inside = {d: o.interior(LEAST[metric]) for d, o in best.items()}
-        without = [f"{d:g}" for d, yes in inside.items() if yes is not True]
+        without = [f"{d:g}" for d, o in best.items() if o.interior(LEAST[metric]) is not True]
         text = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
         # Fidelity that only rises or only falls has its best at the same end of the grid at every delay, so
         # the slope is zero.
@@ -95,6 +93,5 @@ class MatDelay:
                              label=METRICS[metric][0])  # fmt: skip
             label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
             for k, delay in enumerate(table.distinct("delay_ms")):
-                labels = {"scene": scene, "delay_ms": delay, "policy": "threshold"}
-                draw_curve(bottom, table.curve("gamma_ms", "psnr_moving_db", **labels), f"{delay:g} ms", k)
+                draw_curve(bottom, _curve(table, scene, "psnr_moving_db", delay), f"{delay:g} ms", k)
             label_lines(bottom, METRICS["psnr_moving_db"][0], "threshold (ms)")

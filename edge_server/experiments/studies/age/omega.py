@@ -23,8 +23,8 @@ from edge_server.experiments.studies.study import (
     Verdict,
     by_bool,
     no_delay_gain,
-    policy_points,
     scenes_of,
+    sweep,
     trial_of,
 )
 
@@ -47,17 +47,13 @@ class Omega:
         found = []
         for scene in scenes_of(request, ("room", "kitchen", "people")):
             ours = scene not in RECORDED
-            for seed in request.repeats(6 if ours else 3, 40):
-                for state, (preset, _, _) in STATES.items():
-                    if request.quick and not ours and state == "low":
-                        continue
-                    base = trial_of(request, scene, seed=seed, channel={"preset": preset}, every_ms=2400.0)
-                    labels = {"scene": scene, "state": state}
-                    found.append(Point({**labels, "policy": "all", "omega_ms": None}, base))
-                    omegas = QUICK_OMEGAS if request.quick else OMEGAS
-                    found += policy_points(base, labels, "omega_ms", dict.fromkeys(POLICIES, omegas))
-                ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"})
-                found.append(Point({"scene": scene, "state": "-", "policy": "no delay"}, ideal))
+            states = [
+                ({"state": state}, {"channel": {"preset": preset}, "every_ms": 2400.0})
+                for state, (preset, _, _) in STATES.items() if ours or not request.quick or state != "low"
+            ]  # fmt: skip
+            omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
+            seeds = request.repeats(6 if ours else 3, 40)
+            found += sweep(request, scene, seeds, states, "omega_ms", omegas, [({"state": "-"}, {})])
         return found
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
@@ -85,15 +81,13 @@ class Omega:
             return []
         name, lower, digits = METRICS[metric]
         best = optimum(curve, lower)
-        return [
-            Verdict(
-                f"{scene}, {state} traffic, threshold, {name}",
-                f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1).",
-                f"best at {best.x:g} ms{best.spread}, {best.over_last.text(digits)} better than the largest "
-                f"omega; {no_delay_gain(table, metric, scene=scene, state=state)}.",
-                by_bool(best.interior(LEAST[metric])),
-            )
-        ]
+        text = (
+            f"best at {best.x:g} ms{best.spread}, {best.over_last.text(digits)} better than the largest "
+            f"omega; {no_delay_gain(table, metric, scene=scene, state=state)}."
+        )
+        claim = f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1)."
+        about = f"{scene}, {state} traffic, threshold, {name}"
+        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])))]
 
     def _wait(self, table: Table, scene: str, state: str, metric: str, policy: str) -> list[Verdict]:
         labels = {"scene": scene, "state": state}
@@ -103,7 +97,7 @@ class Omega:
         name, lower, digits = METRICS[metric]
         sign = -1.0 if lower else 1.0
         best = optimum(curve, lower)
-        means = {x: interval(list(v.values())).mean for x, v in curve.items()}
+        means = {x: interval(v.values()).mean for x, v in curve.items()}
         top = max(sign * m for m in means.values())
         plateau = next(x for x, m in means.items() if top - sign * m <= _NEAR[metric])
         loss, over = best.over_last, _best_against(table, metric, policy, labels)
@@ -119,32 +113,21 @@ class Omega:
             # It is not enough that no fall is seen: the loss at the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))
         better = over.above(0.0) if not lower else negated(over.above(0.0))
+        text = (
+            f"best at {best.x:g} ms{best.spread}, {loss.text(digits)} better than the largest omega; "
+            f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on."
+        )
+        ahead = "better than threshold, each at its own best omega (6.5.2)."
         return [
-            Verdict(
-                about,
-                claim,
-                f"best at {best.x:g} ms{best.spread}, {loss.text(digits)} better than the largest omega; "
-                f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on.",
-                by_bool(answer),
-            ),
-            Verdict(
-                about,
-                "better than threshold, each at its own best omega (6.5.2).",
-                f"difference {over.text(digits)}.",
-                by_bool(better),
-            ),
+            Verdict(about, claim, text, by_bool(answer)),
+            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better)),
         ]
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
-        common: dict[str, Any] = {
-            "seed": 3,
-            "channel": {"preset": "ch6-high"},
-            "lpips": False,
-            "every_ms": 2400.0,
-        }
+        common: dict[str, Any] = {"channel": {"preset": "ch6-high"}, "lpips": False, "every_ms": 2400.0}
         rows = [
-            (f"{s}, {p}", [trial_of(request, s, policy=p, value=v, **common) for v in SHOWN])
+            (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
             for s in table.distinct("scene")
             for p in ("threshold", "wait")
         ]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-from edge_server.experiments.common.statistics import optimum
+from edge_server.experiments.common.statistics import all_of, optimum
 from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
     LEAST,
@@ -16,8 +14,7 @@ from edge_server.experiments.studies.study import (
     by_bool,
     no_delay_gain,
     number,
-    policy_points,
-    trial_of,
+    sweep,
 )
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -34,21 +31,14 @@ class Representations:
     title = "Threshold and wait, by representation (figure 6.7)"
 
     def points(self, request: StudyRequest) -> list[Point]:
-        found = []
-        for scene in request.scenes or ("room",):
-            for field, steps in (QUICK_FIELDS if request.quick else FIELDS).items():
-                for seed in request.repeats(4, 20):
-                    base = trial_of(
-                        request, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0
-                    )
-                    base = dataclasses.replace(base, field=field, steps=steps)
-                    ideal = dataclasses.replace(base, channel={"preset": "ideal"})
-                    labels = {"scene": scene, "field": field}
-                    found.append(Point({**labels, "policy": "all"}, base))
-                    found.append(Point({**labels, "policy": "no delay"}, ideal))
-                    omegas = QUICK_OMEGAS if request.quick else OMEGAS
-                    found += policy_points(base, labels, "omega_ms", dict.fromkeys(POLICIES, omegas))
-        return found
+        fields = (QUICK_FIELDS if request.quick else FIELDS).items()
+        ideals = [({"field": f}, {"field": f, "steps": steps, "every_ms": 2400.0}) for f, steps in fields]
+        traffic = [(labels, {**settings, "channel": {"preset": "ch6-high"}}) for labels, settings in ideals]
+        omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
+        return [
+            point for scene in request.scenes or ("room",)
+            for point in sweep(request, scene, request.repeats(4, 20), traffic, "omega_ms", omegas, ideals)
+        ]  # fmt: skip
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         verdicts = []
@@ -79,13 +69,7 @@ class Representations:
                 )
         if not text:
             return []
-        same = all(answers) if None not in answers else False if False in answers else None
-        return [
-            Verdict(
-                f"{scene}, {policy}, {name}",
-                "the trade shows with every representation (6.5.2).",
-                f"best omega: {', '.join(text)}; an optimum inside for "
-                f"{sum(a is True for a in answers)} of {len(answers)}.",
-                by_bool(same),
-            )
-        ]
+        inside = f"an optimum inside for {sum(a is True for a in answers)} of {len(answers)}."
+        about, claim = f"{scene}, {policy}, {name}", "the trade shows with every representation (6.5.2)."
+        found = f"best omega: {', '.join(text)}; {inside}"
+        return [Verdict(about, claim, found, by_bool(all_of(answers)))]

@@ -9,21 +9,28 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.statistics import Interval, at_its_best, optimum, paired, share_closed
+from edge_server.experiments.common.statistics import (
+    Interval,
+    all_of,
+    any_of,
+    at_its_best,
+    optimum,
+    paired,
+    share_closed,
+)
 from edge_server.experiments.studies.study import (
-    DOES_NOT_HOLD,
-    HOLDS,
     LEAST_DB,
     RECORDED,
-    UNDECIDED,
     Point,
     StudyRequest,
     Table,
     Verdict,
+    by_bool,
     number,
     scenes_of,
     trial_of,
@@ -38,31 +45,28 @@ COST_MS = {"mask": 0.5, "freshen": 4.0}
 PERIOD_MS = 30.0
 METRIC = "psnr_moving_db"
 # Thresholds and waits, in mean delays after one period.
-THRESHOLDS, QUICK_THRESHOLDS = (0.5, 1.0, 2.0, 4.0), (0.75, 1.5, 3.0)
-WAITS, QUICK_WAITS = (0.5, 1.0, 2.0, 4.0), (1.0, 2.5)
+SHARES = {"threshold": (0.5, 1.0, 2.0, 4.0), "wait": (0.5, 1.0, 2.0, 4.0)}
+QUICK_SHARES = {"threshold": (0.75, 1.5, 3.0), "wait": (1.0, 2.5)}
 OWN = ("mask", "freshen")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of the map."""
+    """A cell of the map; its fields label its rows."""
 
     scene: str
-    speed: float | None
+    speed_m_per_s: float | None
     delay_ms: float
     memory: str
     compute: str
 
     @property
     def labels(self) -> dict[str, Any]:
-        return {
-            "scene": self.scene, "speed_m_per_s": self.speed, "delay_ms": self.delay_ms,
-            "memory": self.memory, "compute": self.compute,
-        }  # fmt: skip
+        return vars(self)
 
     @property
     def text(self) -> str:
-        speed = "" if self.speed is None else f" at {self.speed:g} m/s"
+        speed = "" if self.speed_m_per_s is None else f" at {self.speed_m_per_s:g} m/s"
         return f"{self.scene}{speed}, mean delay {self.delay_ms:g} ms, {self.memory}, compute {self.compute}"
 
 
@@ -94,25 +98,24 @@ class Phase:
             speeds: tuple[float | None, ...] = (None,)
             if ours:
                 speeds = (0.5, 2.0) if quick else (0.3, 1.0, 2.0, 4.0)
-            delays: tuple[float, ...] = (60.0, 150.0) if quick else (30.0, 60.0, 120.0, 240.0)
-            if quick and not ours:
-                delays = (60.0,)
-            for speed in speeds:
-                for delay in delays:
-                    usual = delay == 60.0  # the thesis's mean; a quick pass has one cell of the others
-                    if usual or not quick:
-                        yield Cell(scene, speed, delay, "scratch", "zero")
-                    yield Cell(scene, speed, delay, "warm", "zero")
-                    if not quick or (ours and usual):
-                        yield Cell(scene, speed, delay, "warm", "charged")
-                    if not quick:
-                        yield Cell(scene, speed, delay, "scratch", "charged")
+            delays: tuple[float, ...] = (30.0, 60.0, 120.0, 240.0)
+            if quick:
+                delays = (60.0, 150.0) if ours else (60.0,)
+            for speed, delay in product(speeds, delays):
+                usual = delay == 60.0  # the thesis's mean; a quick pass has one cell of the others
+                if usual or not quick:
+                    yield Cell(scene, speed, delay, "scratch", "zero")
+                yield Cell(scene, speed, delay, "warm", "zero")
+                if not quick or (ours and usual):
+                    yield Cell(scene, speed, delay, "warm", "charged")
+                if not quick:
+                    yield Cell(scene, speed, delay, "scratch", "charged")
 
     def _trial(self, request: StudyRequest, cell: Cell, seed: int) -> Any:
         channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": cell.delay_ms}}
         more: dict[str, Any] = {"every_ms": 1500.0}
         if cell.scene not in RECORDED:
-            more["speed_m_per_s"] = cell.speed
+            more["speed_m_per_s"] = cell.speed_m_per_s
         base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":
             base = dataclasses.replace(
@@ -124,17 +127,13 @@ class Phase:
 
     def _policies(self, request: StudyRequest, delay_ms: float) -> Iterator[tuple[str, float | None]]:
         yield "all", None
-        for share in QUICK_THRESHOLDS if request.quick else THRESHOLDS:
-            yield "threshold", PERIOD_MS + share * delay_ms
-        for share in QUICK_WAITS if request.quick else WAITS:
-            yield "wait", PERIOD_MS + share * delay_ms
-        for name in OWN:
-            yield name, None
+        for policy, shares in (QUICK_SHARES if request.quick else SHARES).items():
+            yield from ((policy, PERIOD_MS + share * delay_ms) for share in shares)
+        yield from ((name, None) for name in OWN)
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        cells = [Cell(*key) for key in dict.fromkeys(
-            (r["scene"], r["speed_m_per_s"], r["delay_ms"], r["memory"], r["compute"]) for r in table.rows
-        )]  # fmt: skip
+        names = [f.name for f in dataclasses.fields(Cell)]
+        cells = list(dict.fromkeys(Cell(*(row[name] for name in names)) for row in table.rows))
         verdicts = []
         for cell in cells:
             for metric, name in (("psnr_moving_db", "moving pixels"), ("psnr_db", "whole image")):
@@ -143,7 +142,7 @@ class Phase:
         return verdicts
 
     def _judge(self, table: Table, cell: Cell, metric: str, name: str) -> list[Verdict]:
-        best = {p: _best(table, cell, metric, p) for p in ("threshold", "wait")}
+        best = {p: _best(table, cell, metric, p) for p in SHARES}
         use_all = table.values(metric, policy="all", **cell.labels)
         limit = table.values(metric, policy="no delay", **cell.labels)
         gap = paired(limit, use_all)
@@ -156,27 +155,22 @@ class Phase:
             gain = paired(values, use_all)
             answers.append(gain.above(LEAST_DB))
             text.append(f"best {policy} ({omega:g} ms) {gain}")
-        verdict = HOLDS if True in answers else DOES_NOT_HOLD if set(answers) == {False} else UNDECIDED
         about = f"{cell.text}; {name}"
         found = [
             Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
-                    "; ".join(text) + " dB.", verdict)
+                    "; ".join(text) + " dB.", by_bool(any_of(answers)))
         ]  # fmt: skip
         for policy in OWN:
             treated = table.values(metric, policy=policy, **cell.labels)
             share = share_closed(treated, use_all, limit) if gap.above(0.0) else None
             over = [paired(treated, others) for _, others in best.values()]
-            beats = [o.above(0.0) for o in over]
-            found.append(
-                Verdict(
-                    about,
-                    f"{policy} beats the best threshold and the best wait.",
-                    f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
-                    f"{over[0]} above the best threshold, {over[1]} above the best wait "
-                    f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
-                    HOLDS if all(beats) else DOES_NOT_HOLD if False in beats else UNDECIDED,
-                )
-            )
+            found.append(Verdict(
+                about, f"{policy} beats the best threshold and the best wait.",
+                f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
+                f"{over[0]} above the best threshold, {over[1]} above the best wait "
+                f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
+                by_bool(all_of(o.above(0.0) for o in over)),
+            ))  # fmt: skip
         return found
 
     def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:
@@ -190,13 +184,13 @@ class Phase:
                     self._draw_map(at, table, shown, f"{scene}, {kind[0]}, compute {kind[1]}: moving pixels")
 
     def _draw_map(self, at: Any, table: Table, cells: list[Cell], title: str) -> None:
-        speeds = sorted({c.speed or 0.0 for c in cells})
+        speeds = sorted({c.speed_m_per_s or 0.0 for c in cells})
         delays = sorted({c.delay_ms for c in cells})
         gains = np.full((len(speeds), len(delays)), np.nan)
         for cell in cells:
-            i, j = speeds.index(cell.speed or 0.0), delays.index(cell.delay_ms)
+            i, j = speeds.index(cell.speed_m_per_s or 0.0), delays.index(cell.delay_ms)
             use_all = table.values(METRIC, policy="all", **cell.labels)
-            options = {p: _best(table, cell, METRIC, p) for p in ("threshold", "wait")}
+            options = {p: _best(table, cell, METRIC, p) for p in SHARES}
             scored = {f"{p} {o:g} ms": paired(v, use_all).mean for p, (o, v) in options.items()}
             scored |= {p: paired(table.values(METRIC, policy=p, **cell.labels), use_all).mean for p in OWN}
             name = max(scored, key=lambda p: np.nan_to_num(scored[p], nan=-np.inf))

@@ -11,8 +11,8 @@ import numpy as np
 
 from edge_server.experiments.studies.learning.setup import (
     RUNS,
+    Parts,
     StudyTrainer,
-    TrainingRun,
     TrainingStudy,
     better,
     room,
@@ -24,7 +24,7 @@ from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.evaluation import PerSeed
 from edge_server.experiments.training.scheduler.report import smoothed
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
@@ -96,9 +96,7 @@ class Drift(TrainingStudy):
     name = "drift"
     title = "The channel changes during use: fixed, learnt, and still learning"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        verdicts: list[Verdict] = []
-        rows: list[Row] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         known = changes()
         for name in request.chosen(list(known), list(known)[:1]):
             trainings = RUNS[request.quick]
@@ -107,15 +105,13 @@ class Drift(TrainingStudy):
                 [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
                 for training in range(trainings)
             ]  # fmt: skip
-            verdicts += judge(f"room, {name}", runs)
             all_runs = [run for of in runs for run in of]
             _draw(request, name, all_runs)
-            rows += [
+            yield judge(f"room, {name}", runs), [
                 {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
                 for r, run in enumerate(all_runs) for policy, values in run.items()
                 for k, value in enumerate(values)
             ]  # fmt: skip
-        return verdicts, rows
 
 
 def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, run: int) -> Rewards:
@@ -124,23 +120,19 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
     before, after = change.settings()
     config = change.config(trainer, trainer.request.training_episodes(EPISODES), training)
     reward, priced = config.reward, "priced-" * bool(change.price)
-    home = trainer.train_one(TrainingRun(f"drift-before-{priced}{training}", before, config))
-    there = trainer.train_one(TrainingRun(f"drift-{name.replace(' ', '-')}-{training}", after, config))
+    home = trainer.train_one(f"drift-before-{priced}{training}", before, config)
+    there = trainer.train_one(f"drift-{name.replace(' ', '-')}-{training}", after, config)
     chosen = trainer.evaluate(before, simple_policies("threshold", ("random",)), reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
     policies: dict[str, Policy] = {
         "fixed": fixed(rng),
         "learnt": BanditPolicy(home.actor, "learnt", rng),
-        "still learning": OnlinePolicy(
-            Learner.load(home.folder / "policy.npz"),
-            fixed(rng),
-            "still learning",
-            rng,
-            OnlineSettings(warmup=0),  # the shipped settings without a warm-up
-        ),
+        # The shipped settings without a warm-up.
+        "still learning": OnlinePolicy(Learner.load(home.folder / "policy.npz"), fixed(rng), "still learning",
+                                       rng, OnlineSettings(warmup=0)),
         "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
-    }
+    }  # fmt: skip
     rewards: Rewards = {policy: [] for policy in POLICIES}
     number = 0
     for setting, count, first in ((before, BEFORE, 0), (after, AFTER, BEFORE)):
@@ -155,13 +147,9 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
 
 
 def _decide(
-    trainer: StudyTrainer,
-    setting: Setting,
-    policy: Policy,
-    moments: list[DecisionPoint],
-    reward: Reward,
+    trainer: StudyTrainer, setting: Setting, policy: Policy, moments: list[DecisionPoint], reward: Reward,
     first: int,
-) -> list[float]:
+) -> list[float]:  # fmt: skip
     """Rewards of decisions, which are numbered from ``first`` on, scored by the reporting cameras. An online
     policy learns from the scores of the rewarding ones."""
     requests = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]

@@ -9,6 +9,7 @@ from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
     Nearest,
+    Parts,
     Runs,
     StudyTrainer,
     TrainedPolicy,
@@ -33,7 +34,7 @@ from edge_server.experiments.training.scheduler.evaluation import (
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -63,9 +64,7 @@ class PpoSelect(TrainingStudy):
     name = "ppo-select"
     title = "A scheduler that learns which views to use (figure 5.9)"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        verdicts: list[Verdict] = []
-        found: list[Row] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         count = len(request.repeats(10, 100))
         cases = {_case_name(*case): case for case in CASES}
         for case in request.chosen(list(cases), list(cases)):
@@ -80,16 +79,14 @@ class PpoSelect(TrainingStudy):
             trained = trainer.train_repeats(name, setting, config)
             mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
             evaluation = trainer.evaluate(setting, {**_baselines(setting), **mine}, reward, count)
-            verdicts += [*judge(about, evaluation), _time(about, trained)]
             labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
-            found += rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
+            found = rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
             few = simple_policies("threshold")
             same = trainer.evaluate_as_rewarded(setting, {**few, **mine}, reward, count)
-            verdicts += _as_rewarded(about, same)
             found += rows(same, **labels, judged_from="the same")
-            level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
-            draw_curve(request.out / f"{trained[0].run.name}.png", trained[0].rows, level)
-        return verdicts, found
+            level = {n: interval(same.rewards(n).values()).mean for n in ("random", "learnt-0")}
+            draw_curve(request.out / f"{trained[0].name}.png", trained[0].rows, level)
+            yield [*judge(about, evaluation), _time(about, trained), *_as_rewarded(about, same)], found
 
 
 def _case_name(on: str, viewpoints: str, scratch: bool, price: float) -> str:
@@ -152,26 +149,21 @@ def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
     random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
     return [
-        better(
-            about,
-            f"better than random there (the thesis: by {THESIS_PERCENT} %).",
-            mine,
-            random,
-            f"{percent(mean_of(mine), random)}; ",
-        ),
+        better(about, f"better than random there (the thesis: by {THESIS_PERCENT} %).", mine, random,
+               f"{percent(mean_of(mine), random)}; "),
         better(about, "better than using all there.", mine, evaluation.rewards("all")),
         better(about, "better than every fixed threshold there.", mine, best, f"the best is {name}; "),
-    ]
+    ]  # fmt: skip
 
 
 def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Verdict:
     share, theirs = evaluation.share(mean_of(mine)), evaluation.share(best)
     random, limit = evaluation.rewards("random"), evaluation.rewards(HINDSIGHT)
-    half: PerSeed = {}
-    for seed, value in random.items():
-        best_there = limit.get(seed)
-        half[seed] = None if value is None or best_there is None else (value + best_there) / 2
-    above, top = paired_difference(mine, half), interval(list(limit.values())).mean
+    half: PerSeed = {
+        seed: None if value is None or (best_there := limit.get(seed)) is None else (value + best_there) / 2
+        for seed, value in random.items()
+    }
+    above, top = paired_difference(mine, half), interval(limit.values()).mean
     alone = " (the intervals are over seeds alone, not over trainings)" if len(mine) > 1 else ""
     return Verdict(
         about, "most of what could be won is won: (r - random) / (hindsight - random) above a half.",

@@ -7,6 +7,7 @@ import dataclasses
 from edge_server.experiments.common.statistics import Interval, crossed
 from edge_server.experiments.studies.learning.predictability import by_ages
 from edge_server.experiments.studies.learning.setup import (
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -22,7 +23,7 @@ from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
 from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, seeds
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Action, Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -47,9 +48,7 @@ class PpoWait(TrainingStudy):
     name = "ppo-wait"
     title = "A scheduler that learns how long to wait, or how old is too old (figure 6.8)"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        verdicts: list[Verdict] = []
-        found: list[Row] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         cases = {named(*case): case for case in CASES}
         for case in request.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
             channel, age, pixels = cases[case]
@@ -64,10 +63,9 @@ class PpoWait(TrainingStudy):
             count = len(request.repeats(16, 100))
             evaluation = trainer.evaluate(setting, candidates, reward, count)
             moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
-            verdicts += judge(case, channel, evaluation)
-            verdicts += [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
-            found += rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
-        return verdicts, found
+            there_is = [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
+            found = rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
+            yield [*judge(case, channel, evaluation), *there_is], found
 
 
 def named(channel: str, age: float, pixels: str) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from edge_server.experiments.common.statistics import crossed
 from edge_server.experiments.studies.learning.setup import (
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -51,14 +52,10 @@ class RewardCost(TrainingStudy):
     name = "reward-cost"
     title = "Reward against the time of training, by the effort of a fit; and against embedding size"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         parts = {"fit budget": _by_budget, "embedding size": _by_dim}
-        verdicts: list[Verdict] = []
-        found: list[Row] = []
         for part in request.chosen(list(parts), list(parts)):
-            more_verdicts, more_rows = parts[part](trainer, request)
-            verdicts, found = verdicts + more_verdicts, found + more_rows
-        return verdicts, found
+            yield parts[part](trainer, request)
 
 
 def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from edge_server.experiments.common.statistics import any_of
 from edge_server.experiments.studies.learning.setup import (
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -19,7 +21,7 @@ from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.state import StateLayout
@@ -31,7 +33,7 @@ class Weights(TrainingStudy):
     name = "weights"
     title = "Sensitivity to the weights of the reward (6.36-6.38)"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         setting, spec = room("swing"), Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
         rewards, candidates = variants(trainer), simple_policies("wait")
         for name, reward in rewards.items():
@@ -40,12 +42,9 @@ class Weights(TrainingStudy):
             candidates |= named_runs(f"learnt {name}", trained)
         count = len(request.repeats(8, 100))
         evaluation = trainer.evaluate(setting, candidates, rewards["corrected"], count)
-        verdicts, found = [], []
         for name, reward in rewards.items():
             evaluation.reward = reward
-            found += rows(evaluation, judged_by=name)
-            verdicts += judge(evaluation, name, list(rewards))
-        return verdicts, found
+            yield judge(evaluation, name, list(rewards)), rows(evaluation, judged_by=name)
 
 
 def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdict]:
@@ -55,13 +54,12 @@ def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdi
     best, fixed = evaluation.best_fixed("wait")
     losses = {o: paired_difference(mine, runs_of(evaluation, f"learnt {o}")) for o in names if o != name}
     worst = max(losses, key=lambda o: losses[o].mean)
-    answers = [loss.above(0.0) for loss in losses.values()]
     return [
         better(about, "what was learnt by it is better than the best fixed wait.", mine, best,
                f"the best is {fixed}; "),
         Verdict(about, "it matters: what was learnt by other weights is worse by these.",
                 "; ".join(f"{o} {span(loss)}" for o, loss in losses.items()) + f"; most: {worst}.",
-                by_bool(None if None in answers and True not in answers else True in answers)),
+                by_bool(any_of(loss.above(0.0) for loss in losses.values()))),
     ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.engine import StudyError
 from edge_server.experiments.studies.learning.setup import (
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -53,8 +54,7 @@ class Semantics(TrainingStudy):
             raise StudyError(f"{self.name}: {missing}")
         return super().report(request, table)
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        verdicts: list[Verdict] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         found: list[Row] = []
         for scene in request.chosen(list(SCENES), list(SCENES)):
             speed, on = SCENES[scene]
@@ -71,13 +71,14 @@ class Semantics(TrainingStudy):
             if speed:
                 candidates |= {f"sees:{k}": SeesMotion(visible, k) for k in KNOWING}
             evaluation = trainer.evaluate(setting, candidates, reward, count)
-            found += rows(evaluation, scene=scene)
-            verdicts += judge(scene, evaluation, on == "moving")
+            here = rows(evaluation, scene=scene)
+            found += here
+            verdicts = judge(scene, evaluation, on == "moving")
             if speed:
                 moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
                 verdicts += why(scene, evaluation, embedding_areas(visible, moments))
+            yield verdicts, here
         draw(request.out / f"{self.name}.png", found)
-        return verdicts, found
 
 
 def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
@@ -95,7 +96,7 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
         claim = "semantics cost no more than 1 % where nothing moves."
         found = [no_worse(about, claim, seeing, blind, evaluation)]
     fixed = [n for n in evaluation.outcomes if not n.startswith(("with", "random", "sees"))]
-    best = max(fixed, key=lambda n: interval(list(evaluation.rewards(n).values())).mean)
+    best = max(fixed, key=lambda n: interval(evaluation.rewards(n).values()).mean)
     return found + [
         better(f"{about}, {name} semantics", "better than the best of all that does not learn.", runs,
                evaluation.rewards(best), f"{best}, known from the very seeds; ")
@@ -110,7 +111,7 @@ def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[
     """
     about, (embedding, camera) = f"tower, ch5, {scene}", areas
     knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
-    best = max(knowing, key=lambda n: interval(list(evaluation.rewards(n).values())).mean)
+    best = max(knowing, key=lambda n: interval(evaluation.rewards(n).values()).mean)
     return [
         Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
                 f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "

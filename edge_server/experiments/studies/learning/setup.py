@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -50,6 +50,8 @@ RUNS = {True: 1, False: 3}
 
 Runs = Sequence[PerSeed]
 """Rewards by seed of each of several trainings that differ in their random seed only."""
+Parts = Iterator[tuple[list[Verdict], list[Row]]]
+"""Verdicts and rows of the table, of one case of a study after the other."""
 
 
 class TrainingStudy:
@@ -64,36 +66,31 @@ class TrainingStudy:
 
     def report(self, request: StudyRequest, table: Table | None) -> list[Verdict]:
         """Train, evaluate, write OUT/NAME.csv and return the verdicts. table: not used."""
+        verdicts: list[Verdict] = []
+        rows: list[Row] = []
         with StudyTrainer(request) as trainer:
-            verdicts, rows = self.run(trainer, request)
+            for more_verdicts, more_rows in self.run(trainer, request):
+                verdicts, rows = verdicts + more_verdicts, rows + more_rows
         write_csv(request.out / f"{self.name}.csv", rows)
         return verdicts
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        """The verdicts and the rows of the table."""
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
+        """The verdicts and the rows of the table, part by part."""
         raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """One training of a study. name: of its folder and in its tables."""
-
-    name: str
-    setting: Setting
-    config: TrainingConfig
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
     """A finished training.
 
+    name: of its folder and in its tables.
     actor: the trained policy.
     rows: of its log.
     seconds: wall-clock time of the training, by ``jobs`` processes, when it was carried out.
     folder: holds policy.npz.
     """
 
-    run: TrainingRun
+    name: str
     actor: Actor
     rows: list[Row]
     seconds: float
@@ -102,14 +99,9 @@ class TrainedPolicy:
 
 
 def room(
-    channel: Mapping[str, Any] | str = "ch5",
-    *,
-    scene: str = "room",
-    speed_m_per_s: float = 1.0,
-    held_out: tuple[str, ...] = ("cam00",),
-    report: tuple[str, ...] = REPORT,
-    **more: Any,
-) -> Setting:
+    channel: Mapping[str, Any] | str = "ch5", *, scene: str = "room", speed_m_per_s: float = 1.0,
+    held_out: tuple[str, ...] = ("cam00",), report: tuple[str, ...] = REPORT, **more: Any,
+) -> Setting:  # fmt: skip
     """The usual setting: a world at 64 x 64, nineteen cameras and a warm splat field.
 
     channel: a preset, or a section of a scenario.
@@ -183,30 +175,29 @@ class StudyTrainer:
             self._printed_missing = True
         return reward
 
-    def train_one(self, run: TrainingRun) -> TrainedPolicy:
+    def train_one(self, name: str, setting: Setting, config: TrainingConfig) -> TrainedPolicy:
         """Carry out a training, or read it if it is finished; its curve is drawn to OUT/NAME.png."""
-        folder = self.folder / f"{run.name}-{_digest(run)}"
+        # Trainings with other settings or of other code get folders of their own.
+        about = source_digest() + setting.key + repr(dataclasses.asdict(config))
+        folder = self.folder / f"{name}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
         jobs_file = folder / "jobs.json"
         learner = train(
-            run.setting, run.config, self.pool, folder,
-            lambda line: print(f"  {run.name}: {line}", flush=True),
-        )  # fmt: skip
+            setting, config, self.pool, folder, lambda line: print(f"  {name}: {line}", flush=True)
+        )
         rows = read_log(folder)
-        draw_curve(self.request.out / f"{run.name}.png", rows)
+        draw_curve(self.request.out / f"{name}.png", rows)
         if not jobs_file.exists():
             write_json(jobs_file, self.request.jobs)
         seconds = sum(row["seconds"] for row in rows)
-        return TrainedPolicy(
-            run, learner.actor, rows, seconds, int(json.loads(jobs_file.read_text())), folder
-        )
+        jobs = int(json.loads(jobs_file.read_text()))
+        return TrainedPolicy(name, learner.actor, rows, seconds, jobs, folder)
 
     def train_repeats(self, name: str, setting: Setting, config: TrainingConfig) -> list[TrainedPolicy]:
         """Repeat a training ``RUNS`` times, with different episodes and initial values."""
-        runs = range(RUNS[self.request.quick])
         return [
-            self.train_one(TrainingRun(f"{name}-{run}", setting, dataclasses.replace(config, seed=run)))
-            for run in runs
-        ]  # fmt: skip
+            self.train_one(f"{name}-{run}", setting, dataclasses.replace(config, seed=run))
+            for run in range(RUNS[self.request.quick])
+        ]
 
     def evaluate(
         self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
@@ -239,7 +230,7 @@ def embeddings_missing() -> str | None:
 def fixed_of(evaluation: Evaluation, kind: str) -> str:
     """Name and reward of the best fixed policy of a kind, as text."""
     values, name = evaluation.best_fixed(kind)
-    return f"{name} {span(interval(list(values.values())))}"
+    return f"{name} {span(interval(values.values()))}"
 
 
 def mean_of(runs: Runs) -> PerSeed:
@@ -302,13 +293,9 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
 
 
 def no_worse(
-    about: str,
-    claim: str,
-    mine: PerSeed | Runs,
-    other: PerSeed | Runs,
-    evaluation: Evaluation,
+    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, evaluation: Evaluation,
     share: float = 0.01,
-) -> Verdict:
+) -> Verdict:  # fmt: skip
     """The verdict whether ``mine`` loses at most ``share`` of the size of ``other``'s mean reward. The text
     also gives the loss relative to the way from random to hindsight, because the zero of a reward is
     arbitrary. Undecided where the reward is too near its zero for a percentage."""
@@ -321,9 +308,3 @@ def no_worse(
     if limit.above(0.0):
         text += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
     return Verdict(about, claim, f"{text}.", by_bool(difference.above(-share * abs(base.mean))))
-
-
-def _digest(run: TrainingRun) -> str:
-    """Trainings with other settings or of other code get folders of their own."""
-    text = source_digest() + run.setting.key + repr(dataclasses.asdict(run.config))
-    return hashlib.sha256(text.encode()).hexdigest()[:8]

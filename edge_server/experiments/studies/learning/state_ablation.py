@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -19,7 +20,7 @@ from edge_server.experiments.studies.learning.setup import (
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
 from edge_server.experiments.training.scheduler.setting import layout_of
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 100, False: 600}
@@ -34,7 +35,7 @@ class Ablation(TrainingStudy):
     name = "ablation"
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         variants = dict(VARIANTS)
         if missing := embeddings_missing():
             print(f"  semantics are left out: {missing}")
@@ -49,7 +50,7 @@ class Ablation(TrainingStudy):
             trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
             candidates |= named_runs(f"learnt {name}", trained)
         evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
-        return judge(evaluation, list(variants)), rows(evaluation)
+        yield judge(evaluation, list(variants)), rows(evaluation)
 
 
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from edge_server.experiments.studies.learning.setup import (
+    Parts,
     StudyTrainer,
     TrainingStudy,
     better,
@@ -18,7 +19,7 @@ from edge_server.experiments.studies.learning.setup import (
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -38,9 +39,7 @@ class Transfer(TrainingStudy):
     name = "transfer"
     title = "Trained on one scene and channel, used on another"
 
-    def run(self, trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-        verdicts: list[Verdict] = []
-        found: list[Row] = []
+    def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
         reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
         places = settings(request.quick)
@@ -56,9 +55,7 @@ class Transfer(TrainingStudy):
                 **named_runs("learnt here", trained[place]),
             }
             evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(8, 100)))
-            found += rows(evaluation, place=place)
-            verdicts += judge(place, evaluation)
-        return verdicts, found
+            yield judge(place, evaluation), rows(evaluation, place=place)
 
 
 def judge(place: str, evaluation: Evaluation) -> list[Verdict]:

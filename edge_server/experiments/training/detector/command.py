@@ -124,12 +124,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("runs/detector"), metavar="DIR", help="[%(default)s]")
     add("--seed", type=int, default=0, help="[%(default)s]")
     add(
-        "--worlds",
-        type=at_least(20),
-        default=400,
-        metavar="N",
+        "--worlds", type=at_least(20), default=400, metavar="N",
         help="to train on, 8 pictures each [%(default)s]",
-    )
+    )  # fmt: skip
     add("--epochs", type=at_least(1), default=18, metavar="N", help="[%(default)s]")
     add("--side", type=_side, default=128, metavar="PX", help="of the pictures [%(default)s]")
     add("--rate", type=float, default=2e-3, help="of learning [%(default)s]")

@@ -4,7 +4,6 @@ correlation."""
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -122,12 +121,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     taps = tuple(layers.taps)
     Perceptual(layers, split, power)  # what is written can be read
     save_coefficients(args.out / COEFFICIENTS, taps, split, power)
+    by_layer = [part.sum() for part in np.split((x * weights).sum(axis=0), np.cumsum(layers.widths())[:-1])]
     results = {
         "fitted_to": f"LPIPS-{lpips.network}", "pairs": len(y), "power": power, "seed": args.seed,
-        "share_by_layer": {
-            tap: round(float((x[:, part] @ weights[part]).sum() / (x @ weights).sum()), 3)
-            for tap, part in zip(taps, _slices(layers.widths()))
-        },
+        "share_by_layer": {tap: round(float(s / sum(by_layer)), 3) for tap, s in zip(taps, by_layer)},
         "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
         "scene_left_out_of_the_fit": left_out(by_scene),
     }  # fmt: skip
@@ -230,11 +227,6 @@ def show(results: dict[str, Any]) -> str:
             f"mean error {found['mean_absolute_error']:.3f}  ({found['pairs']} pairs)"
         )
     return "\n".join(lines)
-
-
-def _slices(widths: Sequence[int]) -> list[slice]:
-    ends = np.cumsum([0, *widths])
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 def _parser() -> argparse.ArgumentParser:

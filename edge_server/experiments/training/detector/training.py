@@ -57,7 +57,8 @@ def train(
     averaged = Detector(len(KINDS)).eval()
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
-    log = _resume(checkpoint, settings, model, averaged, optimizer)
+    parts = {"model": model, "averaged": averaged, "optimizer": optimizer}
+    log = _resume(checkpoint, settings, parts)
     per_epoch = len(dataset) // BATCH
     progress = Progress(settings.epochs - len(log))
     for epoch in range(len(log), settings.epochs):
@@ -79,7 +80,7 @@ def train(
             raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite; lower the rate")
         seconds = round(time.perf_counter() - began, 1)
         log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
-        _save(checkpoint, settings, model, averaged, optimizer, log)
+        _save(checkpoint, settings, parts, log)
         progress.advance(1)
         losses = f"loss {score_loss:.3f} + {box_loss:.3f}"
         progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", losses)
@@ -102,13 +103,8 @@ def _average(averaged: Detector, model: Detector, step: int) -> None:
                 a.copy_(b)
 
 
-def _resume(
-    checkpoint: Path,
-    settings: Settings,
-    model: Detector,
-    averaged: Detector,
-    optimizer: torch.optim.Optimizer,
-) -> list[dict[str, Any]]:
+def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list[dict[str, Any]]:
+    """Load what ``_save`` wrote into ``parts``; returns the log so far."""
     if not checkpoint.is_file():
         return []
     try:
@@ -122,25 +118,17 @@ def _resume(
                 f"{checkpoint}: was trained with {key} {known.get(key)}, not {value}: go on alike, delete "
                 "it, or name another --out"
             )
-    model.load_state_dict(kept["model"])
-    averaged.load_state_dict(kept["averaged"])
-    optimizer.load_state_dict(kept["optimizer"])
+    for name, part in parts.items():
+        part.load_state_dict(kept[name])
     log: list[dict[str, Any]] = kept["log"]
     return log
 
 
-def _save(
-    checkpoint: Path,
-    settings: Settings,
-    model: Detector,
-    averaged: Detector,
-    optimizer: torch.optim.Optimizer,
-    log: list[dict[str, Any]],
-) -> None:
-    part = checkpoint.with_suffix(".part")
-    state = {"model": model.state_dict(), "averaged": averaged.state_dict(), "log": log}
-    torch.save({"settings": asdict(settings), "optimizer": optimizer.state_dict(), **state}, part)
-    part.replace(checkpoint)
+def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list[dict[str, Any]]) -> None:
+    new = checkpoint.with_suffix(".part")
+    states = {name: part.state_dict() for name, part in parts.items()}
+    torch.save({"settings": asdict(settings), "log": log, **states}, new)
+    new.replace(checkpoint)
 
 
 def _batches(dataset: LabeledImages, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:

@@ -92,7 +92,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         setting = setting_of(args, load(args.scenario))
         config = _config(args, setting, folders)
-        _check(args, config)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server train-scheduler: {error}", file=sys.stderr)
         return 2
@@ -196,17 +195,12 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
-        given,
-        report=report,
-        motions=not args.same_motion,
+        given, report=report, motions=not args.same_motion,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
-        scratch=args.scratch,
-        decisions=args.decisions,
-        lead_ms=_HOLD_LEAD_MS if args.hold else 1000.0,
-        span_ms=args.hold * args.decisions or 6000.0,
-        compute=read_config(given).compute,
+        scratch=args.scratch, decisions=args.decisions, lead_ms=_HOLD_LEAD_MS if args.hold else 1000.0,
+        span_ms=args.hold * args.decisions or 6000.0, compute=read_config(given).compute,
         parts=_parts(args.parts),
-    )
+    )  # fmt: skip
 
 
 def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
@@ -238,18 +232,19 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
         print(f"  {missing}")
+    if args.jobs < 1:
+        raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
+    if not 0 <= args.test <= 10_000:
+        raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
+    seeds(args.seed, "train", args.episodes)
     if not 0.0 <= args.price < math.inf:
         raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
     spec = Spec(
-        args.kind,
-        layout_of(setting, setting.parts),
-        _omegas(args),
-        network=args.network,
-        hold_ms=args.hold,
+        args.kind, layout_of(setting, setting.parts), _omegas(args), network=args.network, hold_ms=args.hold,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
-    )
+    )  # fmt: skip
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
 
 
@@ -276,14 +271,6 @@ def _parts(text: str) -> tuple[str, ...]:
             f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(STATE_PARTS)}"
         )
     return tuple(part for part in STATE_PARTS if part in asked)
-
-
-def _check(args: argparse.Namespace, config: TrainingConfig) -> None:
-    if args.jobs < 1:
-        raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
-    if not 0 <= args.test <= 10_000:
-        raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
-    seeds(config.seed, "train", config.episodes)
 
 
 def _parser() -> argparse.ArgumentParser:

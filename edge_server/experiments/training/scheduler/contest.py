@@ -14,7 +14,7 @@ from typing import Any
 
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import Interval, interval, paired
+from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.training.scheduler.workers import WorkerPool
@@ -56,8 +56,8 @@ def contest(
     for who, of in runs.items():
         for m in ("psnr_db", "psnr_moving_db"):
             values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
-            found[who][m] = _as_list(interval(list(values[who].values())))
-            found[who][f"{m}_over_{REFERENCE}"] = _as_list(paired(values[who], values[REFERENCE]))
+            found[who][m] = interval(values[who].values()).rounded(4)
+            found[who][f"{m}_over_{REFERENCE}"] = paired(values[who], values[REFERENCE]).rounded(4)
         if who == LEARNT:
             found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
     say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
@@ -84,8 +84,4 @@ def _runs(
 def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
     """Mean omega in each state of the channel, with the interval over the runs that were in it."""
     states = sorted({state for run in runs for state in run})
-    return {state: _as_list(interval([run.get(state) for run in runs])) for state in states}
-
-
-def _as_list(i: Interval) -> list[float | None]:
-    return [None if v != v else round(v, 4) for v in (i.mean, i.low, i.high)]
+    return {state: interval([run.get(state) for run in runs]).rounded(4) for state in states}

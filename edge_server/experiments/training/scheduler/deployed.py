@@ -19,7 +19,7 @@ from channel_emu.model.config import channel_from_mapping
 from edge_server.config import read_config
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.training.scheduler.choices import named
-from edge_server.experiments.training.scheduler.episode import EpisodeFactory, Outcome
+from edge_server.experiments.training.scheduler.episode import SCORES, EpisodeFactory, Outcome
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.live.state import Publication
@@ -103,9 +103,8 @@ def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outco
     """Means of what was shown, and of the updates that were published, in [begin, end)."""
     shown = [s for s in deployment.shown if begin_ns <= s.published_ns < end_ns]
     updates = [p for p in deployment.publications if begin_ns <= p.published_ns < end_ns]
-    names = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
     return Outcome(
-        **{name: mean_or_none([getattr(s, name) for s in shown]) for name in names},
+        **{name: mean_or_none([getattr(s, name) for s in shown]) for name in SCORES},
         aaoi_ms=mean_or_none([p.aaoi_ms for p in updates]),
         views=mean_or_none([p.views for p in updates]) or 0.0,
         wait_ms=mean_or_none([p.update_ms for p in updates]) or 0.0,

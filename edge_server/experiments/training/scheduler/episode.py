@@ -51,6 +51,7 @@ Image = Callable[[str, float], NDArray[np.uint8]]
 # Number of episodes whose images and warm fields a process keeps.
 _EPISODES_KEPT = 32
 _TRUTHS_KEPT = 8192
+SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
 # The first decision of the deployment's own edge: never within an episode.
 _NEVER_MS = 1e11
 
@@ -298,7 +299,7 @@ class Episode:
         views = self._decoded(chosen)
         if not views:
             waited_ms = (choice.at_ns - moment.now_ns) / 1e6
-            return Outcome(None, None, None, None, None, None, 0.0, waited_ms)
+            return Outcome(**dict.fromkeys(SCORES), aaoi_ms=None, views=0.0, wait_ms=waited_ms)
         treated = len(views) if choice.treatment else 0
         published_ns = choice.at_ns + setting.compute.charge_ns(setting.steps, treated)
         shown = views
@@ -317,15 +318,10 @@ class Episode:
             field.load_state(warm)
         field.fit(shown, Budget(steps=setting.steps))
         score = self._truth.score(field.snapshot(published_ns), published_ns)
-        ages_ms = [(published_ns - view.generated_ns) / 1e6 for view in views]
-        views_used, wait_ms = float(len(views)), (published_ns - moment.now_ns) / 1e6
-        aaoi_ms = float(np.mean(ages_ms))
-        if score is None:
-            return Outcome(None, None, None, None, None, aaoi_ms, views_used, wait_ms)
-        return Outcome(
-            score.psnr_db, score.psnr_moving_db, score.ssim, score.lpips, score.perceptual, aaoi_ms,
-            views_used, wait_ms,
-        )  # fmt: skip
+        scores = {name: None if score is None else getattr(score, name) for name in SCORES}
+        aaoi_ms = float(np.mean([(published_ns - view.generated_ns) / 1e6 for view in views]))
+        wait_ms = (published_ns - moment.now_ns) / 1e6
+        return Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
 
     def _moment(self, number: int) -> DecisionPoint:
         now_ns = self.instants_ns[number]

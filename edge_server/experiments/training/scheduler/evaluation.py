@@ -70,7 +70,7 @@ class Evaluation:
     def term(self, name: str, term: str) -> Interval:
         """Mean of one field of the outcomes, over seeds."""
         found = {at: _mean([getattr(o, term) for o in self._fits(name, at)]) for at in self.outcomes[name]}
-        return interval(list(_by_seed(found).values()))
+        return interval(_by_seed(found).values())
 
     def best_fixed(self, kind: str) -> tuple[PerSeed, str]:
         """Rewards of ``kind`` (threshold, wait) at its best value, chosen on one half of the seeds and
@@ -79,7 +79,7 @@ class Evaluation:
             float(name.partition(":")[2]): self.rewards(name)
             for name in self.outcomes if name.startswith(f"{kind}:")
         }  # fmt: skip
-        means = {x: interval(list(values.values())).mean for x, values in curve.items()}
+        means = {x: interval(values.values()).mean for x, values in curve.items()}
         best = max(means, key=lambda x: means[x])
         return dict(at_its_best(curve)), f"{kind}:{best:g}"
 
@@ -195,7 +195,7 @@ def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
     for name in [*evaluation.outcomes, HINDSIGHT]:
         mine = evaluation.rewards(name)
         intervals = {
-            "reward": interval(list(mine.values())),
+            "reward": interval(mine.values()),
             "over_random": paired(mine, evaluation.rewards("random")),
             "share": evaluation.share(mine),
         }

@@ -59,16 +59,16 @@ def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
     return {
         "seeds": evaluation.seeds(trained)[1],
         "seeds_without_value": evaluation.seeds(trained)[0] - evaluation.seeds(trained)[1],
-        "reward": _as_list(interval(list(mine.values()))),
-        "rewards": {n: _as_list(interval(list(evaluation.rewards(n).values())))
+        "reward": interval(mine.values()).rounded(6),
+        "rewards": {n: interval(evaluation.rewards(n).values()).rounded(6)
                     for n in (*evaluation.outcomes, HINDSIGHT)},
-        "over_random": _as_list(paired(mine, evaluation.rewards("random"))),
-        "over_best_fixed": _as_list(paired(mine, best)),
+        "over_random": paired(mine, evaluation.rewards("random")).rounded(6),
+        "over_best_fixed": paired(mine, best).rounded(6),
         "best_fixed": name,
-        "share": _as_list(evaluation.share(mine)),
-        "best_fixed_share": _as_list(evaluation.share(best)),
+        "share": evaluation.share(mine).rounded(6),
+        "best_fixed_share": evaluation.share(best).rounded(6),
         "best_value_by_decision": best_values["quartiles"],
-        "knowing_it_is_worth": _as_list(best_values["gain"]),
+        "knowing_it_is_worth": best_values["gain"].rounded(6),
     }  # fmt: skip
 
 
@@ -80,7 +80,7 @@ def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:
     drawn, known = evaluation.seeds(trained)
     lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
     return [
-        f"reward {span(interval(list(mine.values())))} on {known} unseen seeds{lacking}",
+        f"reward {span(interval(mine.values()))} on {known} unseen seeds{lacking}",
         f"over random {span(paired(mine, random))}, over the best fixed {fixed} ({name}) "
         f"{span(paired(mine, best))}",
         f"share of what could be won: {span(evaluation.share(mine), 2)}; the best fixed {fixed} has "
@@ -99,7 +99,7 @@ def quartiles(best_values: dict[str, Any]) -> str:
 def percent(values: PerSeed, base: PerSeed) -> str:
     """Gain in mean reward over ``base`` in percent of its size, as in the thesis. The text says that there is
     none where the arbitrary zero of the reward lies near ``base`` or between the two."""
-    a, b = interval(list(values.values())), interval(list(base.values()))
+    a, b = interval(values.values()), interval(base.values())
     if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
         return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"
     return f"{100.0 * (a.mean - b.mean) / abs(b.mean):+.1f} %"
@@ -110,10 +110,6 @@ def span(i: Interval, digits: int = 4) -> str:
     if i.count < 2 or np.isnan(i.low):
         return f"{i.mean:.{digits}f}"
     return f"{i.mean:.{digits}f} [{i.low:.{digits}f}, {i.high:.{digits}f}]"
-
-
-def _as_list(i: Interval) -> list[float | None]:
-    return [None if np.isnan(v) else round(v, 6) for v in (i.mean, i.low, i.high)]
 
 
 def _numbers(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:

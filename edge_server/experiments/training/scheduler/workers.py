@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -61,14 +62,9 @@ def _evaluate(setting: Setting, folders: Folders, requests: Sequence[Request]) -
     return found
 
 
-def _play(setting: Setting, folders: Folders, tries: Sequence[tuple[int, Actor, int]]) -> list[list[Decided]]:
-    return [play(_factory(setting, folders), *one) for one in tries]
-
-
-def _judge(
-    setting: Setting, folders: Folders, runs: Sequence[tuple[int, str | Actor]]
-) -> list[dict[str, Any]]:
-    return [judge(_factory(setting, folders), *one) for one in runs]
+def _each(work: Callable[..., Any], setting: Setting, folders: Folders, asked: Sequence[Any]) -> list[Any]:
+    """``work`` of the setting's factory and the further arguments of each that is asked for."""
+    return [work(_factory(setting, folders), *one) for one in asked]
 
 
 def _init_process() -> None:
@@ -170,12 +166,15 @@ class WorkerPool:
         self, setting: Setting, seeds: Sequence[int], actor: Actor, tries: int
     ) -> list[list[list[Decided]]]:
         """The decisions of every try of each episode in which ``actor`` decides."""
-        sent = [self._send(s, _play, setting, [(s, actor, turn) for turn in range(tries)]) for s in seeds]
+        work = partial(_each, play)
+        sent = [self._send(s, work, setting, [(s, actor, turn) for turn in range(tries)]) for s in seeds]
         return [one.result() for one in sent]
 
     def judge(self, setting: Setting, seeds: Sequence[int], who: str | Actor) -> Iterator[dict[str, Any]]:
         """``deployed.judge`` of each episode."""
-        sent: Iterable[Future[list[Any]]] = (self._send(s, _judge, setting, [(s, who)]) for s in seeds)
+        sent: Iterable[Future[list[Any]]] = (
+            self._send(s, partial(_each, judge), setting, [(s, who)]) for s in seeds
+        )
         # In this process one is done when it is sent: each is given as soon as it is.
         for one in sent if self.jobs == 1 else list(sent):
             yield one.result()[0]

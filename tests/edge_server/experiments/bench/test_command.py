@@ -66,6 +66,19 @@ def test_field(tmp_path, monkeypatch):
     assert "| tile | ngp | 1 | 0.3: " in (tmp_path / "bench.md").read_text()
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """What is asked for of ``bench field``, where nothing is measured."""
+    found = []
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: found.append(name) or _curve(name, *rest))
+    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: {})
+    monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: found.append(f"start {name}") or {})
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "SIZE", 24)
+    return found
+
+
 def _curve(name, still, planned_s, seeds, lpips):
     """What ``bench field`` measures, without measuring: of two seeds, a dB more every point."""
     series = {f"{s:g}_s": {"seconds": s, "fitted_s": s, "psnr_db": 24.0 + k} for k, s in enumerate(planned_s)}
@@ -73,18 +86,13 @@ def _curve(name, still, planned_s, seeds, lpips):
     return {"seeds": seeds, "series": series, "seconds_to_db": to_db, "best_db": 25.0, "outside_cores": 0.25}
 
 
-def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
-    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, asked):
     rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
              "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
     starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
               "jit_cached_cpu_s": 0.25, "peak_rss_mb": 456.0}  # fmt: skip
-    asked = []
-    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: asked.append(name) or _curve(name, *rest))
     monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: dict(rates))
     monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
-    monkeypatch.setattr(bench_field, "SIZE", 32)
     path = tmp_path / "results" / "field.json"
     found = bench("field", path, "--field", "ngp")
     text = path.with_suffix(".md").read_text()
@@ -117,17 +125,10 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
+def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch, asked):
     """And of another effort; everything else is taken for known."""
-    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    asked = []
-    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: asked.append(name) or _curve(name, *rest))
-    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: {})
-    monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: asked.append(f"start {name}") or {})
     monkeypatch.setattr(bench_field, "table", lambda figures: "")
     monkeypatch.setattr(bench_field, "draw", lambda figures, path: None)
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
-    monkeypatch.setattr(bench_field, "SIZE", 24)
     words = ("--resume", "--field", "ngp,voxel")
     bench("field", tmp_path / "bench.json", *words)
     everything = ["start ngp", "start voxel", "ngp", "voxel", "ngp", "voxel"]
@@ -173,9 +174,8 @@ def test_limits(tmp_path):
     for field, scene in product(of, ("tile", "room")):
         about = found[f"{field} on {scene}"]
         kernels = about["kernels"]
-        assert sum(k["share"] for k in kernels.values()) == pytest.approx(
-            1.0 - about["outside_kernels_share"]
-        )
+        shares = [about["outside_kernels_share"], *(k["share"] for k in kernels.values())]
+        assert sum(shares) == pytest.approx(1.0)
         for name in of[field]:
             assert 0.0 < kernels[name]["floor_share"] < 1.0  # faster than possible: a wrong count
             assert f"| {field} on {scene} | {name} | {kernels[name]['ms_a_step']:.2f} |" in table

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import json
 
-import pytest
-
 from edge_server.experiments.common import result_store
-from edge_server.experiments.common.result_store import Interrupted, ResultStore, content_key
+from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.tables import markdown_table, number
 from freshfield.files import write_csv
 
@@ -29,19 +27,6 @@ def test_a_known_result_of_the_same_settings_is_not_computed_again():
     other = again.get("room", "ngp", compute=lambda: {"db": 21.0}, settings={"seconds": (3.0,)})
     assert other["db"] == 21.0 and again.find("room", "ngp", settings={"seconds": (1.0, 2.0)}) is None
     assert again.find("room", "ngp", "deeper") is None and again.find("attic") is None
-
-
-def test_an_interrupted_result_is_kept_and_counts_as_missing():
-    saved = []
-
-    def stopped():
-        raise Interrupted({"updates": 3})
-
-    store = ResultStore(save=lambda path, result: saved.append(result))
-    with pytest.raises(KeyboardInterrupt):
-        store.get("ngp", compute=stopped)
-    assert saved == [{"updates": 3, "interrupted": True}] and store.find("ngp") is None
-    assert store.get("ngp", compute=lambda: {"updates": 9}) == {"updates": 9}
 
 
 def test_lines_outlive_the_process_and_a_torn_last_one_counts_as_none(tmp_path):

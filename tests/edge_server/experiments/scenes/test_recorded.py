@@ -13,23 +13,12 @@ from tests.conftest import data_dir
 from tests.edge_server.experiments.sets import write_photos, write_recording
 
 
-def test_every_kth_view_is_held_out(tmp_path):
+@pytest.mark.parametrize(("holdout", "numbers"), [("4", (0, 4, 8)), ("001, ./images/003", (1, 3)), ("0", ())])
+def test_every_kth_view_or_named_ones_or_none_are_held_out(tmp_path, holdout, numbers):
     write_photos(tmp_path, 9)
-    found = load_recorded(tmp_path, "4")
-    assert [v.camera for v in found.held_out] == ["./images/000", "./images/004", "./images/008"]
-    assert len(found.training) == 6
-    assert found.file.name == "transforms_train.json"
-
-
-def test_named_images_are_held_out_by_stem_name_or_path(tmp_path):
-    write_photos(tmp_path, 5)
-    found = load_recorded(tmp_path, "001, ./images/003")
-    assert [v.camera for v in found.held_out] == ["./images/001", "./images/003"]
-
-
-def test_zero_holds_out_nothing(tmp_path):
-    write_photos(tmp_path, 3)
-    assert load_recorded(tmp_path, "0").held_out == ()
+    found = load_recorded(tmp_path, holdout)
+    assert [v.camera for v in found.held_out] == [f"./images/{n:03d}" for n in numbers]
+    assert len(found.training) == 9 - len(numbers) and found.file.name == "transforms_train.json"
 
 
 def test_a_moving_set_is_one_instant_of_each_camera(tmp_path):
@@ -68,13 +57,12 @@ def test_a_holdout_that_cannot_work_is_said(tmp_path, holdout, message):
 
 
 def test_missing_folder_and_empty_folder_are_said(tmp_path):
-    with pytest.raises(DatasetError, match="no such file or folder"):
-        load_recorded(tmp_path / "nowhere")
-    with pytest.raises(DatasetError, match=r"expected transforms\.json"):
-        load_recorded(tmp_path)
+    (tmp_path / "empty").mkdir()
     (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(DatasetError, match="cannot be read as JSON"):
-        load_recorded(tmp_path)
+    for folder, said in (("nowhere", "no such file or folder"), ("empty", r"expected transforms\.json"),
+                         (".", "cannot be read as JSON")):  # fmt: skip
+        with pytest.raises(DatasetError, match=said):
+            load_recorded(tmp_path / folder)
 
 
 @pytest.mark.parametrize(

@@ -15,18 +15,8 @@ from edge_server.experiments.studies.trial import Trial, last_images, run_trial
 from freshfield.scenario import ScenarioError
 
 TINY = {"gaussians": 256, "start": 256}
-TRIAL = Trial(
-    "room",
-    1,
-    {"preset": "ch5"},
-    "threshold",
-    120.0,
-    size=24,
-    cameras=5,
-    field_options=TINY,
-    steps=4,
-    lpips=False,
-)
+TRIAL = Trial("room", 1, {"preset": "ch5"}, "threshold", 120.0, size=24, cameras=5, field_options=TINY,
+              steps=4, lpips=False)  # fmt: skip
 NO_DATA = Folders()
 
 
@@ -36,11 +26,8 @@ def quiet(_: str) -> None:
 
 def trials() -> list[Trial]:
     found = [replace(TRIAL, seed=s, value=g) for s in (1, 2) for g in (40.0, 400.0)]
-    return [
-        *found,
-        replace(TRIAL, policy="wait-flush", value=90.0),
-        replace(TRIAL, channel={"preset": "ideal"}),
-    ]
+    flush, ideal = {"policy": "wait-flush", "value": 90.0}, {"channel": {"preset": "ideal"}}
+    return [*found, replace(TRIAL, **flush), replace(TRIAL, **ideal)]
 
 
 def test_a_trial_repeats_bit_for_bit_whatever_ran_before_it():

@@ -14,7 +14,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies.age import omega, trade_map
 from edge_server.experiments.studies.command import CAPTURING, LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
-from edge_server.experiments.studies.study import Point, StudyRequest, Table, run_study
+from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, run_study
 from edge_server.scheduler import make_policy
 
 NAMES = [n for n in STUDIES if n not in ("metrics", *CAPTURING, *LEARNING)]
@@ -56,9 +56,8 @@ def noise(seed: int, value: float | None) -> float:
 def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
     study = make_study(name)
     points = study.points(StudyRequest(quick, tmp_path, Folders(), seeds=1))
-    assert points and len({(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}) == len(
-        points
-    )
+    distinct = {(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}
+    assert points and len(distinct) == len(points)
     for point in points:
         scenario = point.trial.scenario()
         assert len(scenario.training) == 18 and scenario.held_out
@@ -77,12 +76,15 @@ def peak(at: float):
     return rule
 
 
-def verdicts(name: str, tmp_path: Path, rule, **more: Any) -> dict[str, str]:
-    found = run_study(
-        make_study(name), request(tmp_path, seeds=6, scenes=("room",), **more), invented(tmp_path, rule)
-    )
+def judged(name: str, tmp_path: Path, rule, seeds: int = 6) -> list[Verdict]:
+    """The verdicts on a study of ``room`` whose results follow a rule."""
+    of_room = request(tmp_path, seeds=seeds, scenes=("room",))
+    return run_study(make_study(name), of_room, invented(tmp_path, rule))
+
+
+def verdicts(name: str, tmp_path: Path, rule) -> dict[str, str]:
     # Of two verdicts on one thing, the first.
-    return {v.about: v.verdict for v in reversed(found)}
+    return {v.about: v.verdict for v in reversed(judged(name, tmp_path, rule))}
 
 
 @pytest.fixture(autouse=True)
@@ -147,10 +149,7 @@ def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, onl
 
 def test_one_seed_decides_nothing(tmp_path: Path):
     for name in ("mat", "mat-delay", "lambda", "omega", "images", "phase"):
-        found = run_study(
-            make_study(name), request(tmp_path, seeds=1, scenes=("room",)), invented(tmp_path, peak(90.0))
-        )
-        assert {v.verdict for v in found} == {"undecided"}, name
+        assert {v.verdict for v in judged(name, tmp_path, peak(90.0), seeds=1)} == {"undecided"}, name
 
 
 def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
@@ -167,9 +166,8 @@ def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_pat
 
 def test_lambda_leaves_noise_undecided(tmp_path: Path):
     def rule(trial):
-        return figures(
-            4.0 * noise(trial.seed, trial.value), 100.0 + 2000.0 * noise(trial.seed + 9, trial.value)
-        )
+        age = 100.0 + 2000.0 * noise(trial.seed + 9, trial.value)
+        return figures(4.0 * noise(trial.seed, trial.value), age)
 
     assert "holds" not in verdicts("lambda", tmp_path, rule).values()
 
@@ -189,17 +187,13 @@ def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
 
 
 def test_images_judges_both_directions(tmp_path: Path):
-    def rule(trial):
-        count = trial.value or 18.0
-        return figures(math.log(count) + noise(trial.seed, count), 10.0 * count)
+    for sign, answer in ((1, "holds"), (-1, "does not hold")):
 
-    assert set(verdicts("images", tmp_path, rule).values()) == {"holds"}
+        def rule(trial, sign=sign):
+            count = trial.value or 18.0
+            return figures(sign * math.log(count) + noise(trial.seed, count), 30.0 * count**sign)
 
-    def wrong(trial):
-        count = trial.value or 18.0
-        return figures(-math.log(count) + noise(trial.seed, count), 100.0 / count)
-
-    assert set(verdicts("images", tmp_path, wrong).values()) == {"does not hold"}
+        assert set(verdicts("images", tmp_path, rule).values()) == {answer}
 
 
 def test_representations_asks_all_of_them(tmp_path: Path):
@@ -218,13 +212,12 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
         gain = 2.0 if trial.channel.get("preset") == "ideal" else gains[trial.policy]
         return figures(gain + noise(trial.seed, trial.value), 50.0)
 
-    study = make_study("phase")
-    found = run_study(study, request(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    found = judged("phase", tmp_path, rule)
     trade, mask, freshen = (found[i::3] for i in range(3))
     assert {v.verdict for v in (*trade, *freshen, *mask)} == {"holds"}
     assert "75 % [7" in freshen[0].found and "no delay is 2.00" in trade[0].found
     gains |= {"threshold": -1.0, "mask": -1.5, "freshen": 2.1}
-    found = run_study(study, request(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    found = judged("phase", tmp_path, rule)
     trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
     assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
     assert (tmp_path / "phase-room.png").exists()

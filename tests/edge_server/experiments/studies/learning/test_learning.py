@@ -23,6 +23,7 @@ from edge_server.experiments.studies.learning import (
     setup,
     state_ablation,
     transfer,
+    workshop,
 )
 from edge_server.experiments.studies.learning.setup import better, no_worse
 from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, StudyRequest, Verdict
@@ -54,12 +55,10 @@ def small(monkeypatch):
         if name != "semantics":
             monkeypatch.setattr(f"{module}.room", room)
         monkeypatch.setattr(f"{module}.EPISODES", {True: 3, False: 3})
-    monkeypatch.setattr("edge_server.experiments.studies.learning.workshop.room", room)
-    monkeypatch.setattr(
-        "edge_server.experiments.studies.learning.reward_cost.EPISODES_BY_DIM", {True: 3, False: 3}
-    )
-    monkeypatch.setattr("edge_server.experiments.studies.learning.channel_drift.BEFORE", 2)
-    monkeypatch.setattr("edge_server.experiments.studies.learning.channel_drift.AFTER", 22)
+    monkeypatch.setattr(workshop, "room", room)
+    monkeypatch.setattr(reward_cost, "EPISODES_BY_DIM", {True: 3, False: 3})
+    monkeypatch.setattr(channel_drift, "BEFORE", 2)
+    monkeypatch.setattr(channel_drift, "AFTER", 22)
 
 
 @pytest.mark.slow
@@ -86,22 +85,22 @@ def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tm
     verdicts = make_study("ppo-wait").report(request, None)
     assert all(v.about.startswith("room, ch6, age -0.003/ms") for v in verdicts)
     logs = list((tmp_path / "training").glob("ppo-wait-ch6-0.003-*/training.jsonl"))
-    assert len(logs) == 4 and all(
-        json.loads(log.read_text().splitlines()[-1])["episodes"] == 4 for log in logs
-    )
+    assert [json.loads(log.read_text().splitlines()[-1])["episodes"] for log in logs] == [4] * 4
 
 
-def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path, capsys):
-    words = ["ppo-wait", "--quick", "--out", str(tmp_path), "--case", "ch7"]
-    assert command.main(words) == 2
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["ppo-wait", "--case", "ch7"], ("none has 'ch7' in its name", "ch6-slow, age -0.015/ms")),
+        (["mat", "--case", "room"], ("--case is for ppo-select",)),
+        (["mat", "--episodes", "3"], ("--episodes is for ppo-select",)),
+        (["ppo-wait", "--episodes", "0"], ("--episodes: expected 1",)),
+    ],
+)
+def test_a_case_that_there_is_not_is_refused_with_those_there_are(words, said, tmp_path: Path, capsys):
+    assert command.main([*words, "--quick", "--out", str(tmp_path)]) == 2
     text = capsys.readouterr().err
-    assert "none has 'ch7' in its name" in text and "ch6-slow, age -0.015/ms" in text
-    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--case", "room"]) == 2
-    assert "--case is for ppo-select" in capsys.readouterr().err
-    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--episodes", "3"]) == 2
-    assert "--episodes is for ppo-select" in capsys.readouterr().err
-    assert command.main(["ppo-wait", "--quick", "--out", str(tmp_path), "--episodes", "0"]) == 2
-    assert "--episodes: expected 1" in capsys.readouterr().err
+    assert all(part in text for part in said)
 
 
 def evaluation_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
@@ -113,7 +112,7 @@ def evaluation_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
     for into in (found.outcomes, found.repeated):
         for name, level in levels.items():
             psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
-            into[name] = {at: Outcome(v, None, None, None, None, 50.0, 3.0, 0.0) for at, v in psnr.items()}
+            into[name] = {at: Outcome(v, *[None] * 4, 50.0, 3.0, 0.0) for at, v in psnr.items()}
     return found
 
 
@@ -226,9 +225,8 @@ def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap,
     # What happens to the dear one after the cheap one has ended does not count.
     (_, time) = reward_cost.judge(evaluation_of(levels), (1, 10), {10: [2.0, 20.0], 50: [15.0, 21.0]})
     assert time.verdict == said and "after 20.0 and 15.0 s" in time.found
-    (dim,) = reward_cost.judge_dims(
-        {f"d = {d}": evaluation_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
-    )
+    of_dims = {f"d = {d}": evaluation_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
+    (dim,) = reward_cost.judge_dims(of_dims)
     assert dim.verdict == said
 
 

@@ -27,10 +27,6 @@ def true(*rows):
     return np.array(rows, dtype=float).reshape(-1, 4)
 
 
-def at_half(detected, truth) -> float:
-    return float(average_precision(detected, truth)[0])
-
-
 def test_overlap():
     shifted = [5.0, 0.0, 15.0, 10.0]
     assert box_iou(true(A, B), true(A, shifted, FAR)) == pytest.approx(
@@ -43,25 +39,23 @@ def test_everything_found_and_nothing_else():
     assert average_precision([found([*A, 0.9], [*B, 0.3])], [true(A, B)]) == pytest.approx(np.ones(10))
 
 
-def test_half_found():
-    # Precision 1 up to recall one half: 51 of 101 recalls, 0 beyond.
-    assert at_half([found([*A, 0.9])], [true(A, B)]) == pytest.approx(51 / 101)
-
-
-def test_a_false_alarm_costs_only_where_it_scores_higher():
-    assert at_half([found([*A, 0.9], [*FAR, 0.1])], [true(A)]) == pytest.approx(1.0)
-    assert at_half([found([*A, 0.1], [*FAR, 0.9])], [true(A)]) == pytest.approx(0.5)
-
-
-def test_a_second_detection_of_one_thing_is_false():
-    # Right, wrong, right: precision 1 up to recall one half, then 2/3.
-    score = at_half([found([*A, 0.9], [*A, 0.8], [*B, 0.7])], [true(A, B)])
-    assert score == pytest.approx((51 + 50 * 2 / 3) / 101)
-
-
-def test_scores_are_ranked_over_all_images():
-    first = at_half([found([*FAR, 0.9]), found([*A, 0.5])], [true(A), true(A)])
-    assert first == pytest.approx(51 * 0.5 / 101)
+@pytest.mark.parametrize(
+    ("images", "truth", "ap"),
+    [
+        # Precision 1 up to recall one half: 51 of 101 recalls, 0 beyond.
+        ([[(A, 0.9)]], [[A, B]], 51 / 101),
+        # A false alarm costs only where it scores higher.
+        ([[(A, 0.9), (FAR, 0.1)]], [[A]], 1.0),
+        ([[(A, 0.1), (FAR, 0.9)]], [[A]], 0.5),
+        # A second detection of one thing is false. Right, wrong, right: 1 up to recall one half, then 2/3.
+        ([[(A, 0.9), (A, 0.8), (B, 0.7)]], [[A, B]], (51 + 50 * 2 / 3) / 101),
+        # Scores are ranked over all images.
+        ([[(FAR, 0.9)], [(A, 0.5)]], [[A], [A]], 51 * 0.5 / 101),
+    ],
+)
+def test_cases_worked_out_by_hand(images, truth, ap):
+    detected = [found(*([*box, score] for box, score in image)) for image in images]
+    assert average_precision(detected, [true(*boxes) for boxes in truth])[0] == pytest.approx(ap)
 
 
 def test_stricter_overlaps_count_for_less():

@@ -89,12 +89,12 @@ def test_shapes_are_kinds():
     assert kind_of(RoundCone(0.2, 0.1, 0.5), np.eye(4)) is None
 
 
-def test_a_seed_makes_one_world_and_purposes_share_none():
-    def pictures(seed, purpose):
-        made, rng = variation(seed, purpose, 64)
-        made = dataclasses.replace(made, supersample=1)
-        return made.take(list(rng.uniform(0, 6, 2)))
+def pictures(seed: int, purpose: str):
+    made, rng = variation(seed, purpose, 64)
+    return dataclasses.replace(made, supersample=1).take(list(rng.uniform(0, 12, 2)))
 
+
+def test_a_seed_makes_one_world_and_purposes_share_none():
     first, again = pictures(3, "train"), pictures(3, "train")
     assert (first[0] == again[0]).all() and all((a == b).all() for a, b in zip(first[1], again[1]))
     assert not (first[0] == pictures(3, "held-out")[0]).all()
@@ -103,9 +103,7 @@ def test_a_seed_makes_one_world_and_purposes_share_none():
 def test_every_kind_turns_up_and_boxes_lie_in_the_picture():
     seen = set()
     for seed in range(16):
-        made, rng = variation(seed, "train", 64)
-        made = dataclasses.replace(made, supersample=1)
-        for boxes in made.take(list(rng.uniform(0, 12, 2)))[1]:
+        for boxes in pictures(seed, "train")[1]:
             assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:4] <= 64).all()
             assert (boxes[:, 2:4] - boxes[:, :2] >= 5).all()
             seen |= set(boxes[:, 4].astype(int))

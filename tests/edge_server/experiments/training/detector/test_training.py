@@ -72,10 +72,8 @@ def test_the_cells_that_fit_best_are_taken_and_scored_by_how_well_they_fit():
     centres = cells[holds, :2]
     assert ((centres > 16) & (centres < 48)).all(), "inside, or half a stride beside"
     distance = (centres - 32).norm(dim=1)
-    assert (
-        float(score[distance.argmin()]) == pytest.approx(float(score.max()), rel=1e-4)
-        and 0.0 < score.max() <= 1.0
-    )
+    assert float(score[distance.argmin()]) == pytest.approx(float(score.max()), rel=1e-4)
+    assert 0.0 < score.max() <= 1.0
 
 
 def test_an_untrained_network_gives_every_thing_a_cell():

@@ -17,7 +17,7 @@ BY_PSNR = Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0)
 
 
 def outcome(psnr_db: float | None) -> Outcome:
-    return Outcome(psnr_db, None, None, None, None, None, 1.0, 0.0)
+    return Outcome(psnr_db, *[None] * 5, views=1.0, wait_ms=0.0)
 
 
 def evaluation_of(rng: np.random.Generator, matters: float, twice: bool = True) -> Evaluation:
