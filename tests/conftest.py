@@ -38,7 +38,7 @@ _SIDE_BY_SIDE = (
     "channel_emu/estimate", "channel_emu/model", "channel_emu/virtual", "edge_server/embed",
     "edge_server/experiments", "edge_server/export", "edge_server/fidelity", "edge_server/fields",
     "edge_server/report", "edge_server/scheduler", "edge_server/surface", "edge_server/treatments",
-    "stability", "test_lazy_imports.py",
+    "fuzz", "stability", "test_lazy_imports.py",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
 )  # fmt: skip
 

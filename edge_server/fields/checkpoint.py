@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 _FORMAT = "freshfield-{kind}-1"
+# RuntimeError: a zip file of a later version, encrypted, or packed in another way.
+_UNREADABLE = (
+    OSError, ValueError, TypeError, EOFError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
 
 
 class CheckpointError(ValueError):
@@ -80,7 +86,7 @@ def load(
         raise CheckpointError(f"{path}: damaged: it claims arrays that no memory holds") from None
     except KeyError:
         raise CheckpointError(f"{path}: an npz file, but not a {kind}'s checkpoint") from None
-    except (OSError, ValueError, TypeError, EOFError, RecursionError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise CheckpointError(f"{path}: damaged or not a checkpoint ({error})") from None
     if not isinstance(facts, dict) or facts.get("format") != expected:
         raise CheckpointError(f"{path}: written in another format than {expected}")

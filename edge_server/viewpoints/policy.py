@@ -149,21 +149,27 @@ def train_policy(
     it with the mean return of each update (figure 4.6).
 
     embeddings: (N, d) of the candidates' pictures, which the policy sees once they are captured; embed: makes
-        them, for its later use. ViewpointError for fewer reachable
-    candidates than views.
+        them, for its later use.
+
+    Raises ViewpointError for fewer reachable candidates than views, and for fewer than two views: the first
+    is drawn.
     """
     import torch
 
     usable = np.flatnonzero(candidates.reachable)
-    if len(usable) < config.views:
-        raise ViewpointError(f"{len(usable)} candidates can be reached, an episode has {config.views} views")
+    if not 2 <= config.views <= len(usable):
+        raise ViewpointError(
+            f"{len(usable)} candidates can be reached, an episode has {config.views} views, at least 2"
+        )
     rng = np.random.default_rng(seed)
     steps = StepFeatures(candidates)
     layout = layout_of(steps, embeddings, config.views, rng)
     spec = Spec("select", layout, hidden=config.hidden, learning_rate=config.learning_rate)
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
-    scale = max(float(usual.std()), 1e-9)
+    # Rounding makes steps of equal reward differ by 1e-16: as a unit, it would blow the rewards up.
+    spread = float(usual.std())
+    scale = spread if spread > 1e-9 * float(np.abs(usual).max()) else 1.0
     actor = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_actor(spec, rng).items()}
     critic = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_value(spec, rng).items()}
     parameters = [*actor.values(), *critic.values()]

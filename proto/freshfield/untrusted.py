@@ -44,8 +44,9 @@ def read_yaml(text: str) -> Any:
     """The value of a YAML document, of plain types only; references are allowed. Raises UntrustedError."""
     if len(text) > MAX_YAML_CHARS:
         raise UntrustedError(f"not YAML: {len(text)} characters, more than {MAX_YAML_CHARS}")
-    loader = yaml.SafeLoader(text)
+    loader = None
     try:
+        loader = yaml.SafeLoader(text)  # refuses some characters at once
         node = loader.get_single_node()
         if node is None:
             return None
@@ -58,7 +59,8 @@ def read_yaml(text: str) -> Any:
     except (yaml.YAMLError, ValueError) as error:  # numbers and dates that are none raise a plain ValueError
         raise UntrustedError(f"not YAML: {' '.join(str(error).split())}") from None
     finally:
-        loader.dispose()
+        if loader is not None:
+            loader.dispose()
 
 
 def _node_parts(node: Any) -> Iterable[Any]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from freshfield.geometry import look_at
+from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.edge_server.fields.small import NAMES, every_field, healthy, reaches, tiny
 
@@ -36,6 +36,52 @@ def test_one_pixel(name: str, changed: dict[str, Any]) -> None:
     field = tiny(name, **changed)
     field.fit([view], Budget(steps=30))
     healthy(field, [view])
+
+
+@every_field
+def test_pictures_of_one_row_and_of_one_column(name: str) -> None:
+    field = tiny(name)
+    for width, height in ((4096, 1), (1, 4096)):
+        camera = Pinhole(width, height, 3500.0, 3500.0, width / 2, height / 2)
+        views = [replace(v, image=picture(camera, v.camera_to_world), intrinsics=camera) for v in VIEWS[:3]]
+        field.fit(views, Budget(steps=20))
+        healthy(field, views)
+        assert mean_psnr(field, views) > 9.0
+
+
+@every_field
+def test_a_scene_ten_kilometres_away_is_learned_as_here(name: str) -> None:
+    """A float32 of ten kilometres has steps of a millimetre."""
+    away = np.eye(4)
+    away[:3, 3] = 1e4, -1e4, 1e4
+    views = [replace(v, camera_to_world=away @ v.camera_to_world) for v in VIEWS]
+    fields = tiny(name), tiny(name)
+    for field, seen in zip(fields, (VIEWS, views)):
+        field.fit(seen, Budget(steps=60))
+        healthy(field, seen)
+    assert abs(mean_psnr(fields[1], views) - mean_psnr(fields[0], VIEWS)) < 0.01
+
+
+@every_field
+def test_two_hundred_cameras(name: str) -> None:
+    views = ring(200, size=16)
+    field = tiny(name)
+    field.fit(views, Budget(steps=40))
+    healthy(field, views)
+    assert mean_psnr(field, views[::20]) > 15.0
+
+
+@every_field
+def test_cameras_a_ten_millionth_of_a_metre_apart_and_from_straight_down(name: str) -> None:
+    for eye in ((2.5, 0.0, 1.0), (0.0, 0.0, 2.5)):
+        poses = [
+            look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)
+        ]
+        views = [replace(v, camera_to_world=p, image=picture(v.intrinsics, p)) for v, p in zip(VIEWS, poses)]
+        field = tiny(name)
+        field.fit(views, Budget(steps=40))
+        healthy(field, views)
+        assert mean_psnr(field, views) > 14.0
 
 
 @pytest.mark.parametrize("value", [0, 255, 77])

@@ -75,8 +75,8 @@ def test_zero_delay_delivers_at_once() -> None:
 def test_a_late_caller_gets_the_punctual_decisions() -> None:
     """Told of 30 ms at once, newest-waits starts the waiting frame when the first was due, not when told."""
     subject = link("newest-waits", [10, 5])
-    subject.offer(0)
-    subject.offer(2 * MS)
+    assert subject.offer(0)[0].drawn_ns == 10 * MS
+    assert subject.offer(2 * MS)[0].drawn_ns is None
     events = subject.advance(30 * MS)
     assert [(e.kind, e.at_ns / MS) for e in events] == [("delivered", 10), ("started", 10), ("delivered", 15)]
 

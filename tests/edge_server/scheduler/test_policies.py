@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_server.scheduler import POLICIES, Epoch, make_live_policy, make_policy
+from edge_server.scheduler import POLICIES, Epoch, make_live_policy, make_policy, policy_help
+from edge_server.scheduler.registry import resolve_checkpoint
 
 MS = 1_000_000
 
@@ -30,6 +31,7 @@ def test_all_takes_everything():
 
 
 def test_threshold_includes_the_age_of_exactly_omega():
+    assert [AT.age_ms(camera) for camera in "abcd"] == [10.0, 120.0, 50.0, 190.0]
     assert choose("threshold", AT, 50) == ("a", "c")
     assert choose("threshold", AT, 49.999) == ("a",)
 
@@ -48,6 +50,7 @@ def test_wait_counts_only_what_was_generated_after_the_decision():
 
 def test_wait_of_zero_uses_the_buffer_as_it_is():
     assert choose("wait", AT, 0) == ("a", "b", "c", "d")
+    assert make_policy("wait", 0, np.random.default_rng(0)).plan(AT).omega_ms == 0.0
 
 
 def test_freshest_k_and_its_ties():
@@ -109,8 +112,24 @@ def test_a_value_out_of_range_is_refused_by_name(name, value):
 
 
 def test_an_unknown_policy_lists_the_known_ones():
-    with pytest.raises(ValueError, match="freshest-k"):
-        make_policy("best", None, np.random.default_rng(0))
+    for name, why in (
+        ("best", "'best' is not known; choose one of .*freshest-k"), ("wait+", r"'wait\+' is not known"),
+        ("best+mask", "'best' is not known"),
+        ("wait+best", "no treatment 'best'; .* choose one of mask, freshen"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=why):
+            make_policy(name, None, np.random.default_rng(0))
+
+
+def test_names_of_treated_and_learned_policies_and_their_help(tmp_path):
+    assert make_policy("wait+mask", 40.0, np.random.default_rng(0)).name == "wait+mask"
+    assert policy_help("threshold") == "frames no older than omega (6.12-6.14)"
+    assert policy_help("mask") == "of stale views, pixels that were moving count for less"
+    assert policy_help("threshold+mask") == f"{policy_help('threshold')}; {policy_help('mask')}"
+    assert [policy_help(name) for name in ("best", "wait+best")] == ["", ""]
+    assert "learned" in policy_help("bandit:a.npz")
+    assert resolve_checkpoint("wait+mask", tmp_path) == "wait+mask"
+    assert resolve_checkpoint("bandit:a.npz", tmp_path) == f"bandit:{tmp_path}/a.npz"
 
 
 def test_flushing_is_asked_for_only_where_something_is_waited_for():

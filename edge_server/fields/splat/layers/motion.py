@@ -272,7 +272,9 @@ class Motion:
         covariance = by @ np.linalg.solve(self._precision(), by.T)
         traces = np.einsum("iaib->ab", covariance.reshape(3, count, 3, count)) / 3.0
         pairs = traces[anchor[:, :, None], anchor[:, None, :]]
-        return np.sqrt(np.einsum("ni,nj,nij->n", share, share, pairs)).astype(np.float32)
+        # Where views are surer by 1e15 than the prior, rounding leaves variances around 0.
+        variance = np.maximum(np.einsum("ni,nj,nij->n", share, share, pairs), 0.0)
+        return np.sqrt(variance).astype(np.float32)
 
     def _precision(self) -> NDArray[np.float64]:
         """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis,

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.fields.common.scene_box import converging_point, plain_background, scene_box
+from edge_server.fields.common.scene_box import (
+    _main_group,
+    converging_point,
+    plain_background,
+    scene_box,
+)
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import ring
 
@@ -24,6 +29,8 @@ def test_the_box_is_where_the_axes_meet() -> None:
     # Nothing is nearer to a lens than two fifths of the way: haze there would fit any picture.
     assert box.near_m == pytest.approx(0.4 * box.distance_m)
     np.testing.assert_allclose(box.normalise(np.array([0, 0, 0.4 + box.radius_m])), [0, 0, 1], atol=1e-6)
+    assert box.pixels_across == pytest.approx(2 * replace(box, contracted=False).pixels_across)
+    assert box.pixels_across == pytest.approx(4 * box.radius_m / box.distance_m * VIEWS[0].intrinsics.fx)
 
 
 def test_it_moves_and_scales_with_the_rig() -> None:
@@ -35,6 +42,16 @@ def test_it_moves_and_scales_with_the_rig() -> None:
     a, b = scene_box(VIEWS), scene_box(grown)
     assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
     np.testing.assert_allclose(b.centre_m, 100 * np.array(a.centre_m) + [5, 6, 7], atol=1e-6)
+
+
+def test_axes_that_meet_less_than_a_metre_ahead_meet() -> None:
+    np.testing.assert_allclose(scene_box(ring(8, size=16, distance_m=0.2)).centre_m, [0, 0, 0.4], atol=1e-6)
+
+
+def test_the_main_group_is_without_a_quarter_at_most() -> None:
+    places = np.random.default_rng(0).normal(size=(8, 3))
+    for far, kept in ((1, 7), (2, 6), (3, 8)):
+        assert len(_main_group(places + 1e3 * (np.arange(8) < far)[:, None])) == kept
 
 
 def test_transparent_pictures_show_an_object() -> None:

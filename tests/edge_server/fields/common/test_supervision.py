@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import View
-from edge_server.fields.common.supervision import check_view
+from edge_server.fields.common.scene_box import UNIT_BOX
+from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels, pack_views
 from tests.edge_server.fields.scenes import ring
 
 VIEW = ring(1, size=16)[0]
@@ -39,4 +40,24 @@ def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> No
 
 def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
     check_view(_posed(np.eye(3), 6e6))
+    check_view(_posed(np.eye(3), FARTHEST_M))
     check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=1e4, fy=1e4)))
+
+
+def test_pixels_move_where_they_change_beyond_the_noise_and_two_around() -> None:
+    before = replace(VIEW, image=np.full((16, 16, 3), 90, np.uint8))
+    for change, moves in ((CHANGE, False), (CHANGE + 1, True)):
+        image = before.image.copy()
+        image[4:11, 4:11, 2] += change  # blurring leaves the whole of it to the inner 5 x 5
+        moved = moved_pixels(before, replace(before, image=image))
+        assert (moved is not None) == moves
+    assert moved is not None
+    np.testing.assert_array_equal(np.argwhere(moved)[[0, -1]], [[3, 3], [11, 11]])
+    assert moved.sum() == 81
+
+
+def test_opaque_and_transparent_pictures_are_packed_together() -> None:
+    clear = replace(VIEW, camera="clear", image=np.full((16, 16, 4), 7, np.uint8))
+    packed = pack_views([VIEW, clear], UNIT_BOX, {})
+    np.testing.assert_array_equal(packed.pixels[:256, :3], VIEW.image.reshape(-1, 3))
+    assert (packed.pixels[:256, 3] == 255).all() and (packed.pixels[256:] == 7).all()

@@ -1,0 +1,247 @@
+"""What strangers may send or write, each as a function of bytes that raises only what it documents.
+
+Honest messages and files are made here, so that they stay honest; hostile ones, and whatever fuzzing once
+found, lie in ``corpus/TARGET/``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from camera_node.config import source_config
+from camera_node.sources.datasets import colmap, transforms
+from camera_node.sources.datasets.records import Dataset, DatasetError
+from channel_emu.live.frame_stream import damage_payload
+from channel_emu.model.config import channel_from_mapping
+from edge_server.config import read_config
+from edge_server.fields import checkpoint
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.ingest import Ingest
+from freshfield import payload, scenario
+from freshfield.clock import VirtualClock
+from freshfield.frame import FrameRejected, checksum, counted_ids, parse, to_request
+from freshfield.geometry import Pinhole
+from freshfield.v1 import frames_pb2 as pb
+from tests.edge_server.frames import frame
+
+CORPUS = Path(__file__).parent / "corpus"
+NOW = 10**18
+CAMERAS = ("cam00", "cam01")
+Target = Callable[[bytes], str]
+"""Takes one input; returns what became of it, in a word, and raises what must never be raised."""
+
+
+def request(folder: Path) -> Target:
+    """A message at the edge, as it is and with a checksum that fits: ``from_request`` and all behind it."""
+    clock, ledger = VirtualClock(NOW), SimpleNamespace(write=lambda *line: "\t".join(map(str, line)))
+    ingest = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, lambda frame: None)  # type: ignore[arg-type]
+
+    def take(data: bytes) -> str:
+        plain = ingest.take(data)
+        with contextlib.suppress(FrameRejected):
+            message = parse(data)
+            message.crc32c = checksum(message.header, message.payload)
+            data = message.SerializeToString()
+        clock.advance_to(clock.now_ns() + 10**6)
+        mended = ingest.take(data)
+        return (plain.reason and mended.reason) or "accepted"
+
+    return take
+
+
+def header(folder: Path) -> Target:
+    """A message at the emulator, which reads the header alone and may damage the payload."""
+
+    def take(data: bytes) -> str:
+        try:
+            found = parse(data).header
+        except FrameRejected as error:
+            return error.reason
+        counted_ids(found, CAMERAS)
+        parse(damage_payload(data, ((0.5, 1), (0.999, 255))))
+        return "read"
+
+    return take
+
+
+def pixels(folder: Path) -> Target:
+    """``payload.check``, and ``decode`` of what passes. The first three bytes: codec, width, height."""
+
+    def take(data: bytes) -> str:
+        codec, width, height = (data[:3] + b"\0\0\0")[:3]
+        name = payload.CODECS[codec % 3]
+        try:
+            image = payload.decode(data[3:], name, width, height)
+        except payload.PayloadError as error:
+            return error.reason
+        assert image.dtype == np.uint8 and image.shape[:2] == (height, width) and image.shape[2] in (3, 4)
+        return name
+
+    return take
+
+
+def of_file(name: str, folder: Path, read: Callable[[Path], str], refusals: type[Exception]) -> Target:
+    """A target that reads a file: what it refuses is one line of bounded length."""
+    file = folder / name
+
+    def take(data: bytes) -> str:
+        file.write_bytes(data)
+        try:
+            return read(file)
+        except refusals as error:
+            assert len(str(error)) < 3000, f"an error of {len(str(error))} characters"
+            return type(error).__name__
+
+    return take
+
+
+def scenarios(folder: Path) -> Target:
+    """A scenario file, with the sections of all three packages."""
+
+    def read(file: Path) -> str:
+        found = scenario.load(file)
+        source_config(found)
+        channel_from_mapping(found.channel)
+        read_config(found)
+        return "read"
+
+    return of_file("a.yaml", folder, read, scenario.ScenarioError)
+
+
+def checkpoints(folder: Path) -> Target:
+    def read(file: Path) -> str:
+        checkpoint.load(file, most_bytes=10**6)
+        return "read"
+
+    return of_file("a.npz", folder, read, checkpoint.CheckpointError)
+
+
+def mcap(folder: Path) -> Target:
+    """A recorded session, of which every payload is read."""
+    from freshfield.session import SessionError
+    from freshfield.session.reader import Session
+
+    def read(file: Path) -> str:
+        session = Session(file)
+        try:
+            for found in session.frames.values():
+                for one in found:
+                    session.payload(one)
+        finally:
+            session.close()
+        return f"{len(session.frames)} cameras"
+
+    return of_file("a.mcap", folder, read, SessionError)
+
+
+def _images(dataset: Dataset) -> str:
+    for image in dataset:
+        assert np.isfinite(image.camera_to_world).all() and image.intrinsics.width > 0
+    return "read"
+
+
+def models(folder: Path) -> Target:
+    """A COLMAP model: first byte even for binary, then cameras and images with ``SPLIT`` between them."""
+    (folder / "a.png").write_bytes(PNG)
+
+    def take(data: bytes) -> str:
+        ending = ".bin" if data[:1] < b"\x80" else ".txt"
+        cameras, _, images = data[1:].partition(SPLIT)
+        (folder / f"images{ending}").write_bytes(images)
+        return of_file(f"cameras{ending}", folder, lambda f: _images(colmap.load_dataset(f)), DatasetError)(
+            cameras
+        )
+
+    return take
+
+
+def transform_files(folder: Path) -> Target:
+    (folder / "a.png").write_bytes(PNG)
+    return of_file("a.json", folder, lambda f: _images(transforms.load_dataset(f)), DatasetError)
+
+
+TARGETS: dict[str, Callable[[Path], Target]] = {
+    "request": request, "header": header, "payload": pixels, "scenario": scenarios, "checkpoint": checkpoints,
+    "mcap": mcap, "colmap": models, "transforms": transform_files,
+}  # fmt: skip
+MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0}
+"""Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
+MOST_FILE_MS = 2000.0
+SPLIT = b"\n--\n"
+PNG = payload.encode(np.zeros((2, 2, 3), np.uint8), "png")
+
+
+def seeds(target: str) -> list[bytes]:
+    """Honest inputs, made here, and the files of the corpus."""
+    return [*_HONEST[target](), *(file.read_bytes() for file in sorted((CORPUS / target).glob("*")))]
+
+
+def _messages() -> Iterable[bytes]:
+    small = payload.encode(np.zeros((2, 2, 3), np.uint8), "zstd")
+    for camera, codec, data in (("cam01", "zstd", small), ("cam00", "png", PNG), ("x", "png", PNG)):
+        lens = Pinhole(2, 2, 2.0, 2.0, 1.0, 1.0, (0.1, 0.0, 0.0, 0.0))
+        sent = frame(
+            camera, codec=codec, payload=data, intrinsics=lens, generated_ns=NOW, held_out=camera == "cam00"
+        )
+        yield to_request(sent).SerializeToString()
+    yield pb.PushRequest().SerializeToString()
+
+
+def _payloads() -> Iterable[bytes]:
+    image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    for number, codec in enumerate(payload.CODECS):
+        yield bytes([number, 8, 8]) + payload.encode(image, codec)
+
+
+def _checkpoints() -> Iterable[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint.save(Path(folder) / "a", {"x": np.zeros(3, np.float32), "n": np.array(2)}, {"steps": 1})
+        yield (Path(folder) / "a").read_bytes()
+
+
+def _sessions() -> Iterable[bytes]:
+    from freshfield.session.writer import SessionWriter
+
+    with tempfile.TemporaryDirectory() as folder:
+        writer = SessionWriter(Path(folder) / "a", {"scenario": "fuzz"})
+        for message in list(_messages())[:2]:
+            writer.frame(pb.PushRequest.FromString(message), NOW)
+        writer.close({"dropped": 0})
+        yield (Path(folder) / "a").read_bytes()
+
+
+def _models() -> Iterable[bytes]:
+    yield (
+        b"\xff1 OPENCV 2 2 2.0 2.0 1.0 1.0 0.1 0 0 0\n2 SIMPLE_RADIAL 2 2 2 1 1 0" + SPLIT
+        + b"# IMAGE\n1 1 0 0 0 0 0 1 1 a.png\n0 0 -1\n2 .7 .7 0 0 1 2 3 2 a.png\n\n"
+    )  # fmt: skip
+    numbers = np.array([2.0, 2.0, 1.0, 1.0], "<f8").tobytes()
+    camera = np.array([1, 1], "<i4").tobytes() + np.array([2, 2], "<u8").tobytes() + numbers
+    pose = np.array([1.0, 0, 0, 0, 0, 0, 1], "<f8").tobytes()
+    image = b"\1\0\0\0" + pose + b"\1\0\0\0a.png\0" + bytes(8)
+    one = (1).to_bytes(8, "little")
+    yield b"\0" + one + camera + SPLIT + one + image
+
+
+def _transforms() -> Iterable[bytes]:
+    pose = np.eye(4).tolist()
+    entry = {"file_path": "a.png", "transform_matrix": pose, "time": 0.5, "camera": "c"}
+    lens = {"fl_x": 2.0, "fl_y": 2.0, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "fps": 30}
+    yield json.dumps({**lens, "frames": [entry, {**entry, "file_path": "none"}]}).encode()
+    yield json.dumps(
+        {"camera_angle_x": 0.7, "frames": [{"file_path": "./a", "transform_matrix": pose}]}
+    ).encode()
+
+
+_HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
+    "request": _messages, "header": _messages, "payload": _payloads, "checkpoint": _checkpoints,
+    "mcap": _sessions, "colmap": _models, "transforms": _transforms,
+    "scenario": lambda: (f.read_bytes() for f in sorted(scenario.SCENARIO_FOLDER.glob("*.yaml"))),
+}  # fmt: skip

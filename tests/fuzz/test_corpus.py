@@ -1,0 +1,32 @@
+"""Every target takes its honest inputs and refuses, in one line, its corpus and variants of both."""
+
+from __future__ import annotations
+
+import random
+import time
+
+import pytest
+
+from freshfield.session import SessionError
+from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
+
+HONEST = {"request": 2, "header": 2, "payload": 3, "scenario": 16, "checkpoint": 1, "mcap": 1, "colmap": 2,
+          "transforms": 2}  # fmt: skip
+ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "2 cameras")
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_strangers_send_is_taken_or_refused(name, tmp_path):
+    try:
+        given = seeds(name)
+    except SessionError as error:
+        pytest.skip(str(error))
+    target = TARGETS[name](tmp_path)
+    assert sum(target(data) in ACCEPTED for data in given) >= HONEST[name]
+    rng = random.Random(1)
+    for data in given:
+        for _ in range(10):
+            cut, width, byte = rng.randrange(len(data) + 1), rng.choice((0, 1, 8)), rng.randbytes(1)
+            begun = time.thread_time()
+            target(data[:cut] + byte * rng.choice((0, 1, 8)) + data[cut + width :])
+            assert (time.thread_time() - begun) * 1e3 < MOST_MS.get(name, MOST_FILE_MS)
