@@ -164,10 +164,13 @@ class FieldUpdater:
         """The first half of a decision: how long to wait for frames."""
         return self.policy.plan(self.epoch(now_ns))
 
-    def select(self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None) -> Selection | None:
+    def select(
+        self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, frame_s: float | None = None
+    ) -> Selection | None:
         """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on.
 
         budget: of the fit that follows, which bounds the new frames where it is one of seconds.
+        frame_s: what one of them takes (virtual time); None: as the field has measured it.
         """
         arrivals = self.buffer.arrivals - self._selected_of
         nothing_new = not arrivals and not self.buffer.held_back
@@ -179,7 +182,7 @@ class FieldUpdater:
         if not cameras:
             return None
         self._selected_of += arrivals
-        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget))
+        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, frame_s))
         before = tuple(earlier[c] for i in items if (c := i.frame.camera) in earlier)
         if self.field.frame_s is not None:
             own = {item.frame.camera: item for item in items}
@@ -187,9 +190,9 @@ class FieldUpdater:
             self._selected |= own
         return Selection(plan, now_ns, items, before, others, arrivals)
 
-    def _most_new(self, budget: Budget | None) -> int | None:
+    def _most_new(self, budget: Budget | None, frame_s: float | None) -> int | None:
         """Number of new frames that the field has time for; None: all."""
-        frame_s = self.field.frame_s
+        frame_s = frame_s or self.field.frame_s
         if budget is None or budget.seconds is None or not frame_s:
             return None
         return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
@@ -217,6 +220,11 @@ class FieldUpdater:
         # Refusals of earlier viewpoints are not counted against current frames.
         current = {view.camera for view in views}
         return views, replace(report, refused=tuple(c for c in report.refused if c in current))
+
+    def use_field(self, field: Field) -> None:
+        """Go on with another field, which begins the scene anew."""
+        self.field = field
+        self.reset()
 
     def reset(self) -> None:
         """Forget the scene."""

@@ -34,18 +34,19 @@ _LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 @dataclass(frozen=True)
 class Params(MovingParams):
     """speed_m_per_s: mean speed of the person's parts; 0 stands still. course: loop, stops, reverses or
-    jumps, how the person walks it. people: 1, or 2, half a loop apart."""
+    jumps, how the person walks it. people: 0 to 4, evenly along the loop."""
 
     horizontal_fov_deg: float = bounded(64.0, *FOV_DEG)
     course: str = one_of("loop", COURSES)
-    people: int = bounded(1, 1, 2)
+    people: int = bounded(1, 0, 4)
 
 
 def build(params: Params) -> Scene:
     """The room as a scene."""
     walk = make_walk(_LOOP_CENTER, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
     walk = replace(walk, course=params.course)
-    walks = (walk, replace(walk, start_s=walk.start_s + 0.5 * walk.period_s))[: params.people]
+    starts_s = (walk.start_s + k / params.people * walk.period_s for k in range(params.people))
+    walks = [replace(walk, start_s=start_s) for start_s in starts_s]
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.80, falloff_m=4.0, tint=(1.0, 0.96, 0.88),
@@ -59,7 +60,7 @@ def build(params: Params) -> Scene:
         world=World((*_shell(), *_furniture()), tuple(map(walking_person, walks)), light),
         bounds=np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]]),
         period_s=walk.repeats_s,
-        moving=not walk.still,
+        moving=bool(walks) and not walk.still,
     )
 
 

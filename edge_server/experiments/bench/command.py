@@ -45,6 +45,8 @@ peer       seconds to 20 and 25 dB on lego and kitchen, beside ngp in plain torc
            (docs/fields.md), nerfstudio's nerfacto and OpenSplat; needs FRESHFIELD_DATA; not part of all
 shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
            perfect field would show, and where the decibels go; not part of all
+growth     how cost grows with cameras, image size, speed and people, from room: age shown, dB, cores, what is
+           shed; in virtual time; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
            each stage; needs the extra surface; not part of all
 
@@ -54,13 +56,14 @@ with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on
 
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
-MORE = ("embed", "foreground", "peer", "shown", "surface")
+MORE = ("embed", "foreground", "peer", "shown", "growth", "surface")
 # Parts that store each figure as it comes, and skip what is known.
-_RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "surface")
+_RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
+_MODULES = {"growth": "shown.growth"}  # where a part is in no module of its own name
 _FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
 # Flags of some parts only.
 _ONLY_OF = {
-    "field": tuple(part for part in _RESUMABLE if part not in ("peer", "shown")), "resume": (*PARTS, *MORE),
+    "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
     "only": ("options",), "scene": (*_FOLLOWING, "shown"),
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
     "option": _FOLLOWING, "model": ("embed", "foreground"),
@@ -98,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     status = 0
     for part in parts:
         print(f"== {part}", flush=True)
-        module = importlib.import_module(f"edge_server.experiments.bench.{part}")
+        module = _module(part)
         try:
             _measure(part, module, args, figures)
         except BenchError as error:
@@ -177,6 +180,10 @@ def _known(path: Path, quick: bool) -> dict[str, Any]:
     return known
 
 
+def _module(part: str) -> ModuleType:
+    return importlib.import_module(f"edge_server.experiments.bench.{_MODULES.get(part, part)}")
+
+
 def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: dict[str, Any]) -> None:
     """One part, into ``figures``."""
     store = ResultStore()
@@ -211,7 +218,7 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
     for part in (*PARTS, *MORE):
         if not figures.get(part):
             continue
-        module = importlib.import_module(f"edge_server.experiments.bench.{part}")
+        module = _module(part)
         text.append(f"## {part}")
         if hasattr(module, "draw"):
             plot = path.with_name(f"{part}.png")

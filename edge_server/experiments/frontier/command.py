@@ -43,7 +43,8 @@ What fidelity costs in time, in two figures.
 2. Live: the scene moves, the network delays, and an update that takes longer shows an older world. The whole
    deployment runs in virtual time, one that charges what updates of the moving scene were measured to take
    here (a step, and everything else), so the second figure is the same bit for bit for one seed and one such
-   measurement. It says how long an update should take at each speed.
+   measurement. It says how long an update should take at each speed, by what is shown at random instants.
+   splat in layers on arrivals is one of the curves: there it is the time from one update to the next.
 
 A scenario with a deadline_ms chooses the effort and the time of its updates from figure 2: of the file it
 names (frontier: OUT/frontier.json), else of one that was measured once and is shipped.
@@ -86,7 +87,7 @@ QUICK = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
     run_s=4.0,
-    efforts=("low", "medium"),
+    efforts=("low", "medium", "layers"),
     warm_steps=150,
     size=128,
     moving=update_time.MovingScene(cameras=13, size=64),
@@ -98,7 +99,7 @@ FULL = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
     run_s=20.0,
-    efforts=("low", "medium", "high"),
+    efforts=("low", "medium", "high", "layers"),
     warm_steps=600,
     size=128,
     moving=update_time.MovingScene(cameras=19, size=128),
@@ -110,9 +111,9 @@ SHIPPED = replace(
     FULL,
     single_options=False,
     planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
-    update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 1.0, 2.0),
+    update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
     run_s=8.0,
-    efforts=("low", "medium"),
+    efforts=("low", "medium", "layers"),
 )
 
 
@@ -251,16 +252,25 @@ class Frontier:
         )
         print(write_output(self.out, self.file.data), flush=True)
         if self.points is not None:
-            about = {k: self.file.data[k] for k in ("scene", "fields", "policy", "channel", "machine")}
-            write_json(self.points, {**about, "updates": updates})
+            about = {k: self.file.data[k] for k in ("scene", "policy", "channel", "machine")}
+            write_json(self.points, {**about, "updates": [*self._other_points(), *updates]})
         print(f"{self.file.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
+
+    def _other_points(self) -> list[Row]:
+        """What FILE of --points holds of representations and efforts that are not measured now."""
+        assert self.points is not None
+        known = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
+        return [
+            row for row in known if f"{row['field']} {row['effort']}" not in {e.label for e in self._live}
+        ]
 
     @property
     def _seeds(self) -> range:
         return range(self.seed, self.seed + self.sweep.seeds)
 
     def _from_scratch(self) -> list[Row]:
-        todo = [(s, e, p) for s in self._seeds for e in self.levels for p in self.sweep.planned_s]
+        levels = [e for e in self.levels if e.still]
+        todo = [(s, e, p) for s in self._seeds for e in levels for p in self.sweep.planned_s]
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
@@ -293,10 +303,11 @@ class Frontier:
             }  # fmt: skip
             measure = partial(_measured_compute, moving, speed, effort, sweep.warm_steps)
             row, new = self.file.get(settings, measure)
-            compute = found[effort.label] = Compute(row["ms_per_step"], row["ms_per_update"])
+            compute = found[effort.label] = Compute(**{k: v for k, v in row.items() if k != "settings"})
             print(
                 f"updates of a moving scene, {effort.label}: {compute.ms_per_step:.1f} ms a step, "
-                f"{compute.ms_per_update:.1f} ms for everything else{_known(new)}",
+                f"{compute.ms_per_view:.1f} ms a new view, {compute.ms_per_update:.1f} ms for everything "
+                f"else{_known(new)}",
                 flush=True,
             )
         return found
@@ -310,14 +321,18 @@ class Frontier:
             start = cache(partial(_warm_start, sweep, effort, speed, seed))
             compute = charged[effort.label]
             for update_s in sweep.update_s:
-                seconds, steps = max(sweep.run_s, 6.0 * update_s), update_time.steps_for(update_s, compute)
+                seconds, layers = max(sweep.run_s, 6.0 * update_s), effort.name == "layers"
+                steps = (
+                    update_time.static_steps(update_s) if layers else update_time.steps_for(update_s, compute)
+                )
+                every_s = update_s if layers else 0.0
                 settings: Row = {
                     "figure": 2, **asdict(sweep.moving), "speed_m_per_s": speed, **_settings(effort),
                     "warm_steps": sweep.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
-                    "compute": asdict(compute), "lpips": self.lpips is not None,
+                    "compute": asdict(compute), "lpips": self.lpips is not None, "every_s": every_s,
                 }  # fmt: skip
                 point, new = self.file.get(
-                    settings, partial(_moving_run, start, steps, compute, seconds, self.lpips)
+                    settings, partial(_moving_run, start, steps, compute, seconds, self.lpips, every_s)
                 )
                 rows.append({
                     **point, "field": effort.field, "effort": effort.name, "options": effort.options,
@@ -325,8 +340,8 @@ class Frontier:
                 })  # fmt: skip
                 print(
                     f"[{len(rows)}/{len(runs) * len(sweep.update_s)}] {effort.label:16} {speed:g} m/s, "
-                    f"update {point['update_s']:5.2f} s  "
-                    f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
+                    f"update {point['update_s']:5.2f} s  shown {_db(point['shown_psnr_db'])}  "
+                    f"moving {_db(point['shown_psnr_moving_db'])}{_known(new)}",
                     flush=True,
                 )
         return update_time.mean_over_seeds(rows)
@@ -349,8 +364,7 @@ def _moving_run(start: Callable[[], update_time.WarmStart], *how: Any) -> Row:
 def _measured_compute(
     moving: update_time.MovingScene, speed: float, effort: effort_sweep.Effort, warm_steps: int
 ) -> Row:
-    compute = update_time.measure_compute(moving, speed, effort.field, effort.options, warm_steps)
-    return {"ms_per_step": compute.ms_per_step, "ms_per_update": compute.ms_per_update}
+    return asdict(update_time.measure_compute(moving, speed, effort.field, effort.options, warm_steps))
 
 
 def _known(new: bool) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, score_views
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget, View
-from edge_server.fields.registry import efforts_of, make_field
+from edge_server.fields.registry import efforts_of, make_field, option_help
 from freshfield.machine_load import LoadMeter
 
 # Single options, compared with the level "medium" (full sweep only).
@@ -38,7 +38,7 @@ class Effort:
     field: the representation.
     options: its settings.
     divided: training images are divided by this; scores are always of full-size images.
-    live: tried on the moving scene, too.
+    live: tried on the moving scene, too; still: on the still one.
     """
 
     field: str
@@ -46,6 +46,7 @@ class Effort:
     options: dict[str, Any]
     divided: float = 1.0
     live: bool = True
+    still: bool = True
 
     @property
     def label(self) -> str:
@@ -54,15 +55,20 @@ class Effort:
 
 def efforts(field: str, options: dict[str, Any], single_options: bool) -> list[Effort]:
     """The field's effort levels, cheapest first; with ``single_options`` also images of half the size, and
-    each of ``_SINGLE_OPTIONS`` alone. ``options`` apply to all of them."""
+    each of ``_SINGLE_OPTIONS`` alone. Where the field knows layers, these are one more level, of what moves
+    only: they have none of their own, because effort sizes the static field, which delays no update.
+    ``options`` apply to all of them."""
     levels = [Effort(field, level, {"effort": level, **options}) for level in efforts_of(field)]
+    layers = [Effort(field, "layers", {"layers": True, **options}, still=False)] * (
+        "layers" in option_help(field)
+    )
     if single_options:
         levels += [replace(e, name=f"{e.name}, half size", divided=2.0, live=False) for e in levels]
         levels += [
             Effort(field, n, {**changed, **options}, live=False)
             for n, changed in _SINGLE_OPTIONS.get(field, {}).items()
         ]
-    return levels
+    return layers + levels
 
 
 def downscaled(views: Sequence[View], divided: float) -> tuple[View, ...]:

@@ -13,7 +13,7 @@ from edge_server.report.style import CYCLE, INK, figure
 from freshfield.files import write_csv
 
 Row = dict[str, Any]
-_LINES = {"low": "--", "high": "-."}
+_LINES = {"low": "--", "high": "-.", "layers": (0, (5, 1, 1, 1, 1, 1))}
 _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
@@ -43,19 +43,26 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def updates_table(rows: Sequence[Row]) -> str:
-    """Fidelity at the present by speed and seconds an update takes."""
-    names = ("PSNR", "moving", "seen", "moving")
+    """What is shown by speed and seconds an update takes, and what was published."""
+    names = ("shown", "moving", "publ.", "moving")
     lines = [
-        f"{'field, effort':16} {'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} "
+        f"{'field, effort':16} {'speed':>8} {'update':>8} {'steps':>6} {'age':>9} "
         + " ".join(f"{n:>7}" for n in names)
     ]
     for row in rows:
-        numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
+        numbers = [row[k] for k in ("shown_psnr_db", "shown_psnr_moving_db", "psnr_db", "psnr_moving_db")]
         lines.append(
             f"{_label(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
-            f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
+            f"{row['shown_age_ms']:6.0f} ms "
+            + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
         )
-    return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
+    return "\n".join(
+        [
+            *lines,
+            "shown: at random instants, the newest publication carried on; age: of its views then",
+            "publ.: at publication",
+        ]
+    )
 
 
 def conclusion(rows: Sequence[Row]) -> str:
@@ -63,11 +70,12 @@ def conclusion(rows: Sequence[Row]) -> str:
     parts = []
     for speed in dict.fromkeys(row["speed_m_per_s"] for row in rows):
         group = [row for row in rows if row["speed_m_per_s"] == speed]
-        whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
+        whole, moving = best(group, "shown_psnr_db"), best(group)
         if whole is None or moving is None:
             continue
         longest = max((r for r in group if _label(r) == _label(moving)), key=lambda row: row["update_s"])
-        lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
+        most = moving["shown_psnr_moving_db"]
+        lost = most - (longest["shown_psnr_moving_db"] or most)
         parts.append(
             f"at {speed:g} m/s {whole['update_s']:.2f} s ({_label(whole)}) for the whole image and "
             f"{moving['update_s']:.2f} s ({_label(moving)}) where it moves "
@@ -104,32 +112,43 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Fidelity at the present against seconds an update takes: a column for each speed, a color for each
-    representation, a line style for each effort, the best of all encircled. The fidelity between updates is
-    drawn for one of them."""
+    """What is shown against seconds an update takes: a column for each speed, a color for each
+    representation, a line style for each effort, the best of all encircled. What was published is drawn for
+    one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
     efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
     main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
-    panels = (("psnr_db", "PSNR, whole image (dB)"), ("psnr_moving_db", "PSNR where it moves (dB)"))
+    panels = (("psnr_db", "shown, whole image (dB)"), ("psnr_moving_db", "shown where it moves (dB)"))
     with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
         for row, (key, label) in enumerate(panels):
             axes[row, 0].set_ylabel(label)
             for ax, speed in zip(axes[row], speeds):
-                here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
+                here = [r for r in rows if r["speed_m_per_s"] == speed and r[f"shown_{key}"] is not None]
                 for who, look in zip(efforts, _line_styles(efforts)):
                     group = sorted((r for r in here if (r["field"], r["effort"]) == who),
                                    key=lambda r: r["update_s"])  # fmt: skip
                     x = [r["update_s"] for r in group]
                     ax.plot(
-                        x, [r[key] for r in group], marker=".", linewidth=1.2, label=" ".join(who), **look
+                        x,
+                        [r[f"shown_{key}"] for r in group],
+                        marker=".",
+                        linewidth=1.2,
+                        label=" ".join(who),
+                        **look,
                     )
                     if who == main:
-                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=look["color"], linewidth=1.0,
-                                label=f"{' '.join(main)}, seen on\naverage, between updates too")  # fmt: skip
-                top = best(here, key)
+                        ax.plot(x, [r[key] for r in group], ":", color=look["color"], linewidth=1.0,
+                                label=f"{' '.join(main)},\nat publication")  # fmt: skip
+                top = best(here, f"shown_{key}")
                 if top is not None:
                     ax.plot(
-                        [top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=INK, label="best"
+                        [top["update_s"]],
+                        [top[f"shown_{key}"]],
+                        "o",
+                        markersize=10,
+                        mfc="none",
+                        color=INK,
+                        label="best",
                     )
         for ax, speed in zip(axes[0], speeds):
             ax.set_title(f"{speed:g} m/s")

@@ -1,14 +1,15 @@
-"""How long an update should take: fidelity at the present of a moving scene in virtual time, by update time.
+"""How long an update should take: what is shown of a moving scene in virtual time, by update time.
 
 The field is warm: it has converged on the first instant and is not reset. A longer update fits its views
-better, but they are older when it is published.
+better, but they are older when it is published. A field in layers follows arrivals instead: its time is that
+from one update to the next, and it begins with nothing, because what stands still is known from frames alone.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,27 @@ import numpy as np
 
 from camera_node.capture import Camera
 from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth
-from edge_server.fidelity.scorer import PerceptualMetric, Score, Scorer
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.fidelity.scorer import SHOWN, PerceptualMetric, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
 
-# What a viewer sees is sampled this often between publications.
-SEEN_EVERY_S = 0.25
+# Instants of a run at which what is shown is scored, and publications that are scored: they give the mean as
+# well as hundreds of them.
+_INSTANTS, _SCORED = 40, 16
 # Publications of the first part of a run show the start more than the update time.
 _SETTLED_SHARE = 0.25
 # To measure the cost of updates: steps of short and long ones, their number, time between their images.
 _FEW, _MANY, _UPDATES, _BETWEEN_NS = 4, 20, 5, 250_000_000
+# A field in layers: seconds until it is warm, time of an update meanwhile, and steps of its static field,
+# which another core does.
+_LEAD_S, _LEAD_UPDATE_S, _STATIC_STEPS_PER_S = 8.0, 0.02, 250.0
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
-SEEN = ("seen_psnr_db", "seen_psnr_moving_db")
+SHOWN_METRICS = tuple(f"shown_{name}" for name in SHOWN)
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,7 @@ class MovingScene:
             {
                 "name": f"{self.scene} at {speed_m_per_s:g} m/s",
                 "seed": seed,
-                "cameras": {"count": self.cameras, "held_out": ["cam00"]},
+                "cameras": {"count": self.cameras, "held_out": ["cam00"], "phase": "spread"},
                 "source": {
                     "kind": "world", "scene": self.scene, "width": self.size, "height": self.size,
                     "fps": self.fps, "speed_m_per_s": speed_m_per_s,
@@ -61,6 +67,7 @@ class MovingScene:
                 "edge": {
                     "field": field, "field_options": options,
                     "policy": {"name": self.policy, "value": self.policy_value},
+                    "updates": "arrivals" if options.get("layers") else "cycle",
                 },
             },
             Path("frontier"),
@@ -69,7 +76,8 @@ class MovingScene:
 
 class WarmStart:
     """Cameras at one speed, which share their renderings, and a field that has converged on the first
-    instant."""
+    instant, or one in layers, which follows arrivals for a while before each run.
+    """
 
     def __init__(
         self,
@@ -85,37 +93,78 @@ class WarmStart:
         self.scenario = moving.scenario(speed, field, options, seed)
         self.cameras = training_cameras(self.scenario)
         self.field: Field = make_field(field, options, seed=seed)
-        self.field.fit([_view(camera) for camera in self.cameras], Budget(steps=warm_steps))
+        self.layers = bool(options.get("layers"))
+        if not self.layers:
+            self.field.fit([_view(camera) for camera in self.cameras], Budget(steps=warm_steps))
         self._warm = self.field.state()
 
     def run(
-        self, steps: int, compute: Compute, seconds: float, lpips: PerceptualMetric | None = None
+        self,
+        steps: int,
+        compute: Compute,
+        seconds: float,
+        lpips: PerceptualMetric | None = None,
+        every_s: float = 0.0,
     ) -> dict[str, Any]:
-        """Updates of ``steps`` for ``seconds`` of virtual time, from the warm field: mean scores."""
-        self.field.load_state(self._warm)
-        update_s = compute.charge_ns(steps) / 1e9
-        # 16 scores give the mean of a run as well as hundreds of them.
-        settings = RunSettings(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
-        settled_s = _SETTLED_SHARE * seconds
-        viewer = ViewerScores(settled_s)
-        deployment = build_deployment(
-            self.scenario, settings, field=self.field, scorer=Scorer(lpips), cameras=self.cameras,
-            on_published=lambda p: viewer.published(p, self.field),
+        """Updates of ``steps`` for ``seconds`` of virtual time, from the warm field: mean scores.
+
+        every_s: least time from one update to the next.
+        """
+        settings = RunSettings(
+            steps, compute=compute, epoch_ms=1e3 * every_s, score_every_ms=1e3 * seconds / _SCORED,
+            shown_every_ms=1e3 * seconds / _INSTANTS, sheds=self.layers,
         )  # fmt: skip
-        viewer.truth = deployment.truth
+        if self.layers:
+            self.field.reset()
+            deployment = self.lead(settings, Scorer(lpips))
+            deployment.settings = settings
+        else:
+            self.field.load_state(self._warm)
+            deployment = build_deployment(
+                self.scenario, settings, field=self.field, scorer=Scorer(lpips), cameras=self.cameras
+            )
+        from_ns = deployment.clock.now_ns() + round(_SETTLED_SHARE * seconds * 1e9)
         publications = deployment.run(seconds)
-        viewer.score_until(seconds)
-        scored = [p for p in publications if p.psnr_db is not None and p.t_s >= settled_s]
+        scored = [p for p in publications if p.psnr_db is not None and p.published_ns >= from_ns]
+        shown = [
+            (score, age_ms)
+            for score, age_ms in zip(deployment.shown, deployment.shown_age_ms)
+            if score.published_ns >= from_ns
+        ]
         return {
             "steps": steps,
-            "update_s": update_s,
+            "update_s": max(every_s, compute.charge_ns(steps) / 1e9),
             "updates": len(publications),
             "scored": len(scored),
             "aaoi_ms": mean_or_none([p.aaoi_ms for p in publications]),
             **{name: mean_or_none([getattr(p, name) for p in scored]) for name in METRICS},
-            **viewer.means(),
+            "shown_age_ms": mean_or_none([age_ms for _, age_ms in shown]),
+            **{f"shown_{name}": mean_or_none([getattr(s, name) for s, _ in shown]) for name in SHOWN},
             "frames": deployment.frames(),
         }
+
+    def lead(
+        self, settings: RunSettings, scorer: Scorer | None = None, costs: UpdateCosts | None = None
+    ) -> VirtualDeployment:
+        """A deployment of layers that are warm.
+
+        settings: of what is shown. costs: takes in the last third of its updates.
+        """
+        settings = replace(
+            settings, steps=static_steps(_LEAD_UPDATE_S), compute=Compute(), sheds=False,
+            epoch_ms=1e3 * _LEAD_UPDATE_S, score_every_ms=None,
+        )  # fmt: skip
+
+        def published(publication: Publication) -> None:
+            if costs is not None:
+                costs.published(deployment.updates, publication.t_s >= _LEAD_S * 2 / 3)
+
+        deployment = build_deployment(
+            self.scenario, settings, field=self.field, scorer=scorer, cameras=self.cameras,
+            on_published=published,
+        )  # fmt: skip
+        deployment.run(_LEAD_S)
+        return deployment
 
 
 def measure_compute(
@@ -123,48 +172,37 @@ def measure_compute(
 ) -> Compute:
     """Time of updates of a warm field on this machine where the scene moves and every image is new:
     ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
-    snapshot). Medians of ``_UPDATES`` short and as many long updates."""
+    snapshot). Medians of ``_UPDATES`` short and as many long updates. Of layers ms_per_update and
+    ms_per_view, in processor time and without the static field.
+
+    Others lengthen the time on the wall, further threads that of the processor: the shorter one counts.
+    """
     start = WarmStart(moving, speed, field, options, 0, warm_steps)
     start.field.warm_up()
+    if start.layers:
+        costs = UpdateCosts()
+        costs.watch(start.field)
+        lead = start.lead(RunSettings(steps=1), costs=costs)
+        cost = costs.measured(lead.with_images(tuple(lead.updates.buffer.newest().values())))
+        return Compute(ms_per_update=round(cost["update_ms"], 3), ms_per_view=round(cost["view_ms"], 3))
     taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
     for number in range(1, 2 * _UPDATES + 3):
         views = [_view(camera, number * _BETWEEN_NS) for camera in start.cameras]
         steps = (_FEW, _MANY)[number % 2]
-        began = time.perf_counter()
+        began = time.perf_counter(), time.process_time()
         start.field.fit(views, Budget(steps=steps))
         start.field.snapshot()
+        spent = time.perf_counter() - began[0], time.process_time() - began[1]
         if number > 2:  # no motion is known in the first of each
-            taken[steps].append(1e3 * (time.perf_counter() - began))
+            taken[steps].append(1e3 * min(spent))
     few, many = (statistics.median(taken[steps]) for steps in (_FEW, _MANY))
     ms_per_step = max((many - few) / (_MANY - _FEW), 0.01)
     return Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3))
 
 
-class ViewerScores:
-    """Scores at evenly spaced instants of what a viewer sees: the newest publication, up to an update old."""
-
-    def __init__(self, from_s: float) -> None:
-        self.truth: Truth | None = None
-        self._from_s = from_s
-        self._next = 0
-        self._shown: Any = None
-        self._scores: list[Score] = []
-
-    def published(self, publication: Publication, field: Field) -> None:
-        """Score what was shown until now; from now on the new publication is shown."""
-        self.score_until(publication.t_s)
-        self._shown = field.snapshot()
-
-    def score_until(self, t_s: float) -> None:
-        """Score the instants up to ``t_s`` that are still open."""
-        while (at_s := self._next * SEEN_EVERY_S) < t_s:
-            self._next += 1
-            if self._shown is not None and self.truth is not None and at_s >= self._from_s:
-                score = self.truth.score(self._shown, round(at_s * 1e9))
-                self._scores += [score] if score is not None else []
-
-    def means(self) -> dict[str, float | None]:
-        return {name: mean_or_none([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
+def static_steps(update_s: float) -> int:
+    """Steps of the static field of layers beside an update."""
+    return max(1, round(_STATIC_STEPS_PER_S * update_s))
 
 
 def steps_for(update_s: float, compute: Compute) -> int:
@@ -172,7 +210,7 @@ def steps_for(update_s: float, compute: Compute) -> int:
     return max(1, round((update_s * 1e3 - compute.ms_per_update) / compute.ms_per_step))
 
 
-def best(rows: list[dict[str, Any]], metric: str = "psnr_moving_db") -> dict[str, Any] | None:
+def best(rows: list[dict[str, Any]], metric: str = "shown_psnr_moving_db") -> dict[str, Any] | None:
     """The row with the highest ``metric``; None where no row has it."""
     known = [row for row in rows if row[metric] is not None]
     return max(known, key=lambda row: row[metric]) if known else None
@@ -180,7 +218,7 @@ def best(rows: list[dict[str, Any]], metric: str = "psnr_moving_db") -> dict[str
 
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the same field, effort, speed and planned update time as the mean of their seeds, with the
-    standard error of the two PSNRs (None for a single seed)."""
+    standard error of the two PSNRs shown (None for a single seed)."""
     groups: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in rows:
         key = (row["field"], row["effort"], row["speed_m_per_s"], row["planned_update_s"])
@@ -191,9 +229,11 @@ def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "field": field, "effort": effort, "options": group[0]["options"], "speed_m_per_s": speed,
             "planned_update_s": planned_s, "seeds": len(group),
         }  # fmt: skip
-        for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):
+        for name in (
+            "update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, "shown_age_ms", *SHOWN_METRICS
+        ):  # fmt: skip
             row[name] = mean_or_none([r[name] for r in group])
-        for name in METRICS[:2]:
+        for name in SHOWN_METRICS[:2]:
             known = [r[name] for r in group if r[name] is not None]
             many = len(known) > 1
             row[f"{name}_error"] = float(np.std(known, ddof=1) / np.sqrt(len(known))) if many else None

@@ -23,6 +23,9 @@ from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.field_updater import FieldUpdater
+from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
 from freshfield.files import write_json
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -92,6 +95,41 @@ def beside_s(field: Any) -> float:
     """Seconds that updates of ``field`` have spent by now on what is done beside them live."""
     parts: dict[str, float] = getattr(field, "part_s", {})
     return sum(parts.get(part, 0.0) for part in _BESIDE)
+
+
+class UpdateCosts:
+    """What updates of a field in layers take, by the processor time of the thread."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
+        self._seen, self._spent_s = 0, 0.0
+
+    def watch(self, field: Any) -> None:
+        """Have the field measure its parts by the time of this thread, which others cannot slow down."""
+        if hasattr(field, "part_s"):
+            field.now = field.part_s.now = time.thread_time
+
+    def published(self, updates: FieldUpdater, counts: bool) -> None:
+        """Take an update in. counts: or leave it out."""
+        parts: dict[str, float] = getattr(updates.field, "part_s", {})
+        spent_s = sum(parts.values()) - beside_s(updates.field)
+        if counts:
+            self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
+        self._seen, self._spent_s = updates.buffer.arrivals, spent_s
+
+    def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
+        """Of an update, and of each frame that has arrived: least squares over the updates, and what decoding
+        a frame of ``items`` takes."""
+        frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
+        if not spent_ms.any():
+            return {"update_ms": 0.0, "view_ms": 0.0}
+        slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
+        view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
+        begun = time.thread_time()
+        ViewDecoder().views(items)
+        decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
+        update_ms = float(spent_ms.mean() - view_ms * frames.mean())
+        return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
 
 
 def _timed(scenario: Scenario, steps: int, seconds: float, data: Path | None) -> NDArray[np.float64]:

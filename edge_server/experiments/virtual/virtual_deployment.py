@@ -84,6 +84,7 @@ class RunSettings:
     first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
         it, so that policies that take different times decide at the same instants.
     scratch: every update starts with an empty field, as in the thesis.
+    sheds: an update takes in no more new frames than one of ``epoch_ms`` has time for, as live.
     """
 
     steps: int
@@ -95,6 +96,7 @@ class RunSettings:
     shown_every_ms: float | None = None
     first_ms: float | None = None
     scratch: bool = False
+    sheds: bool = False
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.first_steps < 0:
@@ -106,6 +108,13 @@ class RunSettings:
             raise ValueError("shown_every_ms: expected a finite number above 0")
         if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
             raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
+
+    @property
+    def intake(self) -> tuple[Budget | None, float | None]:
+        """What bounds the new frames of an update: its time, and seconds a frame."""
+        if not self.sheds or not self.compute.ms_per_view:
+            return None, None
+        return Budget(seconds=self.epoch_ms / 1e3), self.compute.ms_per_view / 1e3
 
     def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
         """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
@@ -124,7 +133,7 @@ class VirtualDeployment:
     cameras: the training cameras, as a node would host them; their names are the buffer's.
     channel: its model.
     updates: the edge: buffer, policy and field.
-    settings: how it runs.
+    settings: how it runs; others apply from the next decision on.
     seed: of the channel.
     truth: what publications are scored against.
     on_published: called with each publication.
@@ -148,6 +157,8 @@ class VirtualDeployment:
         self.publications: list[Publication] = []
         self.shown: list[Score] = []
         """Scores of what was shown: at each instant the newest publication, carried on to that instant."""
+        self.shown_age_ms: list[float] = []
+        """Mean age of the views of what was shown, at the same instants."""
         self.captured: Counter[str] = Counter()
         self.delivered: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
@@ -361,13 +372,14 @@ class VirtualDeployment:
         else:  # with the cameras that have reported by then: the instants are given
             yield WakeCondition(self._origin_ns + round(settings.first_ms * 1e6))
         while True:
+            settings = self.settings
             if self.next_policy is not None:
                 updates.policy, self.next_policy = self.next_policy, None
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
             if plan.flush:
                 self._flush(decided_ns)
-            while (selection := updates.select(plan, self.clock.now_ns())) is None:
+            while (selection := updates.select(plan, self.clock.now_ns(), *settings.intake)) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if settings.scratch:
@@ -451,3 +463,5 @@ class VirtualDeployment:
         score = self.truth.score(self._shown.at(now_ns), now_ns)
         if score is not None:
             self.shown.append(score)
+            newest = self.publications[-1]
+            self.shown_age_ms.append(newest.aaoi_ms + (now_ns - newest.published_ns) / 1e6)

@@ -272,9 +272,10 @@ def test_a_walk_may_stop_reverse_or_jump_and_two_may_walk_it():
     two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * loop.period_s)
     still = np.abs(one.astype(int) - other).max(axis=2) <= 1
     assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
+    assert same(seen(0.4, people=0), seen(0.9, people=0)) and not make_scene("room", {"people": 0}).moving
     for params, message in (
         ({"course": "hops"}, "course is 'hops', expected one of loop"),
-        ({"people": 3}, "people is 3, expected 1 to 2"),
+        ({"people": 5}, "people is 5, expected 0 to 4"),
     ):
         with pytest.raises(SceneError, match=message):
             make_scene("room", params)

@@ -21,22 +21,19 @@ from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.bench.shown.rows import FIRST_SEED, Row, find
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.common.tables import number
-from edge_server.experiments.virtual.costs import beside_s
+from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.fidelity.psnr import psnr_of_mse
-from edge_server.live.buffer import BufferedFrame
-from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.state import Publication
-from edge_server.live.view_decoder import ViewDecoder
 from freshfield.scenario import Scenario, ScenarioError
 
 SECONDS, QUICK_SECONDS = 12.0, 8.0
 SHOWN_EVERY_MS = 50.0
 _CYCLE = Compute(ms_per_step=3.0, ms_per_update=70.0)
-_LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
-_CYCLE_RUN = replace(_LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
+LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
+_CYCLE_RUN = replace(LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class Variant:
         """compute: what an update of layers takes."""
         if self.edge == "before":
             return _CYCLE_RUN
-        return replace(_LAYERS_RUN, compute=compute) if self.charged else _LAYERS_RUN
+        return replace(LAYERS_RUN, compute=compute) if self.charged else LAYERS_RUN
 
 
 FIRST_VARIANT = "nothing late"  # measures what the others are charged
@@ -123,41 +120,6 @@ def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: 
     items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
     found = {**means(truth.instants), "cost": costs.measured(items), "wall_s": time.monotonic() - begun}
     return {**found, "updates": len(deployment.publications), "charged": vars(settings.compute)}
-
-
-class UpdateCosts:
-    """What updates of a field in layers take, by the processor time of the thread."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
-        self._seen, self._spent_s = 0, 0.0
-
-    def watch(self, field: Any) -> None:
-        """Have the field measure its parts by the time of this thread, which others cannot slow down."""
-        if hasattr(field, "part_s"):
-            field.now = field.part_s.now = time.thread_time
-
-    def published(self, updates: FieldUpdater, counts: bool) -> None:
-        """Take an update in. counts: or leave it out."""
-        parts: dict[str, float] = getattr(updates.field, "part_s", {})
-        spent_s = sum(parts.values()) - beside_s(updates.field)
-        if counts:
-            self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
-        self._seen, self._spent_s = updates.buffer.arrivals, spent_s
-
-    def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
-        """Of an update, and of each frame that has arrived: least squares over the updates, and what decoding
-        a frame of ``items`` takes."""
-        frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
-        if not spent_ms.any():
-            return {"update_ms": 0.0, "view_ms": 0.0}
-        slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
-        view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
-        begun = time.thread_time()
-        ViewDecoder().views(items)
-        decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
-        update_ms = float(spent_ms.mean() - view_ms * frames.mean())
-        return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
 
 
 def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:

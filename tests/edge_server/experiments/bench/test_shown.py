@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.bench.shown import output, rows, runs
+from edge_server.experiments.bench.shown import growth, output, rows, runs
 
 
 @pytest.fixture
@@ -20,8 +20,8 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     edge = {"field": "splat", "field_options": options, "lpips": "none", "grace_ms": 0.0}
     monkeypatch.setattr(rows, "EDGES", {"layers": {**edge, "updates": "arrivals"}, "before": edge})
     monkeypatch.setattr(runs, "QUICK_SECONDS", 0.6)
-    cheap = runs.replace(runs._LAYERS_RUN, steps=1, epoch_ms=100.0)
-    monkeypatch.setattr(runs, "_LAYERS_RUN", cheap)
+    cheap = runs.replace(runs.LAYERS_RUN, steps=1, epoch_ms=100.0)
+    monkeypatch.setattr(runs, "LAYERS_RUN", cheap)
     monkeypatch.setattr(runs, "_CYCLE_RUN", runs.replace(cheap, compute=runs.Compute(ms_per_update=200.0)))
     path = tmp_path / "small.yaml"
     source = {"kind": "world", "scene": "room", "width": 24, "height": 24, "params": {"supersample": 1}}
@@ -80,3 +80,37 @@ def test_every_row_can_be_made_and_drawn_ones_follow_from_their_seeds() -> None:
 def test_a_scene_that_is_not_known_is_refused(tmp_path: Path, capsys) -> None:
     assert edge_server(["bench", "shown", "--quick", "--scene", "fox"]) == 1
     assert "expected a source of kind world" in capsys.readouterr().err
+
+
+def test_growth_varies_one_factor_at_a_time_and_says_what_saturates(small, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(growth, "_ROOM", (3, 24, 24, 15.0, 1.0, 1))
+    monkeypatch.setattr(growth, "POINTS", {"cameras": ({"cameras": 2}, {}), "people": ({"people": 0}, {})})
+    monkeypatch.setattr(growth, "SETTINGS", runs.LAYERS_RUN)
+    out = tmp_path / "growth.json"
+    words = ["bench", "growth", "--quick", "--json", str(out)]
+    assert edge_server(words) == 0
+    found = json.loads(out.read_text())["growth"]
+    room = found["cameras"]["3, 24, 24, 15, 1, 1"]
+    assert found["people"]["3, 24, 24, 15, 1, 1"] == room, "measured once"
+    assert room["age_ms"] > 0.0 and room["psnr_db"] > 0.0 and room["instants"] >= 5
+    assert found["people"]["3, 24, 24, 15, 1, 0"]["psnr_moving_db"] is None
+    assert "| people | 3 | 24 x 24 | 15 | 1 | 0 |" in out.with_suffix(".md").read_text()
+    assert "No point saturates one core." in growth.table(found)
+    room |= {"following_cores": 0.95, "shed": 0.2}
+    text = growth.table(found)
+    assert "Saturated: 3 cameras of 24 x 24 at 15 frames a second, 1 people at 1 m/s (20% of" in text
+    assert out.with_name("growth.png").stat().st_size > 5000
+    written = out.read_text()
+    assert edge_server([*words, "--resume"]) == 0
+    assert json.loads(out.read_text())["growth"] == json.loads(written)["growth"], (
+        "nothing was measured twice"
+    )
+
+
+def test_updates_take_in_no_more_frames_than_there_is_time_for() -> None:
+    """A field that wants every frame, 40 of which take as long as an update may."""
+    settings = runs.RunSettings(1, epoch_ms=20.0, compute=runs.Compute(ms_per_view=0.5))
+    assert settings.intake == (None, None)
+    budget, frame_s = runs.replace(settings, sheds=True).intake
+    assert budget is not None and (budget.seconds, frame_s) == (0.02, 0.0005)
+    assert runs.replace(settings, sheds=True, compute=runs.Compute()).intake == (None, None)
