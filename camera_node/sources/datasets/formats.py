@@ -62,7 +62,7 @@ def recognize(file: Path) -> str:
     data = read_json(file) if file.suffix == ".json" else None
     if isinstance(data, dict):
         return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
-    return next((name for name in ("dynerf", "zju") if file.name in reader(name).FILES), "transforms")
+    return next((name for name in FORMATS if file.name in reader(name).FILES), "transforms")
 
 
 def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tuple[Path, Dataset]:

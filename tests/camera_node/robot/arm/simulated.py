@@ -18,6 +18,7 @@ import pytest
 import yaml
 
 from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.simulated_controller.server import SCRIPT_PORTS
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 
@@ -58,7 +59,8 @@ def simulated_arm(host: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     process = start_cli("simulate-arm", "--host", host, *options)
     try:
         for _ in range(600):
-            with contextlib.suppress(OSError), socket.create_connection((host, 30004), 1.0):
+            # The last port that it opens: all others are served by then.
+            with contextlib.suppress(OSError), socket.create_connection((host, SCRIPT_PORTS[-1]), 1.0):
                 break
             if process.poll() is not None:
                 pytest.fail(f"simulate-arm ended: {process.communicate()}")
