@@ -26,7 +26,7 @@ from edge_server.experiments.training.scheduler.evaluation import (
 )
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
-from edge_server.experiments.training.scheduler.setting import reward_of, seeds
+from edge_server.experiments.training.scheduler.setting import Setting, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import (
     TrainingConfig,
     TrainingError,
@@ -71,6 +71,19 @@ def pool() -> Iterator[WorkerPool]:
         yield pool
 
 
+def trained(out: Path, of: Setting | None = None, say=quiet) -> Learner:
+    """What a pool of its own trains."""
+    with WorkerPool(NOTHING) as pool:
+        return train(of or setting(), CONFIG, pool, out, say)
+
+
+def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], Path]:
+    """The words of a training of a small scenario, and its --out."""
+    (folder / "small.yaml").write_text(yaml.safe_dump(raw))
+    out = folder / "out"
+    return [str(folder / "small.yaml"), *words.split(), "--jobs", "1", "--out", str(out)], out
+
+
 def asked_of(pool: WorkerPool, numbers: Iterable[int] = (7,)) -> list[tuple[int, int, Choice]]:
     """Every decision of these episodes with the choice of policy ``all``, to be evaluated."""
     moments = [m for episode in pool.draw(setting(), list(numbers)) for m in episode]
@@ -94,34 +107,28 @@ def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):
         if line.startswith("4/6"):
             raise KeyboardInterrupt
 
-    with WorkerPool(NOTHING) as pool:
-        whole = train(setting(), CONFIG, pool, tmp_path / "whole", quiet)
-    with WorkerPool(NOTHING) as pool, pytest.raises(KeyboardInterrupt):
-        train(setting(), CONFIG, pool, tmp_path / "parts", stop)
+    whole = trained(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "parts", say=stop)
     assert len(read_log(tmp_path / "parts")) == 2 and not (tmp_path / "parts/policy.npz").exists()
-    with WorkerPool(NOTHING) as pool:
-        parts = train(setting(), CONFIG, pool, tmp_path / "parts", quiet)
+    parts = trained(tmp_path / "parts")
     assert same(whole, parts) and (tmp_path / "parts/policy.npz").exists()
     assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
-    with WorkerPool(NOTHING) as pool, pytest.raises(TrainingError, match="other settings"):
-        train(setting(steps=5), CONFIG, pool, tmp_path / "parts", quiet)
+    with pytest.raises(TrainingError, match="other settings"):
+        trained(tmp_path / "parts", setting(steps=5))
 
 
 @pytest.mark.parametrize("damage", ["weights-*.npz", "training.jsonl"])
 @pytest.mark.parametrize("what", ["gone", "half"])
 def test_a_training_with_damaged_files_is_refused_in_one_line(damage: str, what: str, tmp_path: Path):
-    with WorkerPool(NOTHING) as pool:
-        train(setting(), CONFIG, pool, tmp_path, quiet)
+    trained(tmp_path)
     (path,) = tmp_path.glob(damage)
     if what == "gone":
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with (
-        WorkerPool(NOTHING) as pool,
-        pytest.raises(TrainingError, match="choose another --out, or delete it"),
-    ):
-        train(setting(), CONFIG, pool, tmp_path, quiet)
+    with pytest.raises(TrainingError, match="choose another --out, or delete it"):
+        trained(tmp_path)
 
 
 def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path, pool: WorkerPool):
@@ -229,11 +236,8 @@ def test_other_learners_see_the_same_decisions_as_a_problem(pool: WorkerPool):
 
 
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
-    file, out = tmp_path / "small.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump(RAW))
-    words = [str(file), "--kind", "threshold", "--omegas", "50,200", "--episodes", "2", "--batch", "1",
-             "--decisions", "1", "--fit-steps", "2", "--size", "24", "--test", "2", "--jobs", "1",
-             "--out", str(out)]  # fmt: skip
+    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24"
+    words, out = command_line(tmp_path, f"{asked} --test 2")
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "2/2 episodes" in text and "over random" in text and "bandit:" in text
@@ -270,19 +274,16 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven"))
     monkeypatch.setattr(contest, "SPAN_MS", 600.0)
     monkeypatch.setattr(command, "_HOLD_LEAD_MS", 1200.0)
-    file, out = tmp_path / "small.yaml", tmp_path / "out"
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
-    file.write_text(yaml.safe_dump({**RAW, "channel": {"preset": "swing"}, "edge": {
-        **RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals"}}))  # fmt: skip
-    words = [str(file), "--kind", "threshold", "--hold", "200", "--omegas", "50,200", "--episodes", "2",
-             "--batch", "1", "--decisions", "3", "--size", "0", "--test", "1", "--jobs", "1",
-             "--out", str(out)]  # fmt: skip
+    edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals"}
+    asked = (
+        "--kind threshold --hold 200 --omegas 50,200 --episodes 2 --batch 1 --decisions 3 --size 0 --test 1"
+    )
+    words, out = command_line(tmp_path, asked, {**RAW, "channel": {"preset": "swing"}, "edge": edge})
     assert main(words) == 0
     assert "rewarded from cam03; judged from cam00" in capsys.readouterr().out
-    rows = read_log(out)
-    assert all(4 <= row["decisions"] <= 6 for row in rows), (
-        "two tries of three decisions, once frames are there"
-    )
+    # Two tries of three decisions, once frames are there.
+    assert all(4 <= row["decisions"] <= 6 for row in read_log(out))
     scores = json.loads((out / "scores.json").read_text())
     found = scores["policies"]
     assert scores["seed"] == RAW["seed"] and scores["compute"]["ms_per_view"] == 1.0
@@ -334,17 +335,17 @@ def test_only_a_first_batch_without_a_reward_ends_a_training_in_the_deployment(t
         outcome = Outcome(psnr_db, None, 0.5, None, None, None, 2.0, 0.0)
         return [Decided(Decision(0, 0, state, np.array(k), -0.7, None), outcome, "") for k in (0, 1)]  # type: ignore[arg-type]
 
-    def trained(out: Path, *episodes: list[Decided]) -> list[dict]:
+    def log_of(out: Path, *episodes: list[Decided]) -> list[dict]:
         train(setting(), config, Played(*episodes), out, quiet)  # type: ignore[arg-type]
         return read_log(out)
 
-    rows = trained(tmp_path / "a", decided(20.0), [], decided(None), decided(22.0))
+    rows = log_of(tmp_path / "a", decided(20.0), [], decided(None), decided(22.0))
     assert [row["decisions"] for row in rows] == [2, 0, 2, 2]
     assert [row["reward"] is None for row in rows] == [False, True, True, False]
     assert Learner.load(tmp_path / "a/policy.npz").updates == 2
     for first, said in (([], "nothing had arrived"), (decided(None), "it lacks psnr")):
         with pytest.raises(TrainingError, match=said):
-            trained(tmp_path / "b", first)
+            log_of(tmp_path / "b", first)
 
 
 def test_a_policy_may_show_nothing_in_the_span(tmp_path: Path):
@@ -390,10 +391,8 @@ def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, mi
 
 
 def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_asked(tmp_path: Path):
-    weights = {"alex": ("alexnet_features.npz", "lin_alex_v0.1.npz")}
-    for names in weights.values():
-        for name in names:
-            (tmp_path / name).write_bytes(b"no weights")
+    for name in ("alexnet_features.npz", "lin_alex_v0.1.npz"):
+        (tmp_path / name).write_bytes(b"no weights")
     reward, missing = reward_of("set", "whole", tmp_path, "none")
     assert reward.distance == 0.0 and "edge.lpips is none" in missing
     reward, missing = reward_of("set", "whole", tmp_path, "squeeze")
@@ -404,11 +403,8 @@ def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_ask
 
 
 def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_path: Path, capsys):
-    file, out = tmp_path / "small.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump(RAW))
-    words = [str(file), "--distance", "perceptual", "--episodes", "1", "--batch", "1", "--decisions", "1",
-             "--fit-steps", "2", "--size", "24", "--test", "0", "--jobs", "1", "--same-motion", "--scratch",
-             "--out", str(out)]  # fmt: skip
+    asked = "--distance perceptual --episodes 1 --batch 1 --decisions 1 --fit-steps 2 --size 24 --test 0"
+    words, out = command_line(tmp_path, f"{asked} --same-motion --scratch")
     assert main(words) == 0
     assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
     (row,) = read_log(out)
