@@ -21,7 +21,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.images import BLACK, Color, Image, ImageError, same_size, to_unit
+from edge_server.fidelity.images import BLACK, Color, Image, ImageError, to_unit
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
@@ -203,7 +203,6 @@ class Scorer:
         None."""
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self._background)
-        same_size(a, b)
         moving = moving_mask(b, earlier, bound)
         total = psnr(a, b)
         assert total is not None  # no mask was given

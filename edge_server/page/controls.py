@@ -144,8 +144,8 @@ def _label(parameter: str | None) -> str:
 
 
 def _help(policy: str) -> str:
-    """The scheduler's line of help on the policy, without equation numbers."""
-    return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy)))
+    """The scheduler's line of help on the policy, without equation numbers and values."""
+    return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
 
 
 def notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:

@@ -125,16 +125,18 @@ def resolve_checkpoint(name: str, folder: Path) -> str:
 
 
 def policy_help(name: str) -> str:
-    """One line on a policy, without its value; empty for an unknown one."""
+    """One line on a policy; empty for an unknown one."""
     if name.startswith(BANDIT):
         return "a learned policy (edge-server train-scheduler)"
     base, treatment = _split(name)
     if base not in POLICIES or (treatment and treatment not in TREATMENTS):
         return ""
-    line = POLICIES[base][1].partition("; value:")[0]
+    line = POLICIES[base][1]
     if not treatment:
         return line
-    return TREATMENTS[treatment][2] if name in TREATMENTS else f"{line}; {TREATMENTS[treatment][2]}"
+    what, _, parameter = line.partition("; value:")
+    both = TREATMENTS[treatment][2] if name in TREATMENTS else f"{what}; {TREATMENTS[treatment][2]}"
+    return f"{both}; value:{parameter}" if parameter else both
 
 
 def _split(name: str) -> tuple[str, str]:

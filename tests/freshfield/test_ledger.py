@@ -37,6 +37,7 @@ def test_events_come_back(tmp_path):
     assert path.name == "ledger-node-cam00-7.tsv"
     assert file.events == (*EVENTS, Event(99, "", "", 0, "closed"))
     assert (file.role, file.name, file.closed, file.torn) == ("node", "cam00", True, False)
+    assert not file.unfinished
     assert [f.path for f in read_all(tmp_path)] == [path]
 
 
@@ -129,3 +130,16 @@ def test_the_reader_finds_the_end_without_reading_the_whole(tmp_path):
     assert sum(1 for _ in reader) == 6001 == sum(1 for _ in reader)
     path.write_bytes(path.read_bytes()[:-3])
     assert LedgerReader(path).last() == EVENTS[1] and not LedgerReader(path).closed
+
+
+def test_the_last_line_is_found_among_lines_as_long_as_the_end_that_is_read(tmp_path):
+    long = [Event(k, "cam00", "s", k, "answered", "x" * 40_000) for k in range(3)]
+    assert LedgerReader(write(tmp_path, long, closed=False)).last() == long[-1]
+
+
+def test_one_lost_line_is_said(tmp_path):
+    ledger = Ledger(tmp_path, "node", "cam00", 7)
+    ledger._lines.lost = 1
+    ledger.write(5, "cam00", "s", 0, "captured")
+    assert [(e.event, e.detail) for e in LedgerReader(ledger.path)] == [("captured", ""), ("lost_lines", "1")]
+    ledger.close(6)

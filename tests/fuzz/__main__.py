@@ -20,6 +20,8 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from tests.work import work_ms
+
 MOST_INPUT_BYTES = 2**14
 MOST_GROWTH_MB, MOST_NEW_BLOCKS = 48, 50_000
 """From the end of the first tenth of a run: of memory, where fuzzing itself keeps the inputs that reached
@@ -58,6 +60,8 @@ def fuzz_one(name: str, runs: int, seconds: float, folder: Path) -> None:
         at = time.thread_time()
         outcomes[target(data)] += 1
         took_ms = (time.thread_time() - at) * 1e3
+        if took_ms > slowest_ms:  # by itself, or because others compute on the same cores?
+            took_ms = min(took_ms, work_ms(lambda: target(data)))
         slowest_ms = max(slowest_ms, took_ms)
         assert took_ms < most_ms, f"an input of {len(data)} bytes took {took_ms:.0f} ms"
         done, passed = outcomes.total(), time.monotonic() - begun

@@ -65,6 +65,11 @@ def test_parallel_frames_overtake() -> None:
     ]  # fmt: skip
 
 
+def test_a_fault_that_delays_nothing_leaves_the_delay_to_the_nanosecond() -> None:
+    subject = link("fcfs", [10], faults={"corruption": {"probability": 1.0}})
+    assert subject.offer(0)[0].due_ns == 10 * MS
+
+
 def test_zero_delay_delivers_at_once() -> None:
     subject = Channel(channel_from_mapping({}), 0).link("cam00")
     transit, events = subject.offer(5)

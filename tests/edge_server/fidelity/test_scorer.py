@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
-from edge_server.fidelity.scorer import MAX_PENDING, Scorer, mean_score
+from edge_server.fidelity.scorer import MAX_PENDING, Scorer, mean_score, open_listed_perceptual
 from tests.conftest import data_dir
 
 MS = 1_000_000
@@ -231,3 +231,20 @@ def test_a_bad_rendering_loses_no_other_score():
     scorer.publish("cam00", np.full_like(good, np.nan), 20)
     scorer.publish("cam00", good, 30)
     assert [s.published_ns for s in scorer.held_out("cam00", image, 40)] == [10, 30]
+
+
+def test_what_was_shown_at_the_newest_truth_is_scored_once_the_period_is_known():
+    scorer = Scorer()
+    assert scorer.newest("h", lambda taken_ns: truth_at(0)) is None
+    feed(scorer, 0)
+    assert scorer.period_ms("h") is None and scorer.newest("h", lambda taken_ns: truth_at(0)) is None
+    feed(scorer, 40, start_ms=40)
+    assert scorer.period_ms("h") == 40.0
+    score = scorer.newest("h", lambda taken_ns: truth_at(taken_ns // MS) / 255)
+    assert score is not None and score.psnr_db == PSNR_CEILING_DB
+    with pytest.raises(ValueError, match="48 x 24 but the truth is 48 x 48"):
+        scorer.newest("h", lambda taken_ns: truth_at(40)[:24])
+
+
+def test_only_listed_metrics_are_opened():
+    assert open_listed_perceptual(["psnr", "ssim"]) is None

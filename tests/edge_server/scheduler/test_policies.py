@@ -123,9 +123,11 @@ def test_an_unknown_policy_lists_the_known_ones():
 
 def test_names_of_treated_and_learned_policies_and_their_help(tmp_path):
     assert make_policy("wait+mask", 40.0, np.random.default_rng(0)).name == "wait+mask"
-    assert policy_help("threshold") == "frames no older than omega (6.12-6.14)"
     assert policy_help("mask") == "of stale views, pixels that were moving count for less"
-    assert policy_help("threshold+mask") == f"{policy_help('threshold')}; {policy_help('mask')}"
+    what = "frames no older than omega (6.12-6.14)"
+    assert policy_help("threshold") == f"{what}; value: omega_ms"
+    assert policy_help("threshold+mask") == f"{what}; {policy_help('mask')}; value: omega_ms"
+    assert policy_help("age-driven+mask") == f"{policy_help('age-driven')}; {policy_help('mask')}"
     assert [policy_help(name) for name in ("best", "wait+best")] == ["", ""]
     assert "learned" in policy_help("bandit:a.npz")
     assert resolve_checkpoint("wait+mask", tmp_path) == "wait+mask"

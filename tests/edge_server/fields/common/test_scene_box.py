@@ -45,7 +45,10 @@ def test_it_moves_and_scales_with_the_rig() -> None:
 
 
 def test_axes_that_meet_less_than_a_metre_ahead_meet() -> None:
-    np.testing.assert_allclose(scene_box(ring(8, size=16, distance_m=0.2)).centre_m, [0, 0, 0.4], atol=1e-6)
+    poses = np.stack([view.camera_to_world for view in ring(8, size=16, distance_m=0.2)])
+    point = converging_point(poses[:, :3, 3], poses[:, :3, 2])
+    assert point is not None
+    np.testing.assert_allclose(point, [0, 0, 0.4], atol=1e-6)
 
 
 def test_the_main_group_is_without_a_quarter_at_most() -> None:
