@@ -62,6 +62,7 @@ def test_an_arm_says_which_candidates_it_reaches():
     np.testing.assert_allclose(far, 0.34)
 
 
+@pytest.mark.slow
 def test_a_simulated_expert_is_asked_and_a_policy_plans_by_its_answers(tmp_path, capsys):
     words = ["viewpoints", "tile", "--budget", "3", "--candidates", "16", "--steps", "2"]
     words += ["--out", str(tmp_path)]
