@@ -51,6 +51,8 @@ class PreferencePage:
     ) -> None:  # fmt: skip
         self.session = session
         self.finished = threading.Event()
+        self.seen = threading.Event()  # whether somebody looked at the plan
+        self._plan: tuple[list[str], bytes] | None = None
         self._sprites, self._layout = sprites, {"frames": frames, "columns": columns}
         self._keep = keep
         self._lock = threading.Lock()
@@ -95,10 +97,14 @@ class PreferencePage:
         session = self.session
         if path == "/":
             return "text/html; charset=utf-8", files(__package__).joinpath("preferences.html").read_bytes()
-        if path == "/state":
+        if path == "/seen" and self._plan is not None:  # the picture arrived: the server may end
+            self.seen.set()
+        if path in ("/state", "/seen"):
             return "application/json", json.dumps(self.state(session) | {"may_change": may_change}).encode()
         if path == "/answers.json":
             return "application/json", json.dumps(session.as_json()).encode()
+        if path == "/plan.png" and self._plan is not None:
+            return "image/png", self._plan[1]
         asked = session.question
         found = re.fullmatch(r"/(left|right)/(\w+)\.jpg", path)
         if asked is None or found is None or found[2] != self._turn:
@@ -111,8 +117,14 @@ class PreferencePage:
         return {
             "turn": self._turn, "answered": len(session.answers), "wanted": session.wanted,
             "open": session.question is not None, "agreed": agreed, "repeated": repeated,
-            "says": session.model.says(), "finished": self.finished.is_set(), **self._layout,
+            "says": session.model.says(), "finished": self.finished.is_set(),
+            "plan": None if self._plan is None else self._plan[0], **self._layout,
         }  # fmt: skip
+
+    def show_plan(self, lines: list[str], png: bytes) -> None:
+        """Show the plan that the answers led to: what was chosen and why, and the candidates by value."""
+        with self._lock:
+            self._plan = lines, png
 
     def _change(self, path: str, body: bytes) -> None:
         """An answer, an undo, an import or the end. What a tab sends about an earlier turn is refused: two

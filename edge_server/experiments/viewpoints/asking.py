@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from freshfield.files import write_json
 from freshfield.transport import Transport
 
 ANSWERS = "answers.json"
+SHOWN_S = 10.0  # that the page has to fetch the plan, before the server ends
+ShowPlan = Callable[[list[str], bytes], None]
 VIEWS = 8  # of a reconstruction, where the budget is of metres only
 
 
@@ -43,8 +46,9 @@ class Comparison:
 
 def compare(
     stage: Stage, about: Comparison, who: str, page: tuple[str, int], transport: Transport
-) -> PreferenceSession:
-    """The session once it is finished. It goes on from OUT/answers.json, which is written after each answer.
+) -> tuple[PreferenceSession, ShowPlan | None]:
+    """The session once it is finished, and what shows the plan on the page, where there is one. It goes on
+    from OUT/answers.json, which is written after each answer.
 
     who: PERSON, or the taste of a simulated expert. page: host and port. Raises ViewpointError for answers
     of another session, OptionError and TransportError where the page cannot be served.
@@ -70,13 +74,13 @@ def compare(
         first = expert.answer(asked.left, asked.right).prefers_first
         session = session.answered("left" if first else "right")
         write_json(path, session.as_json())
-    return session
+    return session, None
 
 
 def _on_the_page(
     stage: Stage, about: Comparison, plans: list[Plan], session: PreferenceSession, page: tuple[str, int],
     transport: Transport,
-) -> PreferenceSession:  # fmt: skip
+) -> tuple[PreferenceSession, ShowPlan]:  # fmt: skip
     from edge_server.page.preferences import PageError, PreferencePage
 
     transport.guard(page[0], "preference page", http=True)  # before minutes are spent on fits
@@ -94,11 +98,14 @@ def _on_the_page(
     except PageError as error:
         raise OptionError(str(error)) from None
     print(f"compare at {url}; Ctrl-C stops, and the next call goes on", flush=True)
-    try:
-        asking.finished.wait()
-    finally:
+    asking.finished.wait()
+
+    def show(lines: list[str], png: bytes) -> None:
+        asking.show_plan(lines, png)
+        asking.seen.wait(SHOWN_S)
         close()
-    return asking.session
+
+    return asking.session, show
 
 
 def learn(stage: Stage, session: PreferenceSession, views: int, seed: int) -> CandidatePolicy:

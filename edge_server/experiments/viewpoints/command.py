@@ -69,12 +69,13 @@ def _run(args: argparse.Namespace) -> None:
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
+    show = None
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
         views = min(budget.views or VIEWS, int(stage.candidates.reachable.sum()))
         page = (args.page_host, args.page_port)
         comparison = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
-        session = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
+        session, show = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
         agreed, repeated = session.agreement
         print(
             f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}"
@@ -103,6 +104,9 @@ def _run(args: argparse.Namespace) -> None:
           + (f", SSIM {score.ssim:.3f}" if score.ssim is not None else "")
           + (f", LPIPS {score.lpips:.3f}" if score.lpips is not None else ""))  # fmt: skip
     print(f"{args.out / 'plan.json'} and plan.png", flush=True)
+    if show is not None:
+        lines = [f"candidate {stop.candidate}: {stop.why}" for stop in plan.stops]
+        show([*lines, *([plan.note] if plan.note else [])], (args.out / "plan.png").read_bytes())
 
 
 def read_budget(text: str) -> Budget:

@@ -72,8 +72,8 @@ def test_answers_are_of_the_pair_that_was_shown_and_nothing_is_answered_twice(as
 def test_the_page_is_blind(asked):
     """Neither addresses nor state say which reconstructions are shown, or that a pair is a repeated one."""
     _, url, _ = asked
-    expected = {"turn", "answered", "wanted", "open", "agreed", "repeated", "says", "finished", "frames",
-                "columns", "may_change"}  # fmt: skip
+    expected = {"turn", "answered", "wanted", "open", "agreed", "repeated", "says", "finished", "plan",
+                "frames", "columns", "may_change"}  # fmt: skip
     turns = set()
     for _ in range(9):
         now = state(url)
@@ -233,6 +233,11 @@ def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
         browser.click_text("Finish and plan")
         browser.wait_for_text("Finished")
         assert page.finished.is_set() and len(page.session.answers) == 5 and browser.errors == []
+        page.show_plan(
+            ["candidate 3: the nearest"], cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+        )
+        browser.wait_for_text("candidate 3: the nearest")
+        assert page.seen.wait(5.0) and "Where to look" in browser.text()
         assert all(address.startswith(url) for address in browser.requests)
 
 

@@ -62,6 +62,7 @@ def test_an_arm_says_which_candidates_it_reaches():
     np.testing.assert_allclose(far, 0.34)
 
 
+@pytest.mark.slow
 def test_a_simulated_expert_is_asked_and_a_policy_plans_by_its_answers(tmp_path, capsys):
     words = ["viewpoints", "tile", "--budget", "3", "--candidates", "16", "--steps", "2"]
     words += ["--out", str(tmp_path)]
@@ -91,6 +92,7 @@ def test_a_person_is_asked_on_the_page_and_the_next_call_goes_on(tmp_path, monke
             self._keep(self.session.answered("left"))
             self.session = self.session.answered("left")
             self.finished.set()
+            self.seen.set()
             return "http://here", lambda: None
 
     monkeypatch.setattr("edge_server.page.preferences.PreferencePage", Page)
@@ -100,6 +102,8 @@ def test_a_person_is_asked_on_the_page_and_the_next_call_goes_on(tmp_path, monke
         assert main([*words, "--ask", "--reconstructions", "3"]) == 0
         answers = json.loads((tmp_path / "answers.json").read_text())["answers"]
         assert [a["by"] for a in answers] == ["person"] * call
+    lines, png = served[1]._plan
+    assert len(lines) == 2 and "the first view" in lines[0] and png == (tmp_path / "plan.png").read_bytes()
     first = cv2.imdecode(np.frombuffer(served[0]._sprites[0], np.uint8), 1)
     assert first.shape == (4 * 128, 6 * 128, 3) and served[0]._sprites == served[1]._sprites
     assert np.abs(first[:128, :128].astype(int) - first[-128:, -128:]).mean() > 1.0  # the viewpoint moves
