@@ -36,7 +36,7 @@ class Mat:
     def points(self, request: StudyRequest) -> list[Point]:
         gammas = QUICK_GAMMAS if request.quick else GAMMAS
         found = []
-        for scene in scenes_of(request, ("room", "kitchen", "people")):
+        for scene in scenes_of(request, ("room", "kitchen")):
             ours = scene not in RECORDED
             for seed in request.repeats(10 if ours else 4, 40):
                 for discipline in DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]:

@@ -45,7 +45,7 @@ class Omega:
 
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in scenes_of(request, ("room", "kitchen", "people")):
+        for scene in scenes_of(request, ("room", "kitchen")):
             ours = scene not in RECORDED
             for seed in request.repeats(6 if ours else 3, 40):
                 for state, (preset, _, _) in STATES.items():
