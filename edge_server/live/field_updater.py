@@ -73,6 +73,7 @@ class FieldUpdater:
     foreground: cuts the background out of views.
     on_arrivals: nothing is selected before a frame has arrived since the last selection.
     number: of the next update.
+    most_new: new frames that an update takes in at most; None: as a budget in seconds leaves time for.
     materialize: gives buffered frames their images and poses where these are made late (virtual time).
     """
 
@@ -89,6 +90,7 @@ class FieldUpdater:
     ) -> None:
         self.buffer = buffer
         self.on_arrivals = on_arrivals
+        self.most_new: int | None = None
         self._selected_of = 0  # arrivals at the last selection
         self._selected: dict[str, BufferedFrame] = {}  # the newest selected frame of each camera
         self.decoder = ViewDecoder(foreground)
@@ -190,7 +192,7 @@ class FieldUpdater:
         """Number of new frames that the field has time for; None: all."""
         frame_s = self.field.frame_s
         if budget is None or budget.seconds is None or not frame_s:
-            return None
+            return self.most_new
         return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
 
     def fit(

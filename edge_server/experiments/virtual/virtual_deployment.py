@@ -27,7 +27,7 @@ from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Snapshot
 from edge_server.live.buffer import BufferedFrame
-from edge_server.live.field_updater import FieldUpdater, Selection
+from edge_server.live.field_updater import LEAST_TAKEN, FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler.policy import Policy
@@ -107,6 +107,15 @@ class RunSettings:
         if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
             raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
 
+    @property
+    def most_new(self) -> int | None:
+        """Number of frames that an update takes in, where each is charged: what lets it last two epochs; the
+        others are left out, as live. None: all."""
+        if not (self.epoch_ms and self.compute.ms_per_view):
+            return None
+        left_ms = 2.0 * self.epoch_ms - self.compute.ms_per_update - self.compute.ms_per_step * self.steps
+        return max(int(left_ms / self.compute.ms_per_view), LEAST_TAKEN)
+
     def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
         """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
         epoch_ns = round(self.epoch_ms * 1e6)
@@ -142,7 +151,7 @@ class VirtualDeployment:
     ) -> None:
         self.clock = VirtualClock(updates.start_ns)
         self.updates = updates
-        updates.materialize = self.with_images
+        updates.materialize, updates.most_new = self.with_images, settings.most_new
         self.settings = settings
         self.truth = truth
         self.publications: list[Publication] = []
