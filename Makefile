@@ -16,7 +16,7 @@ SCENARIO ?= deploy/scenarios/card.yaml
 FOR ?= 60s
 OUT ?= runs/demo
 PORT ?= 8080
-# Folder of recorded data, for scenarios that stream it (fox, lego, people, kitchen).
+# Folder of recorded data, for scenarios that stream it (fox, lego, kitchen).
 DATA ?=
 
 # Options of `make bench`, for edge-server bench: --quick, or --resume to go on where Ctrl-C stopped it.

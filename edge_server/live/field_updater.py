@@ -192,10 +192,11 @@ class FieldUpdater:
 
     def _most_new(self, budget: Budget | None, frame_s: float | None) -> int | None:
         """Number of new frames that the field has time for; None: all."""
-        frame_s = frame_s or self.field.frame_s
-        if budget is None or budget.seconds is None or not frame_s:
+        measured_s = self.field.frame_s
+        if measured_s is None or budget is None or budget.seconds is None:
             return None
-        return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
+        a_frame_s = frame_s or measured_s
+        return max(int(INTAKE_SHARE * budget.seconds / a_frame_s), LEAST_TAKEN) if a_frame_s else None
 
     def fit(
         self, selection: Selection, budget: Budget, publishes_ns: int | None = None

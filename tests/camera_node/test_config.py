@@ -50,7 +50,7 @@ def test_errors_name_file_and_key(source, message):
 
 
 @pytest.mark.parametrize(
-    "name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "people", "kitchen", "compose"]
+    "name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "compose"]
 )
 def test_shipped_scenarios_have_a_valid_source(name):
     source_config(load(name))

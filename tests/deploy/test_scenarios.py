@@ -25,7 +25,6 @@ NAMES = {
     "ideal",
     "fox",
     "lego",
-    "people",
     "kitchen",
     "cell",
     "card",

@@ -112,7 +112,7 @@ class WarmStart:
         """
         settings = RunSettings(
             steps, compute=compute, epoch_ms=1e3 * every_s, score_every_ms=1e3 * seconds / _SCORED,
-            shown_every_ms=1e3 * seconds / _INSTANTS, sheds=self.layers,
+            shown_every_ms=1e3 * seconds / _INSTANTS,
         )  # fmt: skip
         if self.layers:
             self.field.reset()
@@ -151,7 +151,7 @@ class WarmStart:
         settings: of what is shown. costs: takes in the last third of its updates.
         """
         settings = replace(
-            settings, steps=static_steps(_LEAD_UPDATE_S), compute=Compute(), sheds=False,
+            settings, steps=static_steps(_LEAD_UPDATE_S), compute=Compute(),
             epoch_ms=1e3 * _LEAD_UPDATE_S, score_every_ms=None,
         )  # fmt: skip
 

@@ -31,10 +31,7 @@ LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips"
 
 Curve = dict[float, dict[int, float | None]]
 # Recorded scenes and their file below the data folder.
-RECORDED = {
-    "kitchen": "blender_kitchen/transforms.json",
-    "people": "pose2sim_single_person/calibration_opencv.json",
-}
+RECORDED = {"kitchen": "blender_kitchen/transforms.json"}
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from freshfield.scenario import Scenario, ScenarioError, load, parse
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
 WORLD_FPS = 100 / 3
-SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kitchen", "people": "people"}
+SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kitchen"}
 # Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096

@@ -110,9 +110,9 @@ class ShownTruth:
     """A ``Truth`` of a deployment that keeps more than a score of what is shown: ``instants``.
 
     from_ns: what is shown before is not looked at.
-    instants: of each picture its mean squared errors (``PARTS``; None where nothing moves), those of the
-    perfect field that knows the scene up to the capture of the newest view (``newest``) and up to the mean
-    capture of all cameras' newest views (``mean``), content lag and ages.
+    instants: of each picture when it was looked at, its mean squared errors (``PARTS``; None where nothing
+    moves), those of the perfect field that knows the scene up to the capture of the newest view (``newest``)
+    and up to the mean capture of all cameras' newest views (``mean``), content lag and ages.
     """
 
     world: KnownWorld
@@ -145,6 +145,7 @@ class ShownTruth:
         }  # fmt: skip
         waiting_ms = publication.aaoi_ms - (publication.network_ms or 0.0) - publication.update_ms
         self.instants.append({
+            "t_s": present_ns / 1e9,
             "shown": squared_errors(shown, truth, moving),
             **{known: squared_errors(world.carried(present_ns - 1e6 * age_ms, present_ns), truth, moving)
                for known, age_ms in ages_ms.items()},

@@ -84,7 +84,6 @@ class RunSettings:
     first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
         it, so that policies that take different times decide at the same instants.
     scratch: every update starts with an empty field, as in the thesis.
-    sheds: an update takes in no more new frames than one of ``epoch_ms`` has time for, as live.
     """
 
     steps: int
@@ -96,7 +95,6 @@ class RunSettings:
     shown_every_ms: float | None = None
     first_ms: float | None = None
     scratch: bool = False
-    sheds: bool = False
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.first_steps < 0:
@@ -111,8 +109,9 @@ class RunSettings:
 
     @property
     def intake(self) -> tuple[Budget | None, float | None]:
-        """What bounds the new frames of an update: its time, and seconds a frame."""
-        if not self.sheds or not self.compute.ms_per_view:
+        """What bounds the new frames of an update where each is charged, as live: its time, and seconds a
+        frame."""
+        if not (self.epoch_ms and self.compute.ms_per_view):
             return None, None
         return Budget(seconds=self.epoch_ms / 1e3), self.compute.ms_per_view / 1e3
 

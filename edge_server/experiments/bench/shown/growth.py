@@ -106,7 +106,7 @@ def _run(
     deployment.run(free_s)
     cost = costs.measured(deployment.with_images(tuple(updates.buffer.newest().values())))
     compute = replace(settings.compute, ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
-    deployment.settings = replace(settings, compute=compute, sheds=True)
+    deployment.settings = replace(settings, compute=compute)
     deployment.run(settling_s)
     shed, arrivals, beside = updates.buffer.shed, updates.buffer.arrivals, beside_s(updates.field)
     first = len(deployment.shown)

@@ -53,8 +53,29 @@ def table(figures: Figures) -> str:
                 f"{_SHARES[shares.index(max(shares))]}."
             ]
     return "\n\n".join(
-        [_SHOWN_TEXT, *meaning, _shown_table(figures), _CEILINGS_TEXT, _ceilings_table(figures)]
+        [
+            _SHOWN_TEXT,
+            *meaning,
+            _shown_table(figures),
+            *_trends(figures),
+            _CEILINGS_TEXT,
+            _ceilings_table(figures),
+        ]
     )
+
+
+def _trends(figures: Figures) -> list[str]:
+    """What long runs show minute by minute, with a heading; nothing without such runs."""
+    runs = {name: run for name in figures if (run := _first(figures, name, "shown")) and "by_minute" in run}
+    if not runs:
+        return []
+    minutes = [part["minute"] for part in next(iter(runs.values()))["by_minute"]]
+    rows = []
+    for name, run in runs.items():
+        parts, scene = run["by_minute"], f"{name} ({run['left_out']} frames left out)"
+        rows.append((f"{scene}: mean age, ms", *(number(part["age_ms"], 0) for part in parts)))
+        rows.append((f"{scene}: moving, dB", *(number(part["psnr_moving_db"], 1) for part in parts)))
+    return ["Long runs, minute by minute:", markdown_table(["scene", *map(str, minutes)], rows)]
 
 
 def _shown_table(figures: Figures) -> str:

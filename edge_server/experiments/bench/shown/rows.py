@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,8 @@ class Row:
     base: a scenario, shipped or a file. changes: keys of its sections, instead of its own.
     seeds: how often what is shown is measured, with seeds from FIRST_SEED on.
     split: whether network and computing are told apart.
+    minutes: of a long run, to see whether age or fidelity has a trend: nothing else is measured then.
+    charged_as: the row whose costs are charged, which has to be known.
     """
 
     name: str
@@ -35,6 +37,8 @@ class Row:
     changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     seeds: int = 1
     split: bool = True
+    minutes: int = 0
+    charged_as: str = ""
 
     def scenario(self, seed: int, edge: str) -> Scenario:
         """The scene under one of ``EDGES``. Raises ScenarioError."""
@@ -93,6 +97,12 @@ ROWS: tuple[Row, ...] = (
     _case("4 cameras", cameras={"count": 5}),
     _case("1 camera", cameras={"count": 2}),
     _case("cameras locked", cameras={"phase": "locked"}),
+    # Ages follow from what is charged, so that small pictures will do.
+    replace(
+        _case("30 fps, ten minutes", source={"fps": 30.0, "width": 32, "height": 32}),
+        minutes=10,
+        charged_as="room",
+    ),
 )
 
 

@@ -30,7 +30,7 @@ from edge_server.live.state import Publication
 from freshfield.scenario import Scenario, ScenarioError
 
 SECONDS, QUICK_SECONDS = 12.0, 8.0
-SHOWN_EVERY_MS = 50.0
+SHOWN_EVERY_MS, SETTLED_S = 50.0, 60.0  # of a long run, what is shown within the first minute does not count
 _CYCLE = Compute(ms_per_step=3.0, ms_per_update=70.0)
 LAYERS_RUN = RunSettings(steps=10, epoch_ms=20.0, score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS)
 _CYCLE_RUN = replace(LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
@@ -65,17 +65,20 @@ VARIANTS = {
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{ROW: {VARIANT: {seed: means over the instants of the last third}}}. BenchError: a scenario cannot
-    run."""
+    """{ROW: {VARIANT: {seed: means over the instants of the last third, of a long run of all but its first
+    minute}}}. BenchError: a scenario cannot run."""
     seconds = QUICK_SECONDS if run.quick else SECONDS
     try:
         for row in find(run.scenes):
             world = KnownWorld(row.scenario(FIRST_SEED, "layers"))
             for name, variant in VARIANTS.items():
                 repeats = row.seeds if variant.repeats and not run.quick else 1
+                if row.minutes and name != "shown":
+                    continue
+                long_s = 60.0 * row.minutes * (not run.quick)
                 for seed in range(FIRST_SEED, FIRST_SEED + repeats):
                     if row.split or not variant.splits:
-                        _measure(row, name, seed, world, run.store, seconds)
+                        _measure(row, name, seed, world, run.store, long_s or seconds)
     except ScenarioError as error:
         raise BenchError(str(error)) from None
     return run.store.results
@@ -88,10 +91,17 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
         scenario = replace(scenario, channel={"preset": "ideal"})
     compute = Compute()
     if name != FIRST_VARIANT:
-        cost = store.results[row.name][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
+        of = row.charged_as or row.name
+        if of not in store.results:
+            raise BenchError(
+                f"{row.name} is charged as {of}, which is not known: measure that first (--resume)"
+            )
+        cost = store.results[of][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
         compute = Compute(ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
     sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
     settings = variant.settings(compute)
+    if seconds > SETTLED_S:
+        settings = replace(settings, shown_every_ms=10.0 * SHOWN_EVERY_MS)
     known = {
         "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(settings),
         "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
@@ -103,8 +113,8 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
 
 
 def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: float) -> dict[str, Any]:
-    """One deployment, its last third."""
-    truth = ShownTruth(world, from_ns=round(seconds * 2e9 / 3))
+    """One deployment, its last third, or all but its first minute."""
+    truth = ShownTruth(world, from_ns=round(min(2.0 * seconds / 3.0, SETTLED_S) * 1e9))
     costs = UpdateCosts()
 
     def published(publication: Publication) -> None:
@@ -114,12 +124,31 @@ def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: 
     deployment = build_deployment(scenario, settings, truth=truth, on_published=published)
     costs.watch(deployment.updates.field)
     begun = time.monotonic()
-    deployment.run(seconds)
+    while (now_s := deployment.clock.now_ns() / 1e9) < seconds:
+        deployment.run(min(seconds - now_s, 60.0))
+        if seconds > SETTLED_S:
+            print(f"    {deployment.clock.now_ns() / 6e10:g} min", flush=True)
     if not truth.instants:
         raise ScenarioError(f"{scenario.path}: nothing was published within {seconds:g} s")
     items = deployment.with_images(tuple(deployment.updates.buffer.newest().values()))
     found = {**means(truth.instants), "cost": costs.measured(items), "wall_s": time.monotonic() - begun}
-    return {**found, "updates": len(deployment.publications), "charged": vars(settings.compute)}
+    if seconds > SETTLED_S:
+        found["by_minute"] = by_minute(truth.instants)
+    return {
+        **found, "updates": len(deployment.publications), "charged": vars(settings.compute),
+        "left_out": deployment.updates.buffer.shed,
+    }  # fmt: skip
+
+
+def by_minute(instants: Sequence[dict[str, Any]]) -> list[dict[str, float]]:
+    """Mean age in ms and moving PSNR in dB of each minute of a run."""
+    minutes: dict[int, list[dict[str, Any]]] = {}
+    for instant in instants:
+        minutes.setdefault(int(instant["t_s"] // 60.0), []).append(instant)
+    return [
+        {"minute": minute + 1, "age_ms": of["age_ms"]["mean"], "psnr_moving_db": of["psnr_db"]["moving"]}
+        for minute, of in ((minute, means(part)) for minute, part in sorted(minutes.items()))
+    ]
 
 
 def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -35,7 +35,7 @@ class Mat:
 
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in scenes_of(request, ("room", "kitchen", "people")):
+        for scene in scenes_of(request, ("room", "kitchen")):
             ours = scene not in RECORDED
             disciplines = DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]
             channels = [({"discipline": d}, {"channel": {"preset": "ch5", "discipline": d}})

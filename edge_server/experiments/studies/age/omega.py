@@ -45,7 +45,7 @@ class Omega:
 
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
-        for scene in scenes_of(request, ("room", "kitchen", "people")):
+        for scene in scenes_of(request, ("room", "kitchen")):
             ours = scene not in RECORDED
             states = [
                 ({"state": state}, {"channel": {"preset": preset}, "every_ms": 2400.0})

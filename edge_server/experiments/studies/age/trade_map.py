@@ -93,7 +93,7 @@ class Phase:
 
     def _cells(self, request: StudyRequest) -> Iterator[Cell]:
         quick = request.quick
-        for scene in scenes_of(request, ("room", "kitchen", "people")):
+        for scene in scenes_of(request, ("room", "kitchen")):
             ours = scene not in RECORDED
             speeds: tuple[float | None, ...] = (None,)
             if ours:

@@ -44,6 +44,7 @@ log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
 
+LEAST_CAMERAS = 2  # one alone tells of no depth: the first field is shown
 PLATE_FRAMES, PLATE_S = 8, 3.2  # of each camera, and since the first frame, before plates are learned
 EVIDENCE_S = 0.8  # age up to which frames tell of motion
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
@@ -57,8 +58,9 @@ MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each take
 class LayeredField:
     """See ``fields.Field`` for the protocol.
 
-    Until plates are known, and for good where a camera moves or images are transparent, views go to a
-    ``SplatField``. Call ``fit`` from one thread only; snapshots may be taken and rendered from any thread.
+    Until plates are known, with a single camera, and for good where a camera moves or images are transparent,
+    views go to a ``SplatField``. Call ``fit`` from one thread only; snapshots may be taken and rendered from
+    any thread.
 
     part_s: seconds spent by part, in all fits.
     """
@@ -122,13 +124,13 @@ class LayeredField:
         if self.layered and (reasons := [why for view in views if (why := self._unfit_for_layers(view))]):
             self._give_up_layers(reasons[0])
         if not self.layered:
-            return self.first.fit(_newest_of_each(views), budget)
+            return self._fit_first(views, budget, pace)
         if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
             self._begin_again()
         taken = self._take_in(views)
         if self.tracker is None:
             if not self._plates_are_known():
-                return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+                return self._fit_first(views, budget, pace)
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
@@ -145,7 +147,7 @@ class LayeredField:
             self.part_s.add("static field", begun)
         self._publish()
         if beside and not self.shown:
-            return self.first.fit(_newest_of_each(views), _remaining(budget, pace.elapsed_s()))
+            return self._fit_first(views, budget, pace)
         self._take_renderings(beside)
         self._take_whole(taken)
         note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
@@ -153,6 +155,15 @@ class LayeredField:
             steps, pace.elapsed_s(), loss, rays, samples, note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
         )  # fmt: skip
+
+    def _fit_first(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
+        """Spend what is left of a budget on the first field."""
+        begun, left = self.now(), budget
+        if budget.seconds is not None:
+            left = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
+        report = self.first.fit(_newest_of_each(views), left)
+        self.part_s.add("first field", begun)
+        return report
 
     def _why_no_step(self, moving: MovingSet) -> str:
         if moving.alive:
@@ -294,7 +305,8 @@ class LayeredField:
 
     def _plates_are_known(self) -> bool:
         return (
-            len(self.observations) > 0
+            len(self.cameras) >= LEAST_CAMERAS
+            and len(self.observations) > 0
             and self.observations.newest_s >= PLATE_S
             # Of a camera that has gone silent nothing more will come.
             and all(self.cameras[o.camera].plate.count >= PLATE_FRAMES for o in self.observations)
@@ -437,8 +449,3 @@ def _newest_of_each(views: Sequence[View]) -> list[View]:
         if view.camera not in newest or view.shows_ns > newest[view.camera].shows_ns:
             newest[view.camera] = view
     return list(newest.values())
-
-
-def _remaining(budget: Budget, spent_s: float) -> Budget:
-    """What is left of a budget in seconds."""
-    return budget if budget.seconds is None else Budget(seconds=max(budget.seconds - spent_s, 0.0))

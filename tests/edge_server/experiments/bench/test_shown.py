@@ -55,6 +55,27 @@ def test_a_scenario_is_measured_once_and_tabulated(small: Path, capsys) -> None:
     capsys.readouterr()
 
 
+def test_a_long_run_is_told_minute_by_minute(small: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    row = rows.Row("long", str(small), split=False, minutes=1, charged_as="as")
+    monkeypatch.setattr(rows, "ROWS", (row, rows.Row("as", str(small), split=False)))
+    monkeypatch.setattr(runs, "SETTLED_S", 0.2)
+    monkeypatch.setattr(runs, "SHOWN_EVERY_MS", 10.0)
+    out = small.with_name("present.json")
+    words = ["bench", "shown", "--quick", "--json", str(out), "--scene"]
+    assert edge_server([*words, "long"]) == 1
+    assert "charged as as, which is not known: measure that first" in capsys.readouterr().err
+    assert edge_server([*words, "as", "--scene", "long"]) == 0
+    found = json.loads(out.read_text())["shown"]
+    assert set(found["long"]) == {"shown"}
+    run = found["long"]["shown"]["7"]
+    assert run["charged"]["ms_per_update"] == found["as"]["nothing late"]["7"]["cost"]["update_ms"]
+    assert [part["minute"] for part in run["by_minute"]] == [1]
+    assert run["by_minute"][0]["age_ms"] == pytest.approx(run["age_ms"]["mean"])
+    assert (
+        f"| long (0 frames left out): mean age, ms | {run['age_ms']['mean']:.0f} |" in capsys.readouterr().out
+    )
+
+
 def test_the_shares_add_up_to_what_is_shown() -> None:
     def run(error: float, perfect: float) -> dict[str, Any]:
         return {"7": {"squared_error": {"moving": error},
@@ -110,7 +131,7 @@ def test_growth_varies_one_factor_at_a_time_and_says_what_saturates(small, tmp_p
 def test_updates_take_in_no_more_frames_than_there_is_time_for() -> None:
     """A field that wants every frame, 40 of which take as long as an update may."""
     settings = runs.RunSettings(1, epoch_ms=20.0, compute=runs.Compute(ms_per_view=0.5))
-    assert settings.intake == (None, None)
-    budget, frame_s = runs.replace(settings, sheds=True).intake
+    budget, frame_s = settings.intake
     assert budget is not None and (budget.seconds, frame_s) == (0.02, 0.0005)
-    assert runs.replace(settings, sheds=True, compute=runs.Compute()).intake == (None, None)
+    assert runs.replace(settings, compute=runs.Compute()).intake == (None, None)
+    assert runs.replace(settings, epoch_ms=0.0).intake == (None, None)

@@ -152,6 +152,31 @@ def test_ideal_channel_delivers_everything_at_no_age():
     assert {age for p in deployment.publications for age in p.ages_ms} == {0.0}
 
 
+@pytest.mark.slow
+def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() -> None:
+    """A processor that takes in less than 100 frames a second; sixty of them, and twice as many."""
+    options = {"layers": True, "gaussians": 300, "start": 200, "seed_cells": 12, "threads": 1}
+    edge = {"field": "splat", "field_options": options, "policy": {"name": "all"}, "updates": "arrivals"}
+    settings = RunSettings(
+        steps=1, compute=Compute(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
+    )
+    ages = []
+    for fps in (15.0, 30.0):
+        source = {
+            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": fps,
+            "params": {"supersample": 1},
+        }  # fmt: skip
+        deployment = run(scenario({}, edge=edge, source=source), settings, seconds=6.0)
+        late = [p for p in deployment.publications if p.t_s > 2.0]
+        assert max(p.update_ms for p in late) <= 80.0
+        halves = [np.mean([p.aaoi_ms for p in late if (p.t_s > 4.0) is second]) for second in (False, True)]
+        assert halves[1] < 1.1 * halves[0]
+        ages.append(np.mean(halves))
+        assert closes(deployment.frames())
+    assert deployment.updates.buffer.shed > 0.1 * deployment.updates.buffer.arrivals
+    assert ages[1] < 2.0 * ages[0]
+
+
 def test_wait_uses_only_what_was_generated_after_the_decision():
     edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
     deployment = run(

@@ -95,6 +95,16 @@ def test_it_is_the_plain_field_at_first_and_where_a_camera_moves() -> None:
     np.testing.assert_array_equal(shown, expected)
 
 
+def test_one_camera_alone_begins_no_layers() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        field.fit([_frame(0, frame, True)], Budget(steps=1))
+    assert field.layered and field.moving is None and field.part_s["first field"] > 0.0
+    for frame in range(20, 30):
+        field.fit([_frame(k, frame, True) for k in range(2)], Budget(steps=1))
+    assert field.moving is not None
+
+
 def test_nothing_moves_where_nothing_moves() -> None:
     field = LayeredField(SMALL)
     _run(field, range(36), moves=False)
