@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 DOCS = Path(__file__).parent
@@ -267,7 +268,38 @@ def _rows(part: str, begins: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
 
 
+def soak(name: str) -> str:
+    """Recoveries by fault, memory and account of a run of ``freshfield_up.soak``."""
+    run = measured(f"docs/results/{name}.json")
+    rows = []
+    for kind, target in dict.fromkeys((f["kind"], f["target"]) for f in run["faults"]):
+        same = [f for f in run["faults"] if (f["kind"], f["target"]) == (kind, target)]
+        known = [f["recovery_s"] for f in same if f["recovery_s"] is not None]
+        starts = [f["start_s"] for f in same if f["start_s"] is not None]
+        rows.append(
+            [f"{kind}, {target}", len(same), len(same) - len(known)]
+            + [f"{of(v):.2f}" if v else "" for v in (known, starts) for of in (median, max)]
+        )
+    memory = ", ".join(
+        f"{who} {use['early_mb']:.0f} to {use['late_mb']:.0f} MB in {use['minutes']:.0f} min"
+        for who, use in run["memory"].items()
+        if use["minutes"] >= 5.0
+    )
+    frames = run["frames"]
+    account = "all accounted for" if frames["closes"] else f"not accounted for: {'; '.join(frames['doubts'])}"
+    head = ["fault", "times", "no recovery before the next", "recovery, s: median", "worst",
+            "start, s: median", "worst"]  # fmt: skip
+    return (
+        f"Load average {run['load_average']:.0f}, {run['cores']} cores, a fault each {run['every_s']:.0f} s. "
+        + (f"Memory of each last process: {memory}. " if memory else "")
+        + f"Frames: {frames['captured']:,} captured, {account}.\n\n"
+        + table(head, rows)
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "soak": lambda: soak("soak"),
+    "kills": lambda: soak("kills"),
     "representations": representations,
     "tile": lambda: from_scratch("tile", (0.25, 0.5, 0.8, 1, 2.5, 15)),
     "room": lambda: from_scratch("room", (0.25, 0.5, 1, 2.5, 4, 15)),
