@@ -16,10 +16,10 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.bench.peer.contestant import Contestant, PeerMissing, on_white
 from edge_server.experiments.bench.peer.nerfacto import nerfacto
 from edge_server.experiments.bench.peer.opensplat import opensplat
-from edge_server.experiments.bench.run import BenchError, BenchRun, mean_baselines, open_recording
+from edge_server.experiments.bench.run import BenchError, BenchRun, open_recording
 from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.scenes.multiview_still import MultiviewStill
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, mean_baselines
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Budget, Field
 from edge_server.fields.ngp.settings import NgpSettings

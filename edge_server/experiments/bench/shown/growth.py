@@ -56,7 +56,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     done: dict[str, Any] = {}
     for factor, points in POINTS.items():
         for point in points:
-            values, scenario = dict(zip(_FACTORS, _ROOM)) | point, _scenario(point)
+            values, scenario = {**dict(zip(_FACTORS, _ROOM)), **point}, _scenario(point)
             sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
             settings = {
                 "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(SETTINGS),
@@ -79,7 +79,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def _scenario(point: Mapping[str, float]) -> Scenario:
-    value = dict(zip(_FACTORS, _ROOM)) | point
+    value = {**dict(zip(_FACTORS, _ROOM)), **point}
     source = {
         "width": int(value["width"]), "height": int(value["height"]), "fps": value["fps"],
         "speed_m_per_s": value["speed, m/s"], "params": {"people": int(value["people"])},
