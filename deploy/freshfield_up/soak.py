@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import shutil
 import signal
 import statistics
@@ -191,7 +192,7 @@ class Soak:
             latest = {name: (use.pid, use.rss_mb) for name, use in self._monitor.latest.items()}
             if not self.samples or latest != self.samples[-1][1]:
                 self.samples.append((self._now_s(), latest))
-                self.loads.append(machine_load.load_average() or 0.0)
+                self.loads.append(os.getloadavg()[0])
             left_s = end_s - time.monotonic()
             if left_s <= 0.0:
                 return
