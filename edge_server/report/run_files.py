@@ -22,7 +22,8 @@ class RunFiles:
     edge, channel: status files of the edge and the emulator. series: rows as in state.Publication.
     shown: rows as ``Journal.shown`` writes them.
     ages: rows {t_s, age_ms: {camera: ms or None}}. processes: rows {t_s, name: {rss_mb, cpu, pid}}.
-    mesh: as ``edge-server export --json`` writes it. images: those that exist, by name.
+    frontier: what accuracy costs, as the edge had it. mesh: as ``edge-server export --json`` writes it.
+    images: those that exist, by name.
     notes: one line for people on whatever was missing or torn.
     """
 
@@ -33,6 +34,7 @@ class RunFiles:
     shown: list[Row] = field(default_factory=list)
     ages: list[Row] = field(default_factory=list)
     processes: list[Row] = field(default_factory=list)
+    frontier: Row = field(default_factory=dict)
     mesh: Row = field(default_factory=dict)
     images: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -51,6 +53,8 @@ def read_run_files(out: Path) -> RunFiles:
         files.shown = _continuous(_read_lines(out / "shown.jsonl", files.notes))
     if (out / "processes.jsonl").exists():  # written only where one command started all processes
         files.processes = _continuous(_read_lines(out / "processes.jsonl", files.notes))
+    if (out / "frontier.json").exists():  # not of a fit
+        files.frontier = _read_json(out / "frontier.json", files.notes)
     if (out / "mesh.json").exists():  # only where the scenario asks for one
         files.mesh = _mesh(_read_json(out / "mesh.json", files.notes), files.notes)
     for name in ("truth", "rendered"):
