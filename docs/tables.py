@@ -122,50 +122,50 @@ def baselines() -> str:
 
 
 def best_updates() -> str:
-    """The best time of an update, by what is scored; `splat` at two efforts, the others at one."""
-    points = measured("edge_server/frontier.json")["updates"]
-    longest = max(p["planned_update_s"] for p in points)
+    """The best time of an update, by what is scored; `splat` at each effort, the others at one."""
     rows = []
-    for speed in sorted({p["speed_m_per_s"] for p in points}):
-        for field, effort in (("splat", "low"), *((field, "medium") for field in FIELDS)):
-            row = _line(points, speed, field, effort)
-            whole = max(row, key=lambda p: p["psnr_db"])
-            moving = max(row, key=lambda p: p["psnr_moving_db"])
-            rows.append([
-                f"{speed:g}",
-                f"`{field}`, {effort}",
-                f"{whole['psnr_db']:.1f} at {whole['planned_update_s']:g} s",
-                f"{moving['psnr_moving_db']:.1f} at {moving['planned_update_s']:g} s",
-                f"{row[-1]['psnr_db']:.1f} / {row[-1]['psnr_moving_db']:.1f}",
-            ])  # fmt: skip
-    return table(
-        [
-            "person, m/s", "representation, effort", "best dB, whole image", "best dB, moving pixels",
-            f"at {longest:g} s, whole / moving",
-        ],
-        rows,
-    )  # fmt: skip
+    for (speed, field, effort, by), times in _updates().items():
+        if field.startswith("`splat`") or effort == "medium":
+            best = [max(times, key=lambda s, part=part: times[s][part]) for part in (0, 1)]
+            at = [f"{times[s][part]:.1f} at {s:g} s" for part, s in enumerate(best)]
+            rows.append(
+                [speed, field, by, *at, "{:.1f} / {:.1f} at {:g} s".format(*times[max(times)], max(times))]
+            )
+    head = (
+        "person, m/s",
+        "representation, effort",
+        "by what was",
+        "best dB, whole image",
+        "best dB, moving pixels",
+    )
+    return table((*head, "longest, whole / moving"), rows)
 
 
 def all_updates() -> str:
     """Every point of the shipped frontier: whole image / moving pixels."""
+    found = _updates()
+    seconds = sorted({s for times in found.values() for s in times})
+    rows = [
+        [speed, field, by, *("{:.1f} / {:.1f}".format(*times[s]) if s in times else "-" for s in seconds)]
+        for (speed, field, _, by), times in found.items()
+    ]
+    head = ("person, m/s", "representation, effort", "by what was")
+    return table((*head, *(f"{s:g} s" for s in seconds)), rows)
+
+
+def _updates() -> dict[tuple[str, str, str, str], dict[float, tuple[float, float]]]:
+    """(speed, representation with effort, effort, shown or published) -> seconds planned for an update ->
+    PSNR of the whole image and of moving pixels."""
+    found: dict[Any, Any] = {}
+    order = list(FIELDS)
     points = measured("edge_server/frontier.json")["updates"]
-    times = sorted({p["planned_update_s"] for p in points})
-    rows = []
-    for speed in sorted({p["speed_m_per_s"] for p in points}):
-        for field in FIELDS:
-            for effort in ("low", "medium"):
-                cells = [
-                    f"{p['psnr_db']:.1f} / {p['psnr_moving_db']:.1f}"
-                    for p in _line(points, speed, field, effort)
-                ]
-                rows.append([f"{speed:g}", f"`{field}`, {effort}", *cells])
-    return table(["person, m/s", "representation, effort", *(f"{s:g} s" for s in times)], rows)
-
-
-def _line(points: Sequence[Any], speed: float, field: str, effort: str) -> list[Any]:
-    found = [p for p in points if (p["speed_m_per_s"], p["field"], p["effort"]) == (speed, field, effort)]
-    return sorted(found, key=lambda p: p["planned_update_s"])
+    for p in sorted(points, key=lambda p: (p["speed_m_per_s"], order.index(p["field"]))):
+        by = "shown" if "shown_psnr_db" in p else "published"
+        prefix = "shown_" if by == "shown" else ""
+        key = f"{p['speed_m_per_s']:g}", f"`{p['field']}`, {p['effort']}", p["effort"], by
+        psnr = p[f"{prefix}psnr_db"], p[f"{prefix}psnr_moving_db"]
+        found.setdefault(key, {})[p["planned_update_s"]] = psnr
+    return found
 
 
 def options() -> str:

@@ -112,7 +112,8 @@ class EdgeConfig:
     update_ms: fitting time of an update.
     deadline_ms: instead of it, the time from decision to publication. The setting that spends it best is
     looked up in ``frontier``, and the fitting time follows how busy the machine is.
-    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; None: the shipped one.
+    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; page and report draw it,
+    too. None: the shipped one.
     steps, compute: of an update in virtual time, its optimizer steps and what it costs: ``zero``, the
     milliseconds of ``ComputeConfig``, or a file of ``edge-server costs``, relative to the scenario.
     scores: what policies reach in virtual time, for the page: the values of a scores.json of ``edge-server
@@ -156,8 +157,6 @@ class EdgeConfig:
                 raise ValueError(f"{name}: expected {least:g} to 3600000, got {value:g}")
         if self.updates not in ("cycle", "arrivals"):
             raise ValueError(f"updates: expected cycle or arrivals, got {self.updates!r}")
-        if self.frontier is not None and self.deadline_ms is None:
-            raise ValueError("frontier: it is read for a deadline_ms, which is not given")
         if not 1 <= self.steps <= 10_000_000:
             raise ValueError(f"steps: expected 1 to 10000000, got {self.steps}")
         if self.grace_ms < 0:

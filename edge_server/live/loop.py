@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from queue import Empty, Queue
 
-from edge_server.fields import Budget, FitReport, Snapshot, View
+from edge_server.fields import Budget, Field, FitReport, Snapshot, View
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Publication
 from edge_server.live.update_budget import UpdateBudget
@@ -33,7 +33,9 @@ class UpdateLoop:
     on_published(publication, renderer, views): called after each update, on the loop's thread.
     on_status(line): says what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
-    Changes of the policy, pause and reset, asked for by other threads, take effect with the next decision.
+    budget: of the updates to come; others may set it.
+    Changes of the policy, of the field, pause and reset, asked for by other threads, take effect with the
+    next decision.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class UpdateLoop:
     ) -> None:
         self._updater = updater
         self._clock = clock
-        self._budget = budget
+        self.budget = budget
         self._grace_ns = round(grace_ms * 1e6)
         self._on_published = on_published
         self._on_status = on_status
@@ -57,6 +59,7 @@ class UpdateLoop:
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._next_policy: Policy | None = None
+        self._next_field: Field | None = None
         self._reset = False
         self._last_update_ms = 0.0
         self._without_steps = 0  # updates in a row
@@ -81,6 +84,11 @@ class UpdateLoop:
     def use_policy(self, policy: Policy) -> None:
         with self._lock:
             self._next_policy = policy
+
+    def use_field(self, field: Field) -> None:
+        """Go on with a field that knows nothing yet."""
+        with self._lock:
+            self._next_field = field
 
     def request_reset(self) -> None:
         with self._lock:
@@ -123,7 +131,7 @@ class UpdateLoop:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
-        budget = self._budget.next()
+        budget = self.budget.next()
         selection = self._select(budget)
         if selection is None:
             return
@@ -140,15 +148,20 @@ class UpdateLoop:
         renderer = self._updater.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updater.publication(selection, views, report, self._clock.now_ns())
         self._last_update_ms = publication.update_ms
-        self._budget.record(budget, publication.update_ms)
+        self.budget.record(budget, publication.update_ms)
         self._on_published(publication, renderer, views)
 
     def _apply_controls(self) -> None:
         with self._lock:
             policy, self._next_policy = self._next_policy, None
+            field, self._next_field = self._next_field, None
             reset, self._reset = self._reset, False
         if policy is not None:
             self._updater.policy = policy
+        if field is not None:
+            self._on_status("compiling the field's kernels")
+            field.warm_up()
+            self._updater.use_field(field)
         if reset:
             self._updater.reset()
             log.info("the field was reset")
@@ -203,7 +216,7 @@ class UpdateLoop:
             selection = self._updater.select(plan, now_ns, budget)
             if selection is not None:
                 return selection
-            asked = self._reset or self._next_policy is not None or not self._checkpoints.empty()
+            asked = self._reset or self._next_policy or self._next_field or not self._checkpoints.empty()
             if self.paused or asked:
                 return None
             left_s = (plan.wait_until_ns - now_ns) / 1e9

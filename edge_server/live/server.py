@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +20,9 @@ import numpy as np
 from edge_server.config import EdgeConfig, embedding_for
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
-from edge_server.fields import View, checkpoint
+from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
-from edge_server.fields.registry import make_field
+from edge_server.fields.registry import efforts_of, make_field
 from edge_server.live.field_updater import open_updater
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, RollingPercentiles
@@ -32,10 +32,10 @@ from edge_server.live.output.journal import Journal
 from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.live.update_budget import open_budget
+from edge_server.live.update_budget import open_budget, open_frontier, options_for
 from edge_server.scheduler import short_name
 from freshfield.clock import Clock, WallClock
-from freshfield.files import ReplacedJson
+from freshfield.files import ReplacedJson, write_json
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
@@ -89,16 +89,18 @@ class EdgeServer:
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
-        self._without_step, self._within_deadline, self._refused = 0, 0, Counter[str]()
+        self._without_step, self._refused = 0, Counter[str]()
+        self._with_deadline = self._within_deadline = 0  # updates since the deadline was set
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
-        budget, field_options = open_budget(scenario, config)
-        self.field = make_field(config.field, {"nice": SERVER_NICE, **field_options}, seed=scenario.seed)
+        self.frontier = open_frontier(scenario, config)
+        self._field_options = options_for(self.frontier, config)
+        field = self._make_field()
         resumed_updates = 0
         if options.resume is not None:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
-            self.field.load_state(state)
+            field.load_state(state)
             # Numbers continue, so that a snapshot does not take the name of an earlier one.
             resumed_updates = max(0, int(about.get("updates", 0)))
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
@@ -115,7 +117,7 @@ class EdgeServer:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         self.trainer, policy = self.policies.trainer, self.policies.first
         self.updater = open_updater(
-            scenario, config, policy, self.field, self.start_ns, resumed=options.resume is not None
+            scenario, config, policy, field, self.start_ns, resumed=options.resume is not None
         )
         self.updater.number = resumed_updates
         self.buffer = self.updater.buffer
@@ -133,7 +135,7 @@ class EdgeServer:
         self.loop = UpdateLoop(
             self.updater,
             self.clock,
-            budget,
+            open_budget(self.frontier, config, config.deadline_ms),
             config.grace_ms,
             self._published,
             self._set_status_line,
@@ -143,7 +145,9 @@ class EdgeServer:
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
-            controls=Controls(policy.name, policy.value),
+            controls=Controls(
+                policy.name, policy.value, self._field_options.get("effort", "medium"), config.deadline_ms
+            ),
             cameras=self._cameras,
             start_ns=self.start_ns,
             now_ns=self.clock.now_ns,
@@ -151,11 +155,16 @@ class EdgeServer:
             save_snapshot=self._save_snapshot,
             channel=ReplacedJson(options.out / "channel.json").read,
             scores=config.scores,
+            frontier=self.frontier,
+            efforts=() if self._field_options.get("layers") else tuple(efforts_of(config.field)),
+            set_effort=self._set_effort,
+            set_deadline=self._set_deadline,
             field_name=config.field,
             decision=lambda: self.updater.policy.last_decision,
             embed=None if embedder is None else embedder.embed,
             learning=lambda: self.policies.learning_line(self.state.controls.policy),
         )
+        write_json(options.out / "frontier.json", asdict(self.frontier))
         self.journal = Journal(options.out, self.status)
 
     # --- running ----------------------------------------------------------------------------------
@@ -246,10 +255,12 @@ class EdgeServer:
             self._first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
         self._without_step += publication.steps == 0
-        self._within_deadline += publication.update_ms <= (self.config.deadline_ms or 0.0)
+        deadline_ms = self.state.controls.deadline_ms or 0.0
+        self._with_deadline += deadline_ms > 0.0
+        self._within_deadline += publication.update_ms <= deadline_ms
         self._refused.update(publication.refused)
         if self.state.bounds is None:
-            self.state.bounds = getattr(self.field, "bounds", None)
+            self.state.bounds = getattr(self.updater.field, "bounds", None)
         self.state.publish(publication, renderer)
         self.journal.published(publication)
         self._decision_log.record(self.updater.policy, publication.number)
@@ -267,6 +278,7 @@ class EdgeServer:
             self.recorder.scored(publication, self.clock.now_ns())
 
     def _shown(self, score: Score, publication: Publication) -> None:
+        self.state.add_shown(score)
         self.journal.shown((score.published_ns - self.start_ns) / 1e9, score, publication)
 
     def _set_status_line(self, line: str) -> None:
@@ -277,6 +289,25 @@ class EdgeServer:
         self.updater.check(policy)
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
+
+    def _set_deadline(self, deadline_ms: float | None) -> None:
+        controls = self.state.controls
+        effort = controls.effort if self.state.efforts else None
+        self.loop.budget = open_budget(self.frontier, self.config, deadline_ms, effort)
+        controls.deadline_ms = deadline_ms
+        self._with_deadline = self._within_deadline = 0
+
+    def _set_effort(self, effort: str) -> None:
+        if effort not in self.state.efforts:
+            raise ValueError(f"effort: expected one of {', '.join(self.state.efforts)}, got {effort!r}")
+        self._field_options = {**self._field_options, "effort": effort}
+        self.loop.use_field(self._make_field())
+        self.state.controls.effort = effort
+        self._set_deadline(self.state.controls.deadline_ms)
+
+    def _make_field(self) -> Field:
+        options = {"nice": SERVER_NICE, **self._field_options}
+        return make_field(self.config.field, options, seed=self.scenario.seed)
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:
@@ -296,12 +327,12 @@ class EdgeServer:
     def _write_checkpoint(self, path: Path) -> None:
         about = {
             "field": self.config.field,
-            "options": self.config.field_options,
+            "options": self._field_options,
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,
         }
-        checkpoint.save(path, self.field.state(), about)
+        checkpoint.save(path, self.updater.field.state(), about)
 
     def _cameras(self) -> list[CameraView]:
         now_ns, ingest = self.clock.now_ns(), self.ingest
@@ -349,7 +380,8 @@ class EdgeServer:
                 "ms_p50": self._update_ms.percentile(50),
                 "ms_p95": self._update_ms.percentile(95),
                 "first_ms": self._first_ms,
-                "deadline_ms": self.config.deadline_ms,
+                "deadline_ms": self.state.controls.deadline_ms,
+                "with_deadline": self._with_deadline,
                 "within_deadline": self._within_deadline,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
                 "shed": self.buffer.shed,

@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
+from edge_server.live.update_budget import Frontier
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.scheduler.learned.decision import Decision
+
+SHOWN_OF = 30  # instants and updates that the present is the mean of
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,8 @@ class Controls:
 
     policy: str
     value: float | None
+    effort: str = ""
+    deadline_ms: float | None = None
     paused: bool = False
     reset_requested: bool = False
 
@@ -120,6 +125,9 @@ class EdgeState:
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
+    frontier: what accuracy costs in time, as measured. efforts: levels that ``set_effort`` takes; none where
+    the field has none. set_deadline: milliseconds from decision to publication, or None for no deadline; it
+    is None itself where nobody can set one.
     learning: one line on a policy that learns while it is used; empty where none does.
     bounds: world box (2, 3) in metres of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
@@ -138,6 +146,10 @@ class EdgeState:
     decision: Callable[[], Decision | None] = lambda: None
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
     scores: dict[str, Any] | None = None
+    frontier: Frontier | None = None
+    efforts: tuple[str, ...] = ()
+    set_effort: Callable[[str], None] | None = None
+    set_deadline: Callable[[float | None], None] | None = None
     field_name: str = ""
     learning: Callable[[], str] = lambda: ""
     started: bool = False
@@ -145,6 +157,7 @@ class EdgeState:
     status_line: str = ""
     warnings: list[str] = field(default_factory=list)
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
+    _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=SHOWN_OF))
     _renderer: Snapshot | None = None
     _comparison: Comparison | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -169,6 +182,23 @@ class EdgeState:
                     break
             if comparison is not None:
                 self._comparison = comparison
+
+    def add_shown(self, score: Score) -> None:
+        """Add a score of what was shown at a random instant."""
+        with self._lock:
+            self._shown.append(score)
+
+    def present(self) -> tuple[float, float, float | None] | None:
+        """The present point of the frontier, over the last instants and updates: milliseconds from one update
+        to the next, PSNR shown of the whole image and where it moves. None before there is one."""
+        with self._lock:
+            scores, last = list(self._shown), list(self._publications)[-SHOWN_OF:]
+        moving = [s.psnr_moving_db for s in scores if s.psnr_moving_db is not None]
+        if not scores or len(last) < 2:
+            return None
+        whole_db = float(np.mean([s.psnr_db for s in scores]))
+        update_ms = 1e3 * (last[-1].t_s - last[0].t_s) / (len(last) - 1)
+        return update_ms, whole_db, float(np.mean(moving)) if moving else None
 
     def publications(self, since: int = -1) -> list[Publication]:
         """Publications with a number above ``since``, oldest first."""

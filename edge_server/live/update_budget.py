@@ -69,11 +69,11 @@ class UpdateBudget:
 
 @dataclass(frozen=True)
 class FrontierPoint:
-    """A measured setting of updates, and the fidelity at the present that it led to.
+    """A measured setting of updates, and what was shown with it at random instants.
 
     effort, options: name and field options of the setting.
     speed_m_per_s: of the scene it was measured on.
-    update_ms: from decision to publication.
+    update_ms: from decision to publication; of a field in layers from one update to the next.
     psnr_db: of the whole image; psnr_moving_db: where the scene moves.
     error_db: upper bound of the standard error of their mean; 0 with one seed.
     """
@@ -92,10 +92,12 @@ class FrontierPoint:
         return 0.5 * (self.psnr_db + self.psnr_moving_db)
 
 
-def read_frontier(path: Path | None, representation: str) -> list[FrontierPoint]:
+def read_frontier(path: Path | None, representation: str, layers: bool = False) -> list[FrontierPoint]:
     """The points of one representation, measured on moving scenes.
 
     path: a frontier.json of ``edge-server frontier``; None: the shipped one.
+    layers: those in layers, which are another field, or those without.
+    Points of an earlier version that are not known by what was shown are known by what was published.
     Raises ValueError for another kind of file, or one without such points.
     """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
@@ -108,18 +110,21 @@ def read_frontier(path: Path | None, representation: str) -> list[FrontierPoint]
                 options=dict(row["options"]),
                 speed_m_per_s=float(row["speed_m_per_s"]),
                 update_ms=float(row["update_s"]) * 1e3,
-                psnr_db=float(row["psnr_db"]),
-                psnr_moving_db=float(row["psnr_moving_db"]),
-                error_db=0.5 * sum(row.get(f"{k}_error") or 0.0 for k in ("psnr_db", "psnr_moving_db")),
+                psnr_db=float(row[f"{by}psnr_db"]),
+                psnr_moving_db=float(row[f"{by}psnr_moving_db"]),
+                error_db=0.5 * sum(row.get(f"{by}{k}_error") or 0.0 for k in ("psnr_db", "psnr_moving_db")),
             )
             for row in rows
-            if row["field"] == representation and row["psnr_moving_db"] is not None
+            for by in ("shown_" if "shown_psnr_db" in row else "",)
+            if row["field"] == representation and bool(row["options"].get("layers")) == layers
+            if row[f"{by}psnr_moving_db"] is not None
         ]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{source}: not a frontier that `edge-server frontier` wrote ({error})") from None
     if not points:
+        named = f"{representation} in layers" if layers else representation
         raise ValueError(
-            f"{source}: nothing was measured there for {representation} on a moving scene; "
+            f"{source}: nothing was measured there for {named} on a moving scene; "
             f"run `edge-server frontier --field {representation}` and name its frontier.json"
         )
     return points
@@ -131,12 +136,7 @@ def best_point(points: Sequence[FrontierPoint], deadline_ms: float, speed_m_per_
     More time is not always better: what moves ages meanwhile. Of points that their seeds cannot distinguish
     from the best, the fastest is taken; the fastest of all where none meets the deadline.
     """
-
-    def speed_distance(p: FrontierPoint) -> float:
-        return abs(math.log(max(p.speed_m_per_s, 1e-3) / max(speed_m_per_s, 1e-3)))
-
-    nearest = min(speed_distance(p) for p in points)
-    candidates = [p for p in points if speed_distance(p) == nearest]
+    candidates = _at_nearest_speed(points, speed_m_per_s)
     fitting = [p for p in candidates if p.update_ms <= deadline_ms]
     if fitting:
         best = max(fitting, key=lambda p: p.mean_db)
@@ -144,19 +144,73 @@ def best_point(points: Sequence[FrontierPoint], deadline_ms: float, speed_m_per_
     return min(candidates, key=lambda p: (p.update_ms, -p.mean_db))
 
 
-def open_budget(scenario: Scenario, config: EdgeConfig) -> tuple[UpdateBudget, dict[str, Any]]:
-    """The budget that a scenario asks for, and the field's options: the scenario's own, over those of the
-    frontier point that a deadline leads to. ValueError where the frontier cannot be read."""
-    if config.deadline_ms is None:
-        return UpdateBudget(config.update_ms), config.field_options
+def _at_nearest_speed(points: Sequence[FrontierPoint], speed_m_per_s: float) -> list[FrontierPoint]:
+    """Those measured at the speed nearest in ratio."""
+
+    def distance(p: FrontierPoint) -> float:
+        return abs(math.log(max(p.speed_m_per_s, 1e-3) / max(speed_m_per_s, 1e-3)))
+
+    nearest = min(map(distance, points))
+    return [p for p in points if distance(p) == nearest]
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """What accuracy costs in time, as measured for the field of a run.
+
+    points: at the measured speed nearest to ``speed_m_per_s``, the scene's.
+    about: of which file they are, or, where there are none, how to measure them.
+    """
+
+    points: tuple[FrontierPoint, ...]
+    speed_m_per_s: float
+    about: str
+
+    def best(self, deadline_ms: float, effort: str | None = None) -> FrontierPoint | None:
+        """The best point within the deadline (``best_point``), of one effort if given; None: none known."""
+        points = [p for p in self.points if effort in (None, p.effort)]
+        return best_point(points, deadline_ms, self.speed_m_per_s) if points else None
+
+
+def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
+    """The frontier that a scenario names, else the shipped one. ValueError where it cannot be read. That the
+    shipped one knows nothing of the scenario's field is an error only where a deadline asks for it."""
     path = None if config.frontier is None else scenario.path.parent / config.frontier
-    speed = scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S)
-    point = best_point(read_frontier(path, config.field), config.deadline_ms, float(speed))
+    speed = float(scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S))
+    try:
+        points = read_frontier(path, config.field, bool(config.field_options.get("layers")))
+    except ValueError as error:
+        if config.deadline_ms is not None or path is not None:
+            raise
+        return Frontier((), speed, str(error))
+    points = _at_nearest_speed(points, speed)
+    file = config.frontier or "the shipped frontier.json, of room"
+    return Frontier(tuple(points), speed, f"{file}, at {points[0].speed_m_per_s:g} m/s")
+
+
+def open_budget(
+    frontier: Frontier, config: EdgeConfig, deadline_ms: float | None, effort: str | None = None
+) -> UpdateBudget:
+    """The budget of updates with a deadline, or without one.
+
+    effort: the level that the field has; None: any. ValueError: the deadline leaves no time to fit.
+    """
+    if deadline_ms is None:
+        return UpdateBudget(config.update_ms)
+    point = frontier.best(deadline_ms, effort)
+    return UpdateBudget(math.inf if point is None else point.update_ms, deadline_ms)
+
+
+def options_for(frontier: Frontier, config: EdgeConfig) -> dict[str, Any]:
+    """The field's options: the scenario's own, over those of the frontier point that a deadline leads to."""
+    point = None if config.deadline_ms is None else frontier.best(config.deadline_ms)
+    if config.deadline_ms is None or point is None:
+        return config.field_options
     log.info(
-        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB, %.1f where it moves)",
+        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB shown, %.1f moving)",
         config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
         point.psnr_moving_db,
     )  # fmt: skip
     if point.update_ms > config.deadline_ms:
         log.warning("no measured update is as short as that: updates do what fits")
-    return UpdateBudget(point.update_ms, config.deadline_ms), {**point.options, **config.field_options}
+    return {**point.options, **config.field_options}

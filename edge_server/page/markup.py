@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView
+from edge_server.live.update_budget import Frontier
 from edge_server.page.colors import (
     AGAINST,
     FOR,
@@ -101,6 +103,51 @@ def _age_parts(parts_ms: Mapping[str, float]) -> str:
         f'<span style="{_DIM}">age of what is shown, {number(total_ms)} ms</span>'
         f'<div style="display:flex;height:7px;border-radius:4px;overflow:hidden">{"".join(pieces)}</div>'
         f"<div>{' '.join(words)}</div></div>"
+    )
+
+
+def frontier(found: Frontier, effort: str, present: tuple[float, float, float | None] | None) -> str:
+    """What accuracy costs in time: PSNR shown against the time of an update, the curves of ``effort`` bold,
+    and the present point (``EdgeState.present``); how to measure it where it is not known."""
+    if not found.points:
+        return note(f"What accuracy costs in time is not measured for this field. {found.about}")
+    now = [(present[0], db) for db in present[1:] if db is not None] if present is not None else []
+    known = [(p.update_ms, db) for p in found.points for db in (p.psnr_db, p.psnr_moving_db)] + now
+    times, levels = [math.log(max(ms, 1.0)) for ms, _ in known], [db for _, db in known]
+    left, low = min(times), min(levels)
+    wide, high = max(max(times) - left, 1e-3), max(max(levels) - low, 1e-3)
+
+    def at(ms: float, db: float) -> str:
+        x = 30.0 + 280.0 * (math.log(max(ms, 1.0)) - left) / wide
+        return f"{x:.1f},{8.0 + 84.0 * (1.0 - (db - low) / high):.1f}"
+
+    lines = ""
+    for name in dict.fromkeys(p.effort for p in found.points):
+        mine = sorted((p for p in found.points if p.effort == name), key=lambda p: p.update_ms)
+        bold = name == effort or len({p.effort for p in found.points}) == 1
+        for key, dash in (("psnr_db", ""), ("psnr_moving_db", "4 3")):
+            path = " ".join(at(p.update_ms, getattr(p, key)) for p in mine)
+            lines += (
+                f'<polyline points="{path}" fill="none" stroke="{css(FOR)}" stroke-dasharray="{dash}" '
+                f'stroke-width="{1.8 if bold else 0.8}" opacity="{1.0 if bold else 0.45}"/>'
+            )
+    for ms, db in now:
+        x, y = at(ms, db).split(",")
+        lines += f'<circle cx="{x}" cy="{y}" r="4" fill="{css(AGAINST)}"/>'
+    ends = "".join(
+        f'<text x="{x}" y="{y}" text-anchor="{anchor}" font-size="9" fill="currentColor">{words}</text>'
+        for x, y, anchor, words in (
+            (26, 12, "end", f"{low + high:.0f}"),
+            (26, 94, "end", f"{low:.0f} dB"),
+            (30, 106, "start", f"{math.exp(left):.0f} ms an update"),
+            (310, 106, "end", f"{math.exp(left + wide):.0f} ms"),
+        )
+    )
+    return (
+        '<div style="padding:.2em .9em .4em;font-size:.75em">'
+        f'<svg viewBox="0 0 320 110" width="100%">{lines}{ends}</svg>'
+        f'<span style="color:{css(AGAINST)}">&#9679;</span> now, shown; lines measured: whole image, '
+        f'dashed where it moves<div style="{_DIM}">{escape(found.about)}, by edge-server frontier</div></div>'
     )
 
 

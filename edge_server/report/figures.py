@@ -198,11 +198,42 @@ def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
     return True
 
 
+def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
+    """What accuracy costs in time, as measured (OUT/frontier.json), and where the run stands: what it showed
+    in its last fifth, at the time from one update to the next."""
+    try:
+        points = [
+            (str(p["effort"]), float(p["update_ms"]), float(p["psnr_db"]), float(p["psnr_moving_db"]))
+            for p in files.frontier["points"]
+        ]
+        about = str(files.frontier["about"])
+    except (KeyError, TypeError, ValueError):
+        return False
+    shown = report["fidelity"].get("shown") or {}
+    late = [row for row in files.series if row["t_s"] >= 0.8 * (report["seconds"] or 0.0) and "number" in row]
+    updates = late[-1]["number"] - late[0]["number"] if late else 0  # not all have a row
+    if not points or shown.get("psnr_db") is None or not updates > 0:
+        return False
+    update_s = (late[-1]["t_s"] - late[0]["t_s"]) / updates
+    with figure(path, height_inch=2.6) as (_, ((ax,),)):
+        for effort, color in zip(dict.fromkeys(p[0] for p in points), (BLUE, GREEN, ORANGE, PURPLE)):
+            mine = np.array(sorted(p[1:] for p in points if p[0] == effort))
+            ax.plot(mine[:, 0] / 1e3, mine[:, 1], color=color, marker=".", label=f"{effort}, whole image")
+            ax.plot(mine[:, 0] / 1e3, mine[:, 2], "--", color=color, marker=".", label=f"{effort}, moving")
+        for key, label in (("psnr_db", "this run"), ("psnr_moving_db", None)):
+            if shown.get(key) is not None:
+                ax.plot([update_s], [shown[key]], "o", color=VERMILION, markersize=8, label=label)
+        ax.set_xscale("log")
+        label_lines(ax, "PSNR shown (dB)", "seconds an update takes", f"Measured: {about}")
+    return True
+
+
 FIGURES: dict[str, Callable[[Report, RunFiles, Path], bool]] = {
     "comparison": draw_comparison,
     "fidelity": draw_fidelity,
     "ages": draw_ages,
     "updates": draw_updates,
+    "frontier": draw_frontier,
     "channel": draw_channel,
     "processes": draw_processes,
 }

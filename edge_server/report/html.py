@@ -48,6 +48,7 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
         _section("Mesh", _mesh_table(report)),
         _section("Age", _figure(figures, "ages"), _details("By camera", _age_table(report))),
         _section("Updates", _figure(figures, "updates"), _updates_line(report)),
+        _section("What accuracy costs in time", _figure(figures, "frontier")),
         _section("Frames", _frames_table(report), _details("By camera", _frames_by_camera(report))),
         _section("Channel", _figure(figures, "channel"), _channel_table(report)),
         _section("Machine", _figure(figures, "processes"), _machine_table(report)),

@@ -22,7 +22,8 @@ class RunFiles:
     edge, channel: status files of the edge and the emulator. series: rows as in state.Publication.
     shown: rows as ``Journal.shown`` writes them.
     ages: rows {t_s, age_ms: {camera: ms or None}}. processes: rows {t_s, name: {rss_mb, cpu, pid}}.
-    mesh: as ``edge-server export --json`` writes it. images: those that exist, by name.
+    frontier: what accuracy costs, as the edge had it. mesh: as ``edge-server export --json`` writes it.
+    images: those that exist, by name.
     notes: one line for people on whatever was missing or torn.
     """
 
@@ -33,6 +34,7 @@ class RunFiles:
     shown: list[Row] = field(default_factory=list)
     ages: list[Row] = field(default_factory=list)
     processes: list[Row] = field(default_factory=list)
+    frontier: Row = field(default_factory=dict)
     mesh: Row = field(default_factory=dict)
     images: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -47,9 +49,11 @@ def read_run_files(out: Path) -> RunFiles:
     files.channel = _read_json(out / "channel.json", files.notes)
     files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
     files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
-    # Not of a fit, and only where one command started all processes.
+    # Not of a fit; processes only where one command started all of them.
     for name in [n for n in ("shown", "processes") if (out / f"{n}.jsonl").exists()]:
         setattr(files, name, _continuous(_read_lines(out / f"{name}.jsonl", files.notes)))
+    if (out / "frontier.json").exists():  # not of a fit
+        files.frontier = _read_json(out / "frontier.json", files.notes)
     if (out / "mesh.json").exists():  # only where the scenario asks for one
         files.mesh = _mesh(_read_json(out / "mesh.json", files.notes), files.notes)
     for name in ("truth", "rendered"):

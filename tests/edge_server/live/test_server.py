@@ -140,7 +140,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     _, about = checkpoint.load(out / "field.npz")
     assert about["updates"] == len(series)
     again, _, _ = serve(resume=out / "field.npz")
-    assert again.field.step > 0 and again.updater.number == len(series)
+    assert again.updater.field.step > 0 and again.updater.number == len(series)
     fresh, _, _ = serve()
     assert fresh.updater.number == 0
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
@@ -172,6 +172,17 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
     with pytest.raises(grpc.RpcError) as long:
         edge.SetPolicy(edge_pb2.SetPolicyRequest(name="n" * 8_000_000))
     assert long.value.code() == grpc.StatusCode.INVALID_ARGUMENT and len(long.value.details()) < 200
+    before, field = server.state.newest().number, server.updater.field
+    server.state.set_deadline(150.0)
+    server.state.set_effort("low")
+    until(lambda: server.state.newest().number > before and server.updater.field is not field)
+    until(lambda: server.status()["updates"]["with_deadline"] > 0)
+    assert server.status()["updates"]["deadline_ms"] == 150.0 and server.state.controls.effort == "low"
+    with pytest.raises(ValueError, match="effort: expected one of low"):
+        server.state.set_effort("best")
+    with pytest.raises(ValueError, match="deadline_ms"):
+        server.state.set_deadline(5.0)
+    assert server.state.controls.deadline_ms == 150.0, "what is refused changes nothing"
     path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
     assert checkpoint.load(path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())

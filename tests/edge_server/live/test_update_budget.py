@@ -125,6 +125,19 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
             read_frontier(tmp_path / "f.json", "ngp")
     with pytest.raises(ValueError, match=r"missing\.json"):
         read_frontier(tmp_path / "missing.json", "ngp")
+    row = {
+        "field": "splat", "effort": "low", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1,
+        "psnr_db": 30.0, "psnr_moving_db": 20.0, "shown_psnr_db": 25.0, "shown_psnr_moving_db": 15.0,
+    }  # fmt: skip
+    layers = row | {"effort": "layers", "options": {"layers": True}, "shown_psnr_db": 29.0}
+    (tmp_path / "f.json").write_text(json.dumps({"updates": [row, layers]}))
+    (plain,), (layered,) = (
+        read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True)
+    )
+    assert plain.psnr_db == 25.0 and plain.mean_db == 20.0, "by what was shown"
+    assert layered.psnr_db == 29.0 and layered.effort == "layers"
+    with pytest.raises(ValueError, match="for ngp in layers"):
+        read_frontier(tmp_path / "f.json", "ngp", layers=True)
     (tmp_path / "f.json").write_text(json.dumps({"updates": []}))
     with pytest.raises(ValueError, match="nothing was measured"):
         read_frontier(tmp_path / "f.json", "ngp")

@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
+from edge_server.live.update_budget import Frontier, FrontierPoint
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
@@ -136,6 +138,39 @@ def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
     state.controls.policy = path
     panel.refresh()
     assert panel.policy.value == "bandit:p.npz"
+
+
+def test_effort_and_deadline_are_controls_where_the_field_has_them():
+    asked = []
+    frontier = Frontier((FrontierPoint("low", {}, 1.0, 50.0, 20.0, 16.0),), 1.0, "f.json")
+    state = replace(
+        bare_state(), frontier=frontier, efforts=("low", "high"),
+        set_effort=asked.append, set_deadline=asked.append,
+    )  # fmt: skip
+    state.controls.effort = "low"
+    gui = MagicMock()
+    for kind in (gui.add_number, gui.add_html):
+        kind.side_effect = lambda *words, **more: MagicMock()
+    panel = ControlPanel(MagicMock(gui=gui), state)
+    panel._effort_chosen(MagicMock(target=MagicMock(value="high")))
+    panel._deadline_entered(MagicMock(target=MagicMock(value=120.0)))
+    state.controls.deadline_ms = 120.0
+    panel._deadline_entered(MagicMock(target=MagicMock(value=0.0)))
+    assert asked == ["high", 120.0, None]
+    assert panel.deadline.value == 120.0 and "<polyline" in panel.frontier.content
+    layered = ControlPanel(MagicMock(), bare_state())
+    assert layered.effort is None and layered.deadline is None
+
+
+def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():
+    state = bare_state()
+    assert state.present() is None
+    for number in range(40):
+        state.publish(publication(number), BallScene(0.0))
+        moving_db = 10.0 if number == 39 else None
+        state.add_shown(Score("cam00", 0, 20.0 + (number >= 10), moving_db, None, None, None))
+    times = [p.t_s for p in state.publications()[-30:]]
+    assert state.present() == (pytest.approx(1e3 * np.diff(times).mean()), 21.0, 10.0)
 
 
 # --- the port ----------------------------------------------------------------------------------

@@ -251,6 +251,25 @@ def test_a_deadline_is_reported_with_the_share_of_updates_that_met_it():
     assert (found["met_share"], found["ms_p50"], found["ms_p95"], found["count"]) == (0.875, 85.0, 120.0, 8)
 
 
+def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
+    from edge_server.report.figures import draw_frontier
+
+    write_run(tmp_path)
+    report, path = build_report(tmp_path), tmp_path / "figure-frontier.png"
+    assert not draw_frontier(report, read_run_files(tmp_path), path), "a run without one"
+    point = {"effort": "low", "update_ms": 50.0, "psnr_db": 20.0, "psnr_moving_db": 16.0}
+    for points, drawn in (([point], True), ([], False), ([{}], False), (3, False)):
+        (tmp_path / "frontier.json").write_text(json.dumps({"points": points, "about": "f.json"}))
+        assert draw_frontier(report, read_run_files(tmp_path), path) == drawn
+    at: list[float] = []
+    (tmp_path / "frontier.json").write_text(json.dumps({"points": [point], "about": "f.json"}))
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, x, *words, **more: at.append(float(x[0])))
+    files = read_run_files(tmp_path)
+    files.series = files.series[::2]  # a busy edge writes no row for some updates
+    assert draw_frontier(report, files, path) and at[-1] == pytest.approx(0.75), "one update to the next"
+    assert path.stat().st_size > 5000
+
+
 def test_the_stand_in_distance_is_never_shown_as_lpips(tmp_path, monkeypatch):
     """Where LPIPS is missing, tiles, table and figure name the distance that took its place."""
     from edge_server.report.figures import draw_fidelity

@@ -79,7 +79,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def _scenario(point: Mapping[str, float]) -> Scenario:
-    value = {**dict(zip(_FACTORS, _ROOM)), **point}
+    value = dict(zip(_FACTORS, _ROOM)) | dict(point)
     source = {
         "width": int(value["width"]), "height": int(value["height"]), "fps": value["fps"],
         "speed_m_per_s": value["speed, m/s"], "params": {"people": int(value["people"])},
@@ -175,7 +175,7 @@ def draw(figures: Mapping[str, Any], path: Path) -> None:
                     ax.plot(range(len(found)), values, marker=".", color=color, label=name)
                     full = [k for k, f in enumerate(found) if _is_saturated(f)]
                     ax.plot(full, [values[k] for k in full], "o", markersize=9, mfc="none", color=INK,
-                            label="saturated" if full else None)  # fmt: skip
+                            label="saturated" if full and key == "psnr_db" else None)  # fmt: skip
                 if column == 0:
                     ax.set_ylabel(label)
                     ax.legend()
