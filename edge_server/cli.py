@@ -141,6 +141,8 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--page-host", default="127.0.0.1", metavar="HOST", help="page's address [%(default)s]")
     run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port")
     run.add_argument("--out", type=Path, default=Path("runs/edge"), metavar="DIR", help="[%(default)s]")
+    run.add_argument("--emulator-out", type=Path, metavar="DIR",
+        help="the emulator's --out, whose channel state the page shows [that of this server]")  # fmt: skip
     run.add_argument("--seed", type=int, help="instead of the scenario's")
     run.add_argument(
         "--policy", metavar="NAME[:VALUE]", help="not the scenario's: threshold:120, bandit:FILE"
@@ -182,6 +184,7 @@ def _run(args: argparse.Namespace) -> int:
     options = ServerOptions(
         listen=args.listen,
         out=args.out,
+        emulator_out=args.emulator_out,
         transport=transport.from_arguments(args),
         page_host=args.page_host,
         page_port=args.page_port,

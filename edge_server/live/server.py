@@ -60,7 +60,7 @@ class ServerOptions:
     listen: HOST:PORT for frames. out: folder of the run's files. transport: security of connections.
     page_host, page_port, metrics_port: of the page and of Prometheus metrics; without a port there is none.
     lpips_folder: with weights. resume: checkpoint to start from. checkpoint_s: period of writing one.
-    record: MCAP file to write the session to.
+    record: MCAP file to write the session to. emulator_out: folder with the emulator's status; None: ``out``.
     """
 
     listen: str
@@ -73,6 +73,7 @@ class ServerOptions:
     resume: Path | None = None
     checkpoint_s: float | None = None
     record: Path | None = None
+    emulator_out: Path | None = None
 
 
 class EdgeServer:
@@ -153,7 +154,7 @@ class EdgeServer:
             now_ns=self.clock.now_ns,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
-            channel=ReplacedJson(options.out / "channel.json").read,
+            channel=ReplacedJson((options.emulator_out or options.out) / "channel.json").read,
             scores=config.scores,
             frontier=self.frontier,
             efforts=() if self._field_options.get("layers") else tuple(efforts_of(config.field)),
