@@ -86,11 +86,17 @@ class Dataset:
         return tuple(sorted(found, key=lambda image: 0.0 if image.time_s is None else image.time_s))
 
 
+_LONGEST_NAME = 255  # bytes, of a file on every common file system
+
+
 def path_within(name: str) -> Path:
-    """The path of a file in a data set's folder, as the set names it. DatasetError where it leads out."""
+    """The path of a file in a data set's folder, as the set names it. DatasetError where it leads out, or
+    where no file can have the name."""
     path = Path(name)
     if not name or path.is_absolute() or ".." in path.parts:
         raise DatasetError(f"{name[:200]!r} does not lie within the folder of the data set")
+    if "\0" in name or any(len(part.encode("utf-8", "replace")) > _LONGEST_NAME for part in path.parts):
+        raise DatasetError(f"{name[:200]!r} is not the name of a file")
     return path
 
 
