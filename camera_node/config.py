@@ -302,7 +302,7 @@ def source_config(scenario: Scenario) -> SourceConfig:
     """The checked ``source:`` section. Raises ScenarioError."""
     where = f"{scenario.path}: source"
     kind = scenario.source.get("kind")
-    if kind not in MODELS:
+    if not isinstance(kind, str) or kind not in MODELS:
         raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
     return read_section(MODELS[kind], scenario.source, where)
 

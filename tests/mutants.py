@@ -47,9 +47,9 @@ MODULES = {
     "buffer": (["edge_server/live/buffer.py"], ["tests/edge_server/live/test_buffer.py"]),
     "scheduler": (
         [f"{SCHEDULER}/{name}.py" for name in (
-            "age_driven", "freshest_k", "periodic", "policy", "registry", "round_robin", "threshold", "wait"
+            "fixed", "policy", "registry", "wait"
         )],
-        [f"tests/{SCHEDULER}/test_policies.py"],
+        [f"tests/{SCHEDULER}/test_policies.py", f"tests/{SCHEDULER}/test_registry.py"],
     ),
     "fidelity": (
         [f"{FIDELITY}/{name}.py" for name in (

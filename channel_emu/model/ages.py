@@ -6,6 +6,7 @@ process at the sender (what the frames are about, how urgent it is) is given its
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -151,6 +152,13 @@ def _urgency(saw: Sawtooth, weight: float, away: float, back: float, rng: Counte
     return urgency_ms(saw, changes_ns, np.where(states == 1, weight, 1.0))
 
 
+def _weight(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ValueError(f"a weight is finite and at least 0, not {text}")
+    return value
+
+
 METRICS = {
     "age": Metric("time average of the age", (), mean_age_ms),
     "peak": Metric("age just before a delivery", (), peak_age_ms),
@@ -165,7 +173,7 @@ METRICS = {
     ),
     "urgency": Metric(
         "age times a weight while it is urgent, which begins and ends at these rates, urgency:5:1/3s:1/1s",
-        (float, rate_per_ms, rate_per_ms), _urgency, drawn=True,
+        (_weight, rate_per_ms, rate_per_ms), _urgency, drawn=True,
     ),
 }  # fmt: skip
 

@@ -81,6 +81,9 @@ def preset(name: str, folder: Path) -> dict[str, Any]:
     raise SpellingError(f"expected one of {', '.join([*PRESETS, *FROM_FILES])}, got {name!r}")
 
 
+_MOST_KBPS = 1e6  # more than any of its operators, and each 12 are a packet a second to be kept
+
+
 def _errant(path: Path, profile: str) -> dict[str, Any]:
     """Gamma delays of half the profile's round trip (mean and standard deviation) behind a line of its upload
     rate, on which packets queue."""
@@ -92,7 +95,12 @@ def _errant(path: Path, profile: str) -> dict[str, Any]:
         row = found[profile.lower()]
         mean_ms, deviation_ms = float(row["latency_ms_avg"]) / 2, float(row["latency_ms_stdev"]) / 2
         service = {"law": "gamma", "mean_ms": mean_ms, "shape": (mean_ms / deviation_ms) ** 2}
-        packets_per_s = float(row["upload_kbps"]) / 12  # of 1500 bytes
+        upload_kbps = float(row["upload_kbps"])
+        if not 0.0 < upload_kbps <= _MOST_KBPS:
+            raise SpellingError(
+                f"{path}: {profile}: upload_kbps is {upload_kbps:g}, expected up to {_MOST_KBPS:g}"
+            )
+        packets_per_s = upload_kbps / 12  # of 1500 bytes
         span_s = 1 + int(1000 / packets_per_s)  # so that a whole number of packets fits well
         count = max(1, round(packets_per_s * span_s))
     except SpellingError:

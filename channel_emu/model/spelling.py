@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
+from freshfield.untrusted import UntrustedError, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
@@ -57,11 +57,13 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
     """
     if text.lstrip().startswith("{"):
         try:
-            found = yaml.safe_load(text)
-        except yaml.YAMLError:
+            found = read_yaml(text)
+        except UntrustedError:
             found = None
         if not isinstance(found, dict):
-            raise SpellingError(f"{text!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
+            raise SpellingError(
+                f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}"
+            )
         return found
     if key == "service":
         return service(text, folder)
@@ -72,9 +74,11 @@ def fault(text: str) -> dict[str, Any]:
     """``NAME:VALUE`` of a fault, the value as YAML writes it: its parameters, or the first of them."""
     name, colon, value = text.partition(":")
     try:
-        return {name: yaml.safe_load(value) if colon else {}}
-    except yaml.YAMLError:
-        raise SpellingError(f"fault {text!r}: expected something like loss:0.1 or loss:[0.01, 0.3]") from None
+        return {name: read_yaml(value) if colon else {}}
+    except UntrustedError:
+        raise SpellingError(
+            f"fault {text[:200]!r}: expected something like loss:0.1 or loss:[0.01, 0.3]"
+        ) from None
 
 
 def arrivals(text: str) -> dict[str, Any]:
@@ -168,7 +172,7 @@ def delays_ms(path: Path) -> list[float]:
         try:
             records = [json.loads(line) for line in text.split("\n")[1:-1]]
             return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, RecursionError):
             raise SpellingError(f"{path}: neither delays nor a trace of this emulator") from None
     rows = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
     names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}

@@ -35,7 +35,7 @@ def plot_ages(simulation: Simulation, path: Path) -> None:
             saw = run.sawtooth()
             due, born = saw.delivered_ns[:_DELIVERIES] / 1e6, saw.generated_ns[:_DELIVERIES] / 1e6
             # Each delivery is a fall: the age before it and after it.
-            before = np.append(np.nan, due[1:] - born[:-1])
+            before = np.append(np.nan, due[1:] - born[:-1])[: len(due)]
             age.plot(np.repeat(due, 2) / 1e3, np.stack((before, due - born), 1).ravel(), label=run.camera)
             values = np.sort(run.delays_ms())
             delay.plot(values, (np.arange(len(values)) + 0.5) / max(len(values), 1))

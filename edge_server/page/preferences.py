@@ -172,6 +172,10 @@ def _told(body: bytes) -> dict[str, Any]:
 
 def _body(environ: dict[str, Any]) -> bytes:
     length = environ.get("CONTENT_LENGTH") or "0"
-    if not length.isdigit() or int(length) > MAX_BODY_BYTES:
+    if not (length.isascii() and length.isdigit() and len(length) < 10) or int(length) > MAX_BODY_BYTES:
         raise _Refused(413, f"At most {MAX_BODY_BYTES // 2**10} KiB.")
-    return environ["wsgi.input"].read(int(length))  # type: ignore[no-any-return]
+    try:
+        body: bytes = environ["wsgi.input"].read(int(length))
+    except OSError:
+        raise _Refused(400, "The body did not come.") from None
+    return body

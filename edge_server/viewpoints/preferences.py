@@ -41,12 +41,14 @@ class Given(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AnswersFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is exported. reconstructions: of each one, the candidates whose views it was made of, in order."""
+    """What is exported. made_of: digest of all that decides the reconstructions. reconstructions: of each
+    one, the candidates whose views it was made of, in order."""
 
     kind: Literal["freshfield preference answers"]
     version: Literal[1]
     scenario: str
     seed: int
+    made_of: str
     reconstructions: tuple[tuple[int, ...], ...]
     answers: tuple[Given, ...]
 
@@ -62,7 +64,7 @@ class Question:
 class PreferenceSession:
     """scenario: of the reconstructions. orders: the views of each, as in ``AnswersFile``. features: (N, d) of
     them as trajectories. wanted: number of questions. seed: of the questions. by: who answers, a person or
-    the label of a simulated expert.
+    the label of a simulated expert. made_of: as in ``AnswersFile``.
 
     Raises ViewpointError where there is no pair to ask about.
     """
@@ -74,6 +76,7 @@ class PreferenceSession:
     seed: int = 0
     by: str = PERSON
     answers: tuple[Given, ...] = ()
+    made_of: str = ""
 
     def __post_init__(self) -> None:
         if len(set(self.orders)) < 2:
@@ -124,7 +127,7 @@ class PreferenceSession:
 
     def as_json(self) -> dict[str, Any]:
         """The file of answers."""
-        file = AnswersFile(KIND, 1, self.scenario, self.seed, self.orders, self.answers)
+        file = AnswersFile(KIND, 1, self.scenario, self.seed, self.made_of, self.orders, self.answers)
         return dict(msgspec.to_builtins(file))
 
     def imported(self, data: bytes) -> PreferenceSession:
@@ -134,7 +137,8 @@ class PreferenceSession:
             file = msgspec.json.decode(data, type=AnswersFile)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise ViewpointError(f"not a file of answers: {error}") from None
-        if (file.scenario, file.reconstructions) != (self.scenario, self.orders):
+        ours = (self.scenario, self.made_of, self.orders)
+        if (file.scenario, file.made_of, file.reconstructions) != ours:
             raise ViewpointError(f"answers about other reconstructions (scenario {file.scenario:.80})")
         if file.seed < 0:
             raise ViewpointError(f"not a file of answers: seed {file.seed} is below 0")

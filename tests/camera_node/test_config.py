@@ -28,6 +28,7 @@ def test_what_is_given_reaches_the_scene():
     [
         ({}, "source.kind: expected one of world, transforms, video"),
         ({"kind": "wrold"}, "source.kind: .*'wrold'"),
+        ({"kind": [1]}, "source.kind: expected one of world"),
         ({"kind": "world", "fbs": 3}, "source.fbs: unknown key; did you mean 'fps'"),
         ({"kind": "world", "fps": 0}, "fps is 0"),
         ({"kind": "world", "fps": "fast"}, "source.fps: expected a number"),

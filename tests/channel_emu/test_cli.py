@@ -91,6 +91,8 @@ def test_frames_metrics_and_a_picture_of_a_simulation(capsys, tmp_path: Path) ->
     assert found["metrics_ms"]["peak"] == found["peak_age_ms"]
     assert found["metrics_ms"]["shown:9ms:1ms"] == pytest.approx(found["mean_age_ms"] + 9.5, abs=0.5)
     assert drawn.read_bytes().startswith(b"\x89PNG")
+    none = simulate(capsys, "--fault", "loss:1", "--seconds", "1", "--plot", str(drawn))
+    assert none["delivered"] == 0
     rows = frames.read_text().splitlines()
     assert rows[0] == "offered_ms,delivered_ms,camera" and len(rows) == found["offered"] + 1
     assert main(["fit", str(frames), "--states", "1", "--json"]) == 0

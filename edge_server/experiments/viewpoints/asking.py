@@ -12,6 +12,7 @@ from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.viewpoints.reconstructions import (
     COLUMNS,
     FRAMES,
+    identity,
     sprites,
     taste_score,
     varied_plans,
@@ -58,7 +59,10 @@ def compare(
     orders = tuple(tuple(plan.order) for plan in plans)
     features = np.array([steps.trajectory(order) for order in orders])
     by = PERSON if who == PERSON else SimulatedExpert(who, np.zeros(0), np.random.default_rng()).label
-    session = PreferenceSession(stage.name, orders, features, about.questions, about.seed, by)
+    made_of = identity(stage, plans, about.steps, about.seed)
+    session = PreferenceSession(
+        stage.name, orders, features, about.questions, about.seed, by, made_of=made_of
+    )
     path = about.out / ANSWERS
     if path.exists():
         try:

@@ -133,8 +133,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--travel", type=float, default=0.2, metavar="W",
         help="of the way against the value, as shares of their ranges; 0: none [%(default)g]")  # fmt: skip
     add("--candidates", type=int, default=100, metavar="N", help="of a synthetic world [%(default)s]")
-    add("--steps", type=int, default=400, metavar="N", help="of each fit [%(default)s]")
-    add("--seed", type=int, default=0, metavar="N", help="of the first view and what is drawn [%(default)s]")
+    add("--steps", type=at_least(1), default=400, metavar="N", help="of each fit [%(default)s]")
+    add(
+        "--seed",
+        type=at_least(0),
+        default=0,
+        metavar="N",
+        help="of the first view and what is drawn [%(default)s]",
+    )
     add("--ask", nargs="?", const=PERSON, choices=[PERSON, *TASTES], metavar="WHO",
         help=f"compare reconstructions first: {PERSON} (on the page, where no WHO is given), or a simulated "
         f"expert: {', '.join(TASTES)}")  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -85,13 +86,20 @@ def varied_plans(stage: Stage, count: int, views: int, seed: int) -> list[Plan]:
     return list({tuple(plan.order): plan for plan in plans}.values())
 
 
+def identity(stage: Stage, plans: Sequence[Plan], steps: int, seed: int) -> str:
+    """A digest of what reconstructions are made of: the scene as it is seen, and how a field is fitted."""
+    found = hashlib.sha256(repr(([p.order for p in plans], stage.options, steps, seed)).encode())
+    for view in stage.held_out:
+        found.update(np.ascontiguousarray(view.image))
+    return found.hexdigest()[:16]
+
+
 def sprites(
     stage: Stage, plans: list[Plan], steps: int, seed: int, folder: Path, told: Callable[[int], None]
 ) -> list[bytes]:
     """The ``sprite`` of each plan, kept in ``folder`` for the next time. told: is called with the number of
     each that is made. Raises OSError."""
-    orders = [plan.order for plan in plans]
-    about = {"scenario": stage.name, "steps": steps, "seed": seed, "orders": orders}
+    about = {"scenario": stage.name, "made_of": identity(stage, plans, steps, seed)}
     files = [folder / f"{k:03d}.jpg" for k in range(len(plans))]
     try:
         if json.loads((folder / "about.json").read_text()) == about:
@@ -99,6 +107,7 @@ def sprites(
     except (OSError, ValueError):
         pass
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "about.json").unlink(missing_ok=True)  # until all are of this kind
     for k, plan in enumerate(plans):
         write_bytes(files[k], sprite(stage, stage.fit(plan.views, steps, seed)))
         told(k)

@@ -126,7 +126,18 @@ def test_losses_by_state() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["youth", "query", "query:fast", "query:0", "shown:1", "incorrect:1", "peak:1ms"]
+    "text",
+    [
+        "youth",
+        "query",
+        "query:fast",
+        "query:0",
+        "shown:1",
+        "incorrect:1",
+        "peak:1ms",
+        "urgency:nan:1:1",
+        "urgency:-5:1:1",
+    ],
 )
 def test_a_metric_that_cannot_be_read(text: str) -> None:
     saw = ages.Sawtooth(np.array([5]) * MS, np.array([2]) * MS, 15 * MS)

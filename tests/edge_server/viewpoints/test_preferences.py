@@ -101,6 +101,7 @@ def test_the_file_says_what_was_shown_and_who_answered():
         (lambda f: f.update(seed=-1), "below 0"),
         (lambda f: f.update(scenario="cell"), "other reconstructions"),
         (lambda f: f["reconstructions"].pop(), "other reconstructions"),
+        (lambda f: f.update(made_of="of other pictures"), "other reconstructions"),
         (lambda f: f["answers"][2].update(choice="both"), r"answers\[2\].choice"),
         (lambda f: f["answers"][2].update(left=20), "answer 2: 20 and"),
         (lambda f: f["answers"][2].update(left=-1), "answer 2: -1 and"),
