@@ -165,12 +165,12 @@ class FieldUpdater:
         return self.policy.plan(self.epoch(now_ns))
 
     def select(
-        self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, frame_s: float | None = None
+        self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, most_new: int | None = None
     ) -> Selection | None:
         """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on.
 
         budget: of the fit that follows, which bounds the new frames where it is one of seconds.
-        frame_s: what one of them takes (virtual time); None: as the field has measured it.
+        most_new: of them at most (virtual time, where no clock tells what the field has time for).
         """
         arrivals = self.buffer.arrivals - self._selected_of
         nothing_new = not arrivals and not self.buffer.held_back
@@ -182,7 +182,7 @@ class FieldUpdater:
         if not cameras:
             return None
         self._selected_of += arrivals
-        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, frame_s))
+        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, most_new))
         before = tuple(earlier[c] for i in items if (c := i.frame.camera) in earlier)
         if self.field.frame_s is not None:
             own = {item.frame.camera: item for item in items}
@@ -190,13 +190,12 @@ class FieldUpdater:
             self._selected |= own
         return Selection(plan, now_ns, items, before, others, arrivals)
 
-    def _most_new(self, budget: Budget | None, frame_s: float | None) -> int | None:
-        """Number of new frames that the field has time for; None: all."""
-        measured_s = self.field.frame_s
-        if measured_s is None or budget is None or budget.seconds is None:
-            return None
-        a_frame_s = frame_s or measured_s
-        return max(int(INTAKE_SHARE * budget.seconds / a_frame_s), LEAST_TAKEN) if a_frame_s else None
+    def _most_new(self, budget: Budget | None, most_new: int | None) -> int | None:
+        """Number of new frames that a field that wants every frame has time for; None: all."""
+        frame_s = self.field.frame_s
+        if not frame_s or budget is None or budget.seconds is None:
+            return None if frame_s is None else most_new
+        return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
 
     def fit(
         self, selection: Selection, budget: Budget, publishes_ns: int | None = None

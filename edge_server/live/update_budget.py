@@ -69,13 +69,14 @@ class UpdateBudget:
 
 @dataclass(frozen=True)
 class FrontierPoint:
-    """A measured setting of updates, and what was shown with it at random instants.
+    """A measured setting of updates, and the fidelity with it.
 
     effort, options: name and field options of the setting.
     speed_m_per_s: of the scene it was measured on.
     update_ms: from decision to publication; of a field in layers from one update to the next.
     psnr_db: of the whole image; psnr_moving_db: where the scene moves.
     error_db: upper bound of the standard error of their mean; 0 with one seed.
+    measured: whether these are of what was "shown", or of what was "published" (earlier versions).
     """
 
     effort: str
@@ -85,6 +86,7 @@ class FrontierPoint:
     psnr_db: float
     psnr_moving_db: float
     error_db: float = 0.0
+    measured: str = "shown"
 
     @property
     def mean_db(self) -> float:
@@ -113,6 +115,7 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
                 psnr_db=float(row[f"{by}psnr_db"]),
                 psnr_moving_db=float(row[f"{by}psnr_moving_db"]),
                 error_db=0.5 * sum(row.get(f"{by}{k}_error") or 0.0 for k in ("psnr_db", "psnr_moving_db")),
+                measured="shown" if by else "published",
             )
             for row in rows
             for by in ("shown_" if "shown_psnr_db" in row else "",)
@@ -185,7 +188,8 @@ def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
         return Frontier((), speed, str(error))
     points = _at_nearest_speed(points, speed)
     file = config.frontier or "the shipped frontier.json, of room"
-    return Frontier(tuple(points), speed, f"{file}, at {points[0].speed_m_per_s:g} m/s")
+    first = points[0]
+    return Frontier(tuple(points), speed, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}")
 
 
 def open_budget(
@@ -207,9 +211,9 @@ def options_for(frontier: Frontier, config: EdgeConfig) -> dict[str, Any]:
     if config.deadline_ms is None or point is None:
         return config.field_options
     log.info(
-        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB shown, %.1f moving)",
+        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB %s, %.1f moving)",
         config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
-        point.psnr_moving_db,
+        point.measured, point.psnr_moving_db,
     )  # fmt: skip
     if point.update_ms > config.deadline_ms:
         log.warning("no measured update is as short as that: updates do what fits")

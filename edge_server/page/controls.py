@@ -55,7 +55,7 @@ class ControlPanel:
         if state.set_deadline is not None:
             self.deadline = gui.add_number(
                 "deadline, ms", _finite_or_zero(state.controls.deadline_ms), min=0.0, step=10.0,
-                hint="An update's time from decision to publication; 0: as the scenario says.",
+                hint="An update's time from decision to publication; 0: none, the scenario's update_ms.",
             )  # fmt: skip
             self.deadline.on_update(lambda event: self._deadline_entered(event))
         self.frontier = gui.add_html("", visible=state.frontier is not None)

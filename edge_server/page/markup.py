@@ -107,7 +107,7 @@ def _age_parts(parts_ms: Mapping[str, float]) -> str:
 
 
 def frontier(found: Frontier, effort: str, present: tuple[float, float, float | None] | None) -> str:
-    """What accuracy costs in time: PSNR shown against the time of an update, the curves of ``effort`` bold,
+    """What accuracy costs in time: PSNR against the time of an update, the curves of ``effort`` bold,
     and the present point (``EdgeState.present``); how to measure it where it is not known."""
     if not found.points:
         return note(f"What accuracy costs in time is not measured for this field. {found.about}")

@@ -220,11 +220,11 @@ def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
             mine = np.array(sorted(p[1:] for p in points if p[0] == effort))
             ax.plot(mine[:, 0] / 1e3, mine[:, 1], color=color, marker=".", label=f"{effort}, whole image")
             ax.plot(mine[:, 0] / 1e3, mine[:, 2], "--", color=color, marker=".", label=f"{effort}, moving")
-        for key, label in (("psnr_db", "this run"), ("psnr_moving_db", None)):
+        for key, label in (("psnr_db", "this run, shown"), ("psnr_moving_db", None)):
             if shown.get(key) is not None:
                 ax.plot([update_s], [shown[key]], "o", color=VERMILION, markersize=8, label=label)
         ax.set_xscale("log")
-        label_lines(ax, "PSNR shown (dB)", "seconds an update takes", f"Measured: {about}")
+        label_lines(ax, "PSNR (dB)", "seconds an update takes", f"Measured: {about}")
     return True
 
 

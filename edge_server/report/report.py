@@ -124,7 +124,8 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     if deadline_ms is not None:
         met = _mean(float(ms <= deadline_ms) for ms in spent)
         if edge.get("count") and (within := _number(edge.get("within_deadline"))) is not None:
-            met = within / max(_number(edge.get("with_deadline", edge["count"])) or 0.0, 1.0)
+            ended = _number(edge.get("with_deadline", edge["count"])) or 0.0
+            met = within / ended if ended else None
         result |= {"deadline_ms": deadline_ms, "met_share": met}
     return result
 

@@ -103,6 +103,7 @@ class UpdateCosts:
     def __init__(self) -> None:
         self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
         self._seen, self._spent_s = 0, 0.0
+        self._most_pixels: int | None = None
 
     def watch(self, field: Any) -> None:
         """Have the field measure its parts by the time of this thread, which others cannot slow down."""
@@ -115,6 +116,7 @@ class UpdateCosts:
         spent_s = sum(parts.values()) - beside_s(updates.field)
         if counts:
             self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
+        self._most_pixels = updates.decoder.most_pixels
         self._seen, self._spent_s = updates.buffer.arrivals, spent_s
 
     def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
@@ -126,7 +128,7 @@ class UpdateCosts:
         slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
         view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
         begun = time.thread_time()
-        ViewDecoder().views(items)
+        ViewDecoder(most_pixels=self._most_pixels).views(items)
         decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
         update_ms = float(spent_ms.mean() - view_ms * frames.mean())
         return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}

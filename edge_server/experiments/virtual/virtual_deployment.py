@@ -27,7 +27,7 @@ from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Snapshot
 from edge_server.live.buffer import BufferedFrame
-from edge_server.live.field_updater import FieldUpdater, Selection
+from edge_server.live.field_updater import LEAST_TAKEN, FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler.policy import Policy
@@ -108,12 +108,13 @@ class RunSettings:
             raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
 
     @property
-    def intake(self) -> tuple[Budget | None, float | None]:
-        """What bounds the new frames of an update where each is charged, as live: its time, and seconds a
-        frame."""
+    def most_new(self) -> int | None:
+        """Number of frames that an update takes in, where each is charged: what lets it last two epochs; the
+        others are left out. None: all."""
         if not (self.epoch_ms and self.compute.ms_per_view):
-            return None, None
-        return Budget(seconds=self.epoch_ms / 1e3), self.compute.ms_per_view / 1e3
+            return None
+        left_ms = 2.0 * self.epoch_ms - self.compute.ms_per_update - self.compute.ms_per_step * self.steps
+        return max(int(left_ms / self.compute.ms_per_view), LEAST_TAKEN)
 
     def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
         """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
@@ -365,20 +366,23 @@ class VirtualDeployment:
     def _run_edge(self) -> Generator[WakeCondition, None, None]:
         """The edge's loop; it yields when it wants to go on."""
         updates, settings = self.updates, self.settings
-        steps = settings.first_steps or settings.steps
+        steps = settings.first_steps
         if settings.first_ms is None:
             yield from self._await_cameras()
         else:  # with the cameras that have reported by then: the instants are given
             yield WakeCondition(self._origin_ns + round(settings.first_ms * 1e6))
         while True:
             settings = self.settings
+            steps = steps or settings.steps
+            # A field begins with all that has come; only then does it know what a frame takes.
+            most_new = settings.most_new if self.publications else None
             if self.next_policy is not None:
                 updates.policy, self.next_policy = self.next_policy, None
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
             if plan.flush:
                 self._flush(decided_ns)
-            while (selection := updates.select(plan, self.clock.now_ns(), *settings.intake)) is None:
+            while (selection := updates.select(plan, self.clock.now_ns(), most_new=most_new)) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if settings.scratch:
@@ -392,7 +396,7 @@ class VirtualDeployment:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
-            steps = settings.steps
+            steps = 0
             charged_ns = settings.compute.charge_ns(report.steps, treated, selection.arrivals)
             yield WakeCondition(self.clock.now_ns() + charged_ns)
             published_ns = self.clock.now_ns()

@@ -129,9 +129,9 @@ def test_growth_varies_one_factor_at_a_time_and_says_what_saturates(small, tmp_p
 
 
 def test_updates_take_in_no_more_frames_than_there_is_time_for() -> None:
-    """A field that wants every frame, 40 of which take as long as an update may."""
-    settings = runs.RunSettings(1, epoch_ms=20.0, compute=runs.Compute(ms_per_view=0.5))
-    budget, frame_s = settings.intake
-    assert budget is not None and (budget.seconds, frame_s) == (0.02, 0.0005)
-    assert runs.replace(settings, compute=runs.Compute()).intake == (None, None)
-    assert runs.replace(settings, epoch_ms=0.0).intake == (None, None)
+    """Two epochs are 40 ms; an update takes 10 of them, a frame 0.5."""
+    settings = runs.RunSettings(1, epoch_ms=20.0, compute=runs.Compute(ms_per_update=10.0, ms_per_view=0.5))
+    assert settings.most_new == 60
+    assert runs.replace(settings, compute=runs.Compute(ms_per_view=100.0)).most_new == 4
+    assert runs.replace(settings, compute=runs.Compute()).most_new is None
+    assert runs.replace(settings, epoch_ms=0.0).most_new is None
