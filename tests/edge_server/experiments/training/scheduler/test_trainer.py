@@ -216,7 +216,8 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
         (["room", "--fit-steps", "0"], "expected at least 1"),
     ],
 )
-def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
+def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     text = capsys.readouterr().err
     assert said in text and text.count("\n") == 1
