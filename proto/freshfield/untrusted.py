@@ -17,8 +17,18 @@ from freshfield.limits import MAX_YAML_CHARS
 LEAST_VALUES = 100_000  # of a YAML file, however short: anchors repeat cameras and lenses honestly
 
 
+MOST_NESTED = 50  # collections within one another; the parser's work grows with their number for every token
+
+
 class UntrustedError(ValueError):
     """A file that must not be read; the message says why."""
+
+
+class _Loader(yaml.SafeLoader):
+    def fetch_more_tokens(self) -> Any:
+        if self.flow_level + len(self.indents) > MOST_NESTED:
+            raise UntrustedError("not YAML: nested too deeply")
+        return super().fetch_more_tokens()
 
 
 def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]]) -> None:
@@ -46,7 +56,7 @@ def read_yaml(text: str) -> Any:
         raise UntrustedError(f"not YAML: {len(text)} characters, more than {MAX_YAML_CHARS}")
     loader = None
     try:
-        loader = yaml.SafeLoader(text)  # refuses some characters at once
+        loader = _Loader(text)  # refuses some characters at once
         node = loader.get_single_node()
         if node is None:
             return None
@@ -54,8 +64,6 @@ def read_yaml(text: str) -> Any:
         return loader.construct_document(node)
     except UntrustedError:
         raise
-    except RecursionError:
-        raise UntrustedError("not YAML: nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # numbers and dates that are none raise a plain ValueError
         raise UntrustedError(f"not YAML: {' '.join(str(error).split())}") from None
     finally:

@@ -55,6 +55,17 @@ def test_what_is_no_yaml_is_one_line(text, why):
     assert "\n" not in str(error.value) and len(str(error.value)) < 500
 
 
+def test_nesting_costs_no_more_than_its_bound():
+    """The parser looks at every open bracket for each token."""
+    text = "[a,\n" * 400 + "a,\n" * 40_000
+
+    def refused() -> None:
+        with pytest.raises(UntrustedError, match="nested too deeply"):
+            read_yaml(text)
+
+    assert work_ms(refused) < 100
+
+
 def test_honest_references_are_followed():
     text = "base: &b {width: 128, height: 96}\none: *b\ntwo: {<<: *b, width: 64}\n"
     assert read_yaml(text)["two"] == {"width": 64, "height": 96} and read_yaml(text)["one"]["width"] == 128

