@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu.estimate.recording import ROW_DISCIPLINES
 from channel_emu.model import ages, spelling
 from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
-from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
 from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
@@ -334,7 +333,7 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--use-states", action="store_true", help="take the states that the trace recorded")
     sub.add_argument("--scope", choices=SCOPES, default="shared", help="one chain for all cameras "
                      "(%(default)s), or one for each")  # fmt: skip
-    sub.add_argument("--discipline", choices=ROW_DISCIPLINES, help="what the link of the rows does with a "
+    sub.add_argument("--discipline", choices=FITTED_DISCIPLINES, help="what the link of the rows does with a "
                      "frame while it is busy (default: drop-new)")  # fmt: skip
     sub.add_argument("--out", type=Path, metavar="FILE.yaml", help="write a scenario with the fitted channel")
     sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: delays over time and the state")

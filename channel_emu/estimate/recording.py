@@ -30,10 +30,6 @@ MAX_DELAY_MS = 1e9
 _MAX_ROWS_MS = 1e12
 
 
-# Rows of an lcfs-preempt link cannot be fitted: only its fast frames are delivered, so delays are biased.
-ROW_DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "parallel")
-
-
 class RecordingError(ValueError):
     """A recording that cannot be read or fitted; the message says why."""
 

@@ -20,6 +20,8 @@ from channel_emu.model.service_time import ServiceTime
 from channel_emu.model.traffic import PoissonArrivals
 
 DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
+FITTED_DISCIPLINES = tuple(d for d in DISCIPLINES if d != "lcfs-preempt")
+"""Those that a recording can be fitted with: lcfs-preempt delivers only fast frames, which biases delays."""
 
 
 class EventKind(StrEnum):

@@ -12,7 +12,6 @@ import io
 import json
 import logging
 import os
-import secrets
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -41,7 +40,7 @@ def write_bytes(path: Path, data: bytes) -> None:
     file cannot be written: the old one then stays, and nothing is left beside it.
     """
     # The process id is not enough: threads share it, and containers that share a folder often do.
-    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
+    part = path.with_name(f".{path.name}.{os.urandom(6).hex()}.part")
     try:
         part.write_bytes(data)
         os.replace(part, path)

@@ -20,6 +20,7 @@ from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
 from channel_emu.estimate.hmm import Timeline, TwoStateModel
 from channel_emu.model.chain import transition_matrix, two_state_generator
 from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.link import FITTED_DISCIPLINES
 from freshfield import scenario
 from tests.channel_emu.estimate.recordings import write_rows, write_trace
 from tests.channel_emu.live.emulator import emulate
@@ -381,7 +382,7 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
             for i, (o, d, gone) in enumerate(zip(np.cumsum(gaps), delays, lost))]  # fmt: skip
     path = tmp_path / "rows.csv"
     path.write_text("".join(rows))
-    discipline = recordings.ROW_DISCIPLINES[seed % 4]
+    discipline = FITTED_DISCIPLINES[seed % 4]
     with np.errstate(divide="raise", invalid="raise", over="raise"):
         for states in ("auto", "2"):
             try:
