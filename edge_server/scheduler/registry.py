@@ -25,6 +25,7 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
     "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
+    "whittle": (fixed.Whittle, "the k views that take most from the squared ages of what is known; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-flush": (WaitFlush, "as wait, what is on its way at the decision broken off (6.5)"),

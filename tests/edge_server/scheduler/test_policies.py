@@ -64,6 +64,21 @@ def test_age_driven_minimises_the_mean_age():
     assert choose("age-driven", epoch(9, a=5, b=3, c=5)) == ("a", "c")
 
 
+def test_whittle_serves_whom_the_field_knows_least_of_and_counts_what_it_used():
+    policy = make_policy("whittle", 1, np.random.default_rng(0))
+
+    def ask(at: Epoch) -> tuple[str, ...]:
+        return policy.select(at, policy.plan(at))
+
+    assert ask(epoch(10, a=8, b=9)) == ("a",) and ask(epoch(10, a=8, b=9)) == (
+        "b",
+    )  # once each, unseen first
+    assert ask(epoch(20, a=8, b=9)) == ("a",)  # nothing new: no gain anywhere, ties go by order
+    assert ask(epoch(20, a=8, b=19)) == ("b",)
+    # Known 12 and 1 old, to become 10 and 0.
+    assert ask(epoch(20, a=10, b=20)) == ("a",)
+
+
 def test_round_robin_gives_everybody_a_turn():
     policy = make_policy("round-robin", 3, np.random.default_rng(0))
     turns = [policy.select(AT, policy.plan(AT)) for _ in range(4)]
