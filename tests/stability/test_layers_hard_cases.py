@@ -263,9 +263,9 @@ def test_the_event_is_seen() -> None:
 
 
 def test_a_slow_processor_makes_it_older_but_not_worse_than_standing_still() -> None:
-    """Updates of 67, 133 and 200 ms, from the first frame on."""
+    """Updates of 67, 133, 200 and 267 ms, from the first frame on."""
     known_db = [_begun(_walk, True).median_db(-SCORED_S, 0.0)[0]]
-    for update in (1, 2, 3):
+    for update in (1, 2, 3, 4):
         stage = Stage(Case(update=update))
         stage.run(-SCORED_S, score=False)
         stage.run(1.0)

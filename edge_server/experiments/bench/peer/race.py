@@ -99,13 +99,14 @@ def _race(enter: _Enter, still: MultiviewStill, seed: int, limit_s: float, ours:
                     at_s = float(np.interp(target, [best, now_db], [evaluated_s, spent]))
                     reached.setdefault(target, at_s)
             best, evaluated_s = max(best, now_db), spent
+        steps = contestant.steps()
     finally:
         contestant.close()
     return {
         "seconds_to": {f"{target}": reached.get(target) for target in TARGETS_DB},
         "best_db": best,
         "within_s": spent,
-        "steps": contestant.steps(),
+        "steps": steps,
         "outside_cores": load.outside_cores(),
     }
 

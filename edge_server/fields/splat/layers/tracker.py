@@ -7,6 +7,7 @@ for the next fit.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,14 +19,16 @@ from edge_server.fields.splat.layers.observations import (
     FixedCamera,
     Observation,
     Observations,
+    knot_of,
     pixel_weights,
 )
 
 PASSES, AGAIN_M = 3, 0.02  # of Gauss-Newton a fit, at most; movement of an anchor that calls for another one
 ALIGNING_SHARE = 0.5  # of a budget in seconds
+STRIDE_S = 0.08  # of motion that is followed at once: more leads too far from where alignment begins
 LEAST_ALIGNED = 4  # frames a pass, however short the budget is
 MOST_ALIGNED = 24  # frames a pass, newest first
-STEPS = 10  # of appearance a fit, at most
+STEPS = 10  # of appearance a stride, at most
 SEED_EVERY_S = 0.2
 SEED_AT_LEAST_EVERY_S = 0.6  # where budgets have no room for it
 ANCHORS_EVERY_S = 1.0
@@ -74,14 +77,18 @@ class MotionTracker:
         moving, newest_s = self.moving, self.observations.newest_s
         self.fits += 1
         moving.follow_foreground(float(np.mean([o.share for o in self.observations])))
-        if moving.motion.anchors is not None:
-            moving.motion.slide(newest_s + 1.0 / KNOTS_PER_S)
-        if moving.alive:
-            if newest_s - self.anchors_s >= ANCHORS_EVERY_S:
-                self._renew_anchors(newest_s)
+        strides = self._strides()
+        for until_s in strides:
+            if moving.motion.anchors is not None:
+                moving.motion.slide(until_s + 1.0 / KNOTS_PER_S)
+            if not moving.alive:
+                continue
+            if until_s - self.anchors_s >= ANCHORS_EVERY_S:
+                self._renew_anchors(until_s)
             for _ in range(PASSES):
-                if self._solve(pace) < AGAIN_M or not pace.within(ALIGNING_SHARE):
+                if self._solve(until_s, pace) < AGAIN_M or not pace.within(ALIGNING_SHARE):
                     break
+        if moving.alive:
             for o in self.observations:
                 o.fresh = False
             publish()
@@ -91,25 +98,36 @@ class MotionTracker:
             self.seeded_s = newest_s
             self._seed()
             self._seed_time.add(self.times.add("seeding", begun) - begun)
-        return self._train_appearance(pace, parameters)
+        return self._train_appearance(pace, parameters, STEPS * len(strides))
 
-    def _solve(self, pace: StepBudget) -> float:
-        """One pass of Gauss-Newton: align frames that are new, or of the newest knot, then solve. Returns by
-        how many meters it has moved the newest places of anchors (median)."""
+    def _strides(self) -> list[float]:
+        """Instants up to which motion is followed, one after the other: the last is the newest frame's, and
+        those before it divide what is new since the last fit, where it is longer than ``STRIDE_S``."""
+        newest_s = self.observations.newest_s
+        fresh_s = np.array([o.instant_s for o in self.observations if o.fresh])
+        since_s = max((o.instant_s for o in self.observations if not o.fresh), default=newest_s)
+        count = max(1, int(np.ceil((newest_s - since_s) / STRIDE_S)))
+        ends = np.linspace(since_s, newest_s, count + 1)
+        held = [np.any((fresh_s > begin) & (fresh_s <= end)) for begin, end in pairwise(ends)]
+        return [float(end) for end, some in zip(ends[1:-1], held) if some] + [newest_s]
+
+    def _solve(self, until_s: float, pace: StepBudget) -> float:
+        """One pass of Gauss-Newton over the frames up to an instant: align those that are new, or of the
+        newest knot, then solve. Returns by how many meters it has moved the anchors then (median)."""
         motion, begun = self.moving.motion, self.times.now()
-        newest = self.observations.newest_knot
-        seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= motion.newest_s]
-        due = [o for o in seen if o.row is None or o.fresh or o.knot >= newest]
+        until = min(motion.newest_s, until_s)
+        seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= until]
+        due = [o for o in seen if o.row is None or o.fresh or o.knot >= knot_of(until_s)]
         for k, o in enumerate(reversed(due)):
             if k >= MOST_ALIGNED or not (k < LEAST_ALIGNED or pace.within(ALIGNING_SHARE)):
                 self.left_out += len(due) - k
                 break
             self._align(o, exclude=True)
         begun = self.times.add("alignment", begun)
-        before = motion.at(self.observations.newest_s)
+        before = motion.at(until_s)
         motion.solve([o.row for o in seen if o.row is not None])
         self.times.add("solving", begun)
-        apart = np.linalg.norm(motion.at(self.observations.newest_s) - before, axis=1)
+        apart = np.linalg.norm(motion.at(until_s) - before, axis=1)
         return float(np.median(apart)) * motion.radius_m
 
     def _align(self, observation: Observation, exclude: bool) -> None:
@@ -128,13 +146,16 @@ class MotionTracker:
                 observation.foreground, camera.depth_m, distance_m, observation.view.weight
             )
 
-    def _train_appearance(self, pace: StepBudget, parameters: AdamParameters) -> tuple[int, int, int]:
-        """Steps on the frames of the last two knots, one frame a step, each as often as the others."""
+    def _train_appearance(
+        self, pace: StepBudget, parameters: AdamParameters, most: int
+    ) -> tuple[int, int, int]:
+        """At most so many steps on the frames of the last two knots, one frame a step, each as often as the
+        others."""
         moving, newest = self.moving, self.observations.newest_knot
         frames = self.observations.of_knots(newest - 1, newest)
         order = np.random.default_rng([moving.seed, self.fits, 7]).permutation(len(frames))
         begun, rays, samples, steps = self.times.now(), 0, 0, 0
-        while steps < STEPS and moving.alive and pace.has_room(self._step_time.seconds, 1.0, 0.0):
+        while steps < most and moving.alive and pace.has_room(self._step_time.seconds, 1.0, 0.0):
             step_begun = self.times.now()
             frame = frames[order[steps % len(frames)]]
             self._weigh(frame, self.cameras[frame.camera])
