@@ -268,6 +268,29 @@ def _rows(part: str, begins: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
 
 
+def peers() -> str:
+    """Seconds to two qualities beside other programs, medians; and how many times the fastest of ours."""
+    rows = []
+    for scene in ("lego", "kitchen"):
+        found = {n: r for n, r in measured("docs/results/peers.json")["peer"][scene].items() if n != "about"}
+
+        def reached(name: str, target: str, found: dict[str, Any] = found) -> float:
+            seconds = [run["seconds_to"][target] or math.inf for run in found[name].values()]
+            return median(seconds)
+
+        for name, runs in found.items():
+            cells = []
+            for target in ("20", "25"):
+                ours, this = min(reached(n, target) for n in ("splat", "ngp")), reached(name, target)
+                seconds = "not reached" if this == math.inf else f"{this:.{2 if this < 1 else 0}f}"
+                cells.append(
+                    seconds + (f" ({this / ours:.0f} times)" if math.inf > this > 2.0 * ours else "")
+                )
+            best, spent = (max(r[what] for r in runs.values()) for what in ("best_db", "within_s"))
+            rows.append([scene, name, len(runs), *cells, f"{best:.1f} in {spent:.0f} s"])
+    return table(["scene", "contestant", "runs", "s to 20 dB", "s to 25 dB", "best, dB"], rows)
+
+
 def soak(name: str) -> str:
     """Recoveries by fault, memory and account of a run of ``freshfield_up.soak``."""
     run = measured(f"docs/results/{name}.json")
@@ -300,6 +323,7 @@ def soak(name: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "soak": lambda: soak("soak"),
     "kills": lambda: soak("kills"),
+    "peers": peers,
     "representations": representations,
     "tile": lambda: from_scratch("tile", (0.25, 0.5, 0.8, 1, 2.5, 15)),
     "room": lambda: from_scratch("room", (0.25, 0.5, 1, 2.5, 4, 15)),
