@@ -282,7 +282,7 @@ def peers() -> str:
             cells = []
             for target in ("20", "25"):
                 ours, this = min(reached(n, target) for n in ("splat", "ngp")), reached(name, target)
-                seconds = "not reached" if this == math.inf else f"{this:.{2 if this < 1 else 0}f}"
+                cell = "not reached" if this == math.inf else f"{this:.{2 if this < 1 else 0}f}"
                 cells.append(
                     seconds + (f" ({this / ours:.0f} times)" if math.inf > this > 2.0 * ours else "")
                 )
