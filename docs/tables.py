@@ -283,9 +283,7 @@ def peers() -> str:
             for target in ("20", "25"):
                 ours, this = min(reached(n, target) for n in ("splat", "ngp")), reached(name, target)
                 cell = "not reached" if this == math.inf else f"{this:.{2 if this < 1 else 0}f}"
-                cells.append(
-                    seconds + (f" ({this / ours:.0f} times)" if math.inf > this > 2.0 * ours else "")
-                )
+                cells.append(cell + (f" ({this / ours:.0f} times)" if math.inf > this > 2.0 * ours else ""))
             best, spent = (max(r[what] for r in runs.values()) for what in ("best_db", "within_s"))
             rows.append([scene, name, len(runs), *cells, f"{best:.1f} in {spent:.0f} s"])
     return table(["scene", "contestant", "runs", "s to 20 dB", "s to 25 dB", "best, dB"], rows)
