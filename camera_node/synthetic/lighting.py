@@ -91,6 +91,18 @@ class ShadowModel(Protocol):
         ...
 
 
+class Switch(Protocol):
+    """Lamps that go on and out."""
+
+    def on(self, t_s: float) -> bool:
+        """Whether all lamps are on at an instant."""
+        ...
+
+    def without(self, light: Light) -> Light:
+        """What is left of a light when they are out."""
+        ...
+
+
 def shade_diffuse(
     light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None
 ) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from camera_node.synthetic.lighting import (
     ShadowModel,
     SpecularReflection,
     SurfacePoints,
+    Switch,
     contact_shadow,
     shade_diffuse,
     specular_light,
@@ -52,6 +53,7 @@ class World:
     specular: SpecularReflection | None = None
     shadows: ShadowModel | None = None
     medium: Medium | None = None
+    switch: Switch | None = None
 
 
 def cast_rays(
@@ -126,6 +128,12 @@ def light_visibility(world: World, points: Array) -> Array:
     return out
 
 
+def _switched_off(world: World) -> World:
+    """The world while lamps are out, for good."""
+    light = world.light if world.switch is None else world.switch.without(world.light)
+    return replace(world, light=light, switch=None)
+
+
 class CameraRenderer:
     """Renders one camera of a world; holds what does not change between frames.
 
@@ -142,17 +150,24 @@ class CameraRenderer:
         self._directions = np.ascontiguousarray(directions.reshape(-1, 3).T)
         self._render_static()
         self._static_image = self._to_image(self._through_medium(self._static_colors, self._transmittance))
+        self._dim: CameraRenderer | None = None  # while lamps are out
+        if world.switch is not None:
+            self._dim = CameraRenderer(_switched_off(world), camera, camera_to_world, supersample)
 
     def for_world(self, world: World) -> CameraRenderer:
         """A renderer of ``world``, which may differ from this one's only in how its bodies move. Static parts
         are not rendered again."""
         other = copy.copy(self)
         other.world = world
+        if self._dim is not None:
+            other._dim = self._dim.for_world(_switched_off(world))
         return other
 
     def image(self, t_s: float, rows: Rows | None = None) -> Image:
         """The image at an instant, or only some of its rows: uint8 RGB (height or rows, width, 3). Equal
         instants give equal bytes."""
+        if self._dim is not None and self.world.switch is not None and not self.world.switch.on(t_s):
+            return self._dim.image(t_s, rows)
         first, stop = (0, self.height) if rows is None else rows
         if not self.world.moving_bodies:
             return self._static_image[first:stop].copy()

@@ -91,6 +91,7 @@ ROWS: tuple[Row, ...] = (
     _case("teleports", source={"params": {"course": "jumps"}}),
     _case("two people", source={"params": {"people": 2}}),
     _case("exposure drifts", source={"effects": {"exposure_drift": None}}),
+    _case("a lamp goes out", source={"effects": {"light_switch": {"in_truth": True, "period_s": 4.8}}}),
     _case("noise", source={"effects": {"sensor_noise": {"read_noise_counts": 5.0}}}),
     _case("JPEG at 50", source={"quality": 50}),
     _case("6 cameras", cameras={"count": 7}),

@@ -1,0 +1,60 @@
+"""Light switch: the lamps on one side of the scene go out, and on again, for all cameras at once.
+
+List it ``in_truth: true``: the field then has to show the scene as it is lit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera_node.bounds import bounded
+from camera_node.synthetic.effects import EffectParameters
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.motion import PERIOD_UNIT_S, phase_of
+from camera_node.synthetic.scene import Scene
+
+
+@dataclass(frozen=True)
+class LightSwitchParameters(EffectParameters):
+    """period_s: from one time the lamps go on to the next, rounded to a multiple of the scene's period; they
+    go out halfway. share: of the light's points, those farthest to one side; one always stays on.
+    azimuth_deg: of that side, from the x axis."""
+
+    period_s: float = bounded(6.0, 0.6, 600.0)
+    share: float = bounded(0.5, 0.0, 1.0)
+    azimuth_deg: float = bounded(0.0, -360.0, 360.0)
+
+
+class LightSwitch:
+    """Rendered ahead, static parts twice; free while streaming."""
+
+    kind = "world"
+    Parameters = LightSwitchParameters
+
+    def __init__(self, parameters: LightSwitchParameters, rng: np.random.Generator) -> None:
+        self._p = parameters
+        self._period_s = parameters.period_s
+
+    def extend(self, scene: Scene) -> Scene:
+        base = scene.period_s if scene.moving else PERIOD_UNIT_S
+        self._period_s = max(1, round(self._p.period_s / base)) * base
+        world = dataclasses.replace(scene.world, switch=self)
+        return scene.with_world(world, self._period_s, moving=True)
+
+    def on(self, t_s: float) -> bool:
+        """Whether all lamps are on at an instant."""
+        return phase_of(t_s, self._period_s) < 0.5
+
+    def without(self, light: Light) -> Light:
+        """What is left of a light when the lamps are out."""
+        azimuth = math.radians(self._p.azimuth_deg)
+        aside = light.points[:, :2] @ (math.cos(azimuth), math.sin(azimuth))
+        count = len(light.points)
+        left = np.sort(np.argsort(aside, kind="stable")[: max(1, count - round(self._p.share * count))])
+        return dataclasses.replace(
+            light, points=light.points[left], strength=light.strength * len(left) / count
+        )
