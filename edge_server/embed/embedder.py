@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import logging
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import OUTPUT, Backbone
 from edge_server.embed.letterbox import GREY, blob, checked
+from freshfield.limits import MAX_MODEL_BYTES
 
 log = logging.getLogger(__name__)
 
@@ -82,8 +84,7 @@ class Embedder:
         try:
             found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
         except Exception as error:  # ONNX Runtime's exceptions share no base class
-            reason = " ".join(str(error).split())[:200]
-            raise EmbeddingError(f"{self.backbone.name}: ONNX Runtime cannot run it: {reason}") from None
+            raise EmbeddingError(f"{self.backbone.name}: {reason_of(error)}") from None
         if found.shape != (len(part), self.backbone.channels):
             raise EmbeddingError(
                 f"{self.backbone.name}: {len(part)} images gave features of shape {found.shape}, expected "
@@ -107,14 +108,21 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
     options.log_severity_level = 4  # errors are raised, not printed too
     # Spinning threads would take the field's cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    names = [_NAMES[chosen]] if chosen == "cpu" else [_NAMES[chosen], _NAMES["cpu"]]
+    _bound_memory()
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    cuda = [] if chosen == "cpu" else [(_NAMES[chosen], {"gpu_mem_limit": str(MAX_MODEL_BYTES)})]
     try:
         # It prints what it then raises.
         with contextlib.redirect_stdout(io.StringIO()):
-            session = ort.InferenceSession(model, options, providers=names)
+            session = ort.InferenceSession(
+                model,
+                options,
+                providers=[*cuda, _NAMES["cpu"]],
+                # It computes constants while loading, with memory that nothing bounds.
+                disabled_optimizers=["ConstantFolding"],
+            )
     except Exception as error:  # as above
-        reason = " ".join(str(error).split())[:200]
-        raise EmbeddingError(f"{name}: ONNX Runtime cannot load it: {reason}") from None
+        raise EmbeddingError(f"{name}: {reason_of(error, 'load')}") from None
     # If CUDA's libraries do not load, ONNX Runtime falls back to the CPU silently.
     if chosen == "cuda" and _NAMES["cuda"] not in session.get_providers():
         if provider == "cuda":
@@ -122,6 +130,22 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
         log.warning("CUDA does not load: embeddings are computed on the CPU")
         chosen = "cpu"
     return session, chosen
+
+
+@functools.cache
+def _bound_memory() -> None:
+    """Give this process's sessions one CPU arena of MAX_MODEL_BYTES together: what exceeds it fails at once.
+    Sizes that depend on data (Expand, Tile, Range) cannot be checked before."""
+    cpu = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
+    ort.create_and_register_allocator(cpu, ort.OrtArenaCfg({"max_mem": MAX_MODEL_BYTES}))
+
+
+def reason_of(error: Exception, doing: str = "run") -> str:
+    """One line on why ONNX Runtime cannot run or load a model. doing: that verb."""
+    text = " ".join(str(error).split())
+    if "bfc_arena" in text or "bad allocation" in text or "bad_alloc" in text:
+        text = f"ONNX models may take {MAX_MODEL_BYTES >> 20} MB of memory together, and it asks for more"
+    return f"ONNX Runtime cannot {doing} it: {text[:200]}"
 
 
 def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, model_path
 from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, parse_model
-from edge_server.embed.embedder import open_session
+from edge_server.embed.embedder import open_session, reason_of
 from edge_server.embed.letterbox import blob, checked
 from edge_server.foreground import ForegroundError
 
@@ -60,8 +60,7 @@ class Detector:
             given = blob([whole], self.height, self.width, self._dtype)
             out = self._session.run(None, {self._input: given})[0]
         except Exception as error:  # ONNX Runtime's exceptions share no base class
-            reason = " ".join(str(error).split())[:160]
-            raise ForegroundError(f"{self.name}: ONNX Runtime cannot run it: {reason}") from None
+            raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
         rows = decode(np.asarray(out), confidence, self.name)
         h, w = whole.shape[:2]
         # From the letterboxed input back to the image.

@@ -120,8 +120,9 @@ class SegmentModel:
         try:
             found = np.asarray(self._session.run(None, {self._input: given})[0], dtype=np.float32)
         except Exception as error:  # ONNX Runtime's exceptions share no base class
-            reason = " ".join(str(error).split())[:160]
-            raise ForegroundError(f"{self._name}: ONNX Runtime cannot run it: {reason}") from None
+            from edge_server.embed.embedder import reason_of
+
+            raise ForegroundError(f"{self._name}: {reason_of(error)}") from None
         if found.size != found.shape[-1] * found.shape[-2] or found.ndim < 2:
             raise ForegroundError(
                 f"{self._name}: gives {found.shape}, not one map (1, 1, height, width) of the foreground"

@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -97,10 +98,18 @@ class EdgeServer:
 
         self.frontier = open_frontier(scenario, config)
         self._field_options = options_for(self.frontier, config)
-        field = self._make_field()
+        self._options_of = WeakKeyDictionary[Field, dict[str, Any]]()
         resumed_updates = 0
-        if options.resume is not None:
+        if options.resume is None:
+            field = self._make_field()
+        else:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
+            # An operator may have changed it since the scenario was read.
+            saved = about.get("options")
+            effort = str(saved.get("effort", "medium")) if isinstance(saved, dict) else None
+            if effort in efforts_of(config.field):
+                self._field_options = {**self._field_options, "effort": effort}
+            field = self._make_field()
             field.load_state(state)
             # Numbers continue, so that a snapshot does not take the name of an earlier one.
             resumed_updates = max(0, int(about.get("updates", 0)))
@@ -308,7 +317,9 @@ class EdgeServer:
 
     def _make_field(self) -> Field:
         options = {"nice": SERVER_NICE, **self._field_options}
-        return make_field(self.config.field, options, seed=self.scenario.seed)
+        field = make_field(self.config.field, options, seed=self.scenario.seed)
+        self._options_of[field] = self._field_options
+        return field
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:
@@ -328,7 +339,8 @@ class EdgeServer:
     def _write_checkpoint(self, path: Path) -> None:
         about = {
             "field": self.config.field,
-            "options": self._field_options,
+            # Those of the field in use: another one may be about to replace it.
+            "options": self._options_of[self.updater.field],
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,

@@ -53,6 +53,10 @@ MAX_CHUNK_BYTES = 16 * 2**20
 MAX_UNPACKED_PER_BYTE = 20
 """Of all compressed chunks of a recording together: most of it is images, which do not compress."""
 
+MAX_MODEL_BYTES = 4 * 2**30
+"""Of memory for all ONNX models of a process together: four times what the largest YOLO11 takes for a batch.
+An allocation beyond it fails, whatever sizes the file states."""
+
 # --- streams and cameras ----------------------------------------------------------------------
 
 MAX_CAMERAS = 1000

@@ -5,6 +5,7 @@ Damage to parameters, and limits of a single representation, are in files of the
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -64,11 +65,24 @@ def test_a_scene_ten_kilometres_away_is_learned_as_here(name: str) -> None:
 
 @every_field
 def test_two_hundred_cameras(name: str) -> None:
+    """And three updates of 200 new pictures: within their time, in memory that does not grow."""
     views = ring(200, size=16)
     field = tiny(name)
     field.fit(views, Budget(steps=40))
     healthy(field, views)
     assert mean_psnr(field, views[::20]) > 15.0
+    held_mb, seconds = [], []
+    tracemalloc.start()
+    for k in range(1, 4):
+        newer = [replace(v, image=np.roll(v.image, k, axis=1), generated_ns=k * 10**8) for v in views]
+        seconds.append(field.fit(newer, Budget(seconds=0.2)).seconds)
+        field.snapshot()
+        held_mb.append(tracemalloc.get_traced_memory()[0] / 1e6)
+    most_mb = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    healthy(field, newer)
+    assert max(seconds) < 2.0
+    assert held_mb[2] - held_mb[1] < 0.5 and most_mb < 10.0, (held_mb, most_mb)
 
 
 @every_field

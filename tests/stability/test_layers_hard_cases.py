@@ -8,7 +8,8 @@ Six cameras see balls that go about on a table. Ten minutes of ``room``:
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -293,3 +294,43 @@ def test_half_a_minute_later_it_is_as_good() -> None:
     stage.run(30.0)
     assert stage.median_db(30.0 - AFTER_S, 31.0)[0] > stage.median_db(-SCORED_S, 0.0)[0] - BACK_DB
     assert len(stage.field.moving) < 3 * before
+
+
+def _views(stage_s: float, cameras: Sequence[View], away: NDArray[np.float64]) -> list[View]:
+    """What ``cameras`` see of the walking ball, in a world that is shifted by ``away`` (4, 4)."""
+    views = []
+    for view in cameras:
+        ball = np.array(_walk(stage_s)[0] if stage_s > 1.0 else AWAY)
+        image = seen(view.intrinsics, view.camera_to_world, ball, RADIUS_M)[0]
+        pose, at_ns = away @ view.camera_to_world, round(stage_s * 1e9)
+        views.append(replace(view, image=image, camera_to_world=pose, generated_ns=at_ns))
+    return views
+
+
+def test_ten_kilometres_away_it_is_shown_as_here() -> None:
+    away = np.eye(4)
+    away[:3, 3] = 1e4, -1e4, 1e4
+    shown_db = []
+    for shift in (np.eye(4), away):
+        field, scores = LayeredField(SETTINGS), []
+        for frame in range(1, 46):
+            field.fit(_views(frame * FRAME_S, CAMERAS, shift), Budget(steps=STEPS))
+            if frame > 30:
+                (truth,) = _views(frame * FRAME_S, [HELD], shift)
+                color = field.snapshot().render(truth.camera_to_world, HELD.intrinsics).color
+                scores.append(psnr(color, truth.image / 255.0))
+        shown_db.append(np.median(scores))
+    assert shown_db[0] > 18.0 and abs(shown_db[1] - shown_db[0]) < 0.5, shown_db
+
+
+def test_two_hundred_cameras_take_bounded_memory_and_time() -> None:
+    field, cameras, seconds = LayeredField(SETTINGS), ring(200, 16), []
+    tracemalloc.start()
+    for frame in range(1, 25):
+        views = _views(frame * FRAME_S, cameras, np.eye(4))
+        seconds.append(field.fit(views, Budget(seconds=0.1)).seconds)
+        shown = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics)
+        assert np.isfinite(shown.color).all()
+    most_mb = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    assert np.median(seconds) < 3.0 and most_mb < 150.0, (seconds, most_mb)

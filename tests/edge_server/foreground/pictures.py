@@ -81,6 +81,28 @@ def save_orange_segmenter(path: Path, logits: bool = False) -> Path:
     return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), {"weight": weight}, opset=13)
 
 
+def save_memory_bomb(path: Path, kind: str) -> Path:
+    """A segmentation ONNX with one tensor of 400 TB. kind: Expand, Tile, ConstantOfShape, Range or Conv."""
+    from onnx import helper
+
+    from tests.edge_server.embed.graphs import save
+
+    constants = {
+        "shape": np.array([2**33, 3, 64, 64]), "times": np.array([2**33, 1, 1, 1]), "none": np.array(0),
+        "one": np.array(1), "end": np.array(2**46), "weight": np.ones((1, 3, 1, 1), np.float32),
+    }  # fmt: skip
+    read = {"Expand": ["images", "shape"], "Tile": ["images", "times"], "ConstantOfShape": ["shape"],
+            "Range": ["none", "end", "one"], "Conv": ["images", "weight"]}[kind]  # fmt: skip
+    nodes = [
+        helper.make_node(kind, read, ["large"], **({"pads": [5_000_000] * 4} if kind == "Conv" else {})),
+        helper.make_node("Cast", ["large"], ["floats"], to=1),
+        helper.make_node("ReduceMax", ["floats"], ["most"], keepdims=0),
+        helper.make_node("Mul", ["images", "most"], ["lit"]),
+        helper.make_node("Conv", ["lit", "weight"], ["map"]),
+    ]
+    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), constants, opset=13)
+
+
 def save_endless_loop(path: Path) -> Path:
     """A segmentation ONNX that goes round 2^62 times before it answers."""
     from onnx import TensorProto, helper

@@ -17,6 +17,7 @@ from tests.edge_server.foreground.pictures import (
     disc,
     iou,
     save_endless_loop,
+    save_memory_bomb,
     save_orange_detector,
     save_orange_segmenter,
 )
@@ -200,6 +201,21 @@ def test_a_model_that_loops_for_ever_is_refused(tmp_path):
                 make_foreground(config)
 
         assert work_ms(refuse) < MOST_MS
+
+
+@pytest.mark.parametrize("kind", ["Expand", "Tile", "ConstantOfShape", "Range", "Conv"])
+def test_a_model_that_takes_terabytes_is_refused(tmp_path, kind):
+    """Neither while it is loaded, where constants would be computed, nor in its first run. ONNX Runtime holds
+    Tile to 4 GB in words of its own."""
+    needs_onnx()
+    model = save_memory_bomb(tmp_path / "bomb.onnx", kind)
+    config = ForegroundConfig(box=(0, 0, 1, 1), segment=str(model))
+
+    def refuse():
+        with pytest.raises(ForegroundError, match=r"bomb\.onnx: ONNX Runtime .* (may take|more than) 4"):
+            make_foreground(config)
+
+    assert work_ms(refuse) < MOST_MS
 
 
 def test_wrong_models_are_refused_in_one_line(tmp_path):

@@ -14,6 +14,7 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
+from edge_server.fields.registry import field_names
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.policies import ServerPolicies
 from edge_server.live.server import EdgeServer, ServerOptions
@@ -30,12 +31,12 @@ from tests.ports import free_port
 from tests.work import MOST_MS, work_ms
 
 
-def tiny_scenario(tmp_path, held_out=("cam00",)):
+def tiny_scenario(tmp_path, held_out=("cam00",), **edge):
     data = {
         "name": "tiny",
         "seed": 3,
         "cameras": {"count": 3, "held_out": list(held_out)},
-        "edge": {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"},
+        "edge": {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none", **edge},
     }
     return scenario.parse(data, tmp_path / "tiny.yaml")
 
@@ -194,6 +195,32 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path):
     decisions.cancel()
     feed.stop()
     channel.close()
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_a_run_goes_on_with_the_effort_that_an_operator_chose(serve, tmp_path, name):
+    """Two checkpoints: one of the new field, and the last one, of the field that was in use when another
+    effort was chosen and the server ended."""
+    made = tiny_scenario(tmp_path, field=name, field_options={})
+    server, port, thread = serve(made)
+    feed = Feed(port, made.cameras, made.held_out)
+    feed.start()
+    until(lambda: server.state.started)
+    first = server.updater.field
+    server.state.set_effort("low")
+    until(lambda: server.updater.field is not first and server.updater.field.step > 0)
+    saved = server.state.save_snapshot()
+    server.state.controls.paused = True
+    until(lambda: server.state.status_line == "paused")
+    feed.stop()
+    server.loop.stop()
+    server.state.set_effort("high")
+    server.stop()
+    thread.join(20)
+    for path in (saved, tmp_path / "out" / "field.npz"):
+        again = EdgeServer(made, read_config(made), ServerOptions("127.0.0.1:0", tmp_path / "2", resume=path))
+        assert again.state.controls.effort == "low" and again.updater.field.step > 0
+        again.ledger.close(0)
 
 
 def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
