@@ -21,6 +21,7 @@ from edge_server.experiments.studies.study import StudyRequest, run_study
 from edge_server.experiments.studies.trial import SCENARIOS
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
+from edge_server.fields.registry import field_names
 from freshfield.files import write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
@@ -101,7 +102,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     folders = folders_of(args)
     scenes = tuple(args.scene.split(",")) if args.scene else None
     request = StudyRequest(
-        args.quick, args.out, folders, args.seeds, scenes, args.jobs, tuple(args.case), args.episodes
+        args.quick,
+        args.out,
+        folders,
+        args.seeds,
+        scenes,
+        args.jobs,
+        tuple(args.case),
+        args.episodes,
+        args.field,
     )
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
 
@@ -151,6 +160,8 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
     if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
         raise StudyError("--scene and --ray: captures are made here, and those of preferences of tile")
+    if set(names) <= {*LEARNING, *CAPTURING} and request.field != "splat":
+        raise StudyError("--field: studies that learn or capture have representations of their own")
     if request.cases and not set(names) <= set(CASED):
         raise StudyError(f"--case is for {', '.join(CASED)}")
     if request.episodes is not None and not set(names) <= set(LEARNING):
@@ -182,6 +193,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--episodes", type=int, metavar="N", help="of one training, where there is one [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
     add("--scene", metavar="NAME,...", help=f"{', '.join(SCENARIOS)} [the study's own]")
+    add("--field", choices=field_names(), default="splat",
+        help="representation, where the study names none [%(default)s]")  # fmt: skip
     add_folders(parser)
     add("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="[%(default)s]")
     return parser

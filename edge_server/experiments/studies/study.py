@@ -41,6 +41,7 @@ class StudyRequest:
     quick: a small pass.
     out: folder of tables and figures.
     seeds: number of repetitions of a point.
+    field: representation of the trials that do not name one themselves.
     jobs, cases, episodes: of studies that train: processes, words in the names of the selected cases, and
         episodes of a training.
     """
@@ -53,6 +54,7 @@ class StudyRequest:
     jobs: int = 1
     cases: tuple[str, ...] = ()
     episodes: int | None = None
+    field: str = "splat"
 
     def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
         """The selected cases: by default all, or ``quick`` in a quick pass. StudyError for an unknown one."""
@@ -193,7 +195,7 @@ def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
     if scene in RECORDED:
         scale = 2.0 if request.quick else 1.0
         sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
-    return Trial(scene=scene, **{**sized, **more})
+    return Trial(scene=scene, **{"field": request.field, **sized, **more})
 
 
 def sweep(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -15,6 +16,7 @@ from edge_server.experiments.studies.age import omega, trade_map
 from edge_server.experiments.studies.command import CAPTURING, LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, run_study
+from edge_server.experiments.studies.trial import run_trial
 from edge_server.scheduler import make_policy
 
 NAMES = [n for n in STUDIES if n not in ("metrics", *CAPTURING, *LEARNING)]
@@ -255,3 +257,10 @@ def test_metrics_runs_whole(tmp_path: Path, capsys):
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert found["verdicts"] and all(v["verdict"] for v in found["verdicts"])
     assert (tmp_path / "metrics.png").exists() and "SSIM" in (tmp_path / "metrics.md").read_text()
+
+
+@pytest.mark.parametrize("field", ("ngp", "nerfacto"))
+def test_a_trial_runs_with_the_field_asked_for(tmp_path, field):
+    point = make_study("mat").points(request(tmp_path, seeds=1, scenes=("room",), field=field))[0]
+    trial = dataclasses.replace(point.trial, size=32, steps=8, cameras=5, lpips=False)
+    assert trial.field == field and run_trial(trial, Folders())["psnr_db"] > 4.0
