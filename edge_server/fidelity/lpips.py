@@ -9,30 +9,35 @@ report the published network, and so does this. Distances are comparable only wi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor
 
 from edge_server.fidelity.images import ImageError, same_size, to_unit
 
-# ImageNet's statistics, restated by the authors for inputs in [-1, 1].
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
-EPSILON = 1e-10
+if TYPE_CHECKING:
+    from edge_server.fidelity.lpips_network import Network
+
 # Smaller images leave a pooling layer of the network without input.
 MINIMUM_SIDE = {"alex": 31, "squeeze": 17}
-
-Parameters = dict[str, Tensor]
-Slices = Callable[[Parameters, Tensor], list[Tensor]]
+# Channels after each slice.
+SLICES = {"alex": (64, 192, 384, 256, 256), "squeeze": (64, 128, 256, 384, 384, 512, 512)}
+# Convolutions: channels out and in, and side of the kernel. Of SqueezeNet 1.1 each fire:
+# squeezed, in, expanded.
+_ALEX = {
+    "0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3),
+}  # fmt: skip
+_FIRES = {
+    "3": (16, 64, 64), "4": (16, 128, 64), "6": (32, 128, 128), "7": (32, 256, 128), "9": (48, 256, 192),
+    "10": (48, 384, 192), "11": (64, 384, 256), "12": (64, 512, 256),
+}  # fmt: skip
 
 
 class Lpips:
-    """LPIPS of one network on the CPU. Stateless once built, so that threads may share it."""
+    """LPIPS of one network on the CPU, which threads may share. torch is imported at the first distance."""
 
     def __init__(self, network: str, features: Path, lin: Path) -> None:
         """network: "alex" or "squeeze"; features, lin: npz files (see ``lpips_weights``).
@@ -41,14 +46,14 @@ class Lpips:
         """
         self.network = network
         self.minimum_side = MINIMUM_SIDE[network]
-        self._slices: Slices = {"alex": _alex_slices, "squeeze": _squeeze_slices}[network]
         self._parameters = {
-            name.removeprefix("features."): torch.from_numpy(array)
-            for name, array in _arrays(features).items()
+            name.removeprefix("features."): array for name, array in _arrays(features).items()
         }
         lins = _arrays(lin)
-        self._lin = [torch.from_numpy(lins[f"lin{i}"].reshape(-1)) for i in range(len(lins))]
+        self._lin = [lins[f"lin{i}"].reshape(-1) for i in range(len(lins))]
         self._check()
+        self._lock = threading.Lock()
+        self._loaded: Network | None = None
 
     def __call__(self, rendering: NDArray, truth: NDArray) -> float:
         """Distance of two images as ``images.to_unit`` takes them: 0 for equal ones, about 1 for unrelated
@@ -70,75 +75,48 @@ class Lpips:
                 f"LPIPS-{self.network} needs images of at least {self.minimum_side} x {self.minimum_side} "
                 f"pixels, got {width} x {height}"
             )
-        n = len(renderings)
-        with torch.inference_mode():
-            x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)
-            pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
-            pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
-            total = torch.zeros(n, dtype=torch.float64)
-            for features, lin in zip(self._slices(self._parameters, pixels), self._lin):
-                unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
-                weighted = (unit[:n] - unit[n:]).square() * lin.view(1, -1, 1, 1)
-                total += weighted.double().sum(1).mean((1, 2))
-        distances: NDArray[np.float64] = total.numpy()
+        distances = self._network().distances(renderings, truths)
         if not np.isfinite(distances).all():
             raise ImageError("LPIPS is not finite: an image holds NaN, infinity or values far outside [0, 1]")
         return distances
 
+    def _network(self) -> Network:
+        with self._lock:
+            if self._loaded is None:
+                from edge_server.fidelity.lpips_network import Network
+
+                self._loaded = Network(self.network, self._parameters, self._lin)
+            return self._loaded
+
     def _check(self) -> None:
-        """Run a tiny image through the network to find missing and misshapen arrays before the first
-        score."""
-        side = self.minimum_side
-        with torch.inference_mode():
-            try:
-                slices = self._slices(self._parameters, torch.zeros(1, 3, side, side))
-            except RuntimeError as error:
-                raise ValueError(f"an array has a wrong shape: {str(error).splitlines()[0]}") from error
-        widths, expected = [len(lin) for lin in self._lin], [s.shape[1] for s in slices]
+        """Find missing and misshapen arrays before the first score."""
+        for name, shape in _shapes(self.network).items():
+            if self._parameters[name].shape != shape:
+                raise ValueError(
+                    f"{name} has shape {self._parameters[name].shape}, the network needs {shape}"
+                )
+        widths, expected = [len(lin) for lin in self._lin], list(SLICES[self.network])
         if widths != expected:
             raise ValueError(f"learned weights have widths {widths}, the network's slices {expected}")
-        tensors = [*self._parameters.values(), *self._lin]
-        if not all(torch.isfinite(t).all() for t in tensors):
+        if not all(np.isfinite(array).all() for array in [*self._parameters.values(), *self._lin]):
             raise ValueError("an array holds NaN or infinity")
+
+
+def _shapes(network: str) -> dict[str, tuple[int, ...]]:
+    """Of every array by its name: a weight and a bias for each convolution."""
+    layers = dict(_ALEX)
+    if network == "squeeze":
+        layers = {"0": (64, 3, 3)}
+        for fire, (squeeze, inputs, expand) in _FIRES.items():
+            layers[f"{fire}.squeeze"] = (squeeze, inputs, 1)
+            layers[f"{fire}.expand1x1"] = (expand, squeeze, 1)
+            layers[f"{fire}.expand3x3"] = (expand, squeeze, 3)
+    found: dict[str, tuple[int, ...]] = {}
+    for name, (out, inputs, side) in layers.items():
+        found[f"{name}.bias"], found[f"{name}.weight"] = (out,), (out, inputs, side, side)
+    return found
 
 
 def _arrays(path: Path) -> dict[str, NDArray[np.float32]]:
     with np.load(path, allow_pickle=False) as archive:
         return {name: np.ascontiguousarray(archive[name], dtype=np.float32) for name in archive.files}
-
-
-def _alex_slices(p: Parameters, x: Tensor) -> list[Tensor]:
-    """AlexNet after each of its five rectified convolutions; x (N, 3, H, W)."""
-
-    def conv(name: str, x: Tensor, stride: int, padding: int) -> Tensor:
-        return F.relu(F.conv2d(x, p[f"{name}.weight"], p[f"{name}.bias"], stride, padding))
-
-    a = conv("0", x, 4, 2)
-    b = conv("3", F.max_pool2d(a, 3, 2), 1, 2)
-    c = conv("6", F.max_pool2d(b, 3, 2), 1, 1)
-    d = conv("8", c, 1, 1)
-    e = conv("10", d, 1, 1)
-    return [a, b, c, d, e]
-
-
-def _squeeze_slices(p: Parameters, x: Tensor) -> list[Tensor]:
-    """SqueezeNet 1.1 after modules 1, 4, 7, 9, 10, 11 and 12; x (N, 3, H, W)."""
-
-    def conv(name: str, x: Tensor, stride: int = 1, padding: int = 0) -> Tensor:
-        return F.relu(F.conv2d(x, p[f"{name}.weight"], p[f"{name}.bias"], stride, padding))
-
-    def fire(name: str, x: Tensor) -> Tensor:
-        s = conv(f"{name}.squeeze", x)
-        return torch.cat([conv(f"{name}.expand1x1", s), conv(f"{name}.expand3x3", s, 1, 1)], 1)
-
-    def pool(x: Tensor) -> Tensor:
-        return F.max_pool2d(x, 3, 2, ceil_mode=True)
-
-    a = conv("0", x, 2)
-    b = fire("4", fire("3", pool(a)))
-    c = fire("7", fire("6", pool(b)))
-    d = fire("9", pool(c))
-    e = fire("10", d)
-    f = fire("11", e)
-    g = fire("12", f)
-    return [a, b, c, d, e, f, g]

@@ -1,4 +1,4 @@
-"""Finds LPIPS weights, or says what to do where there are none. Imports torch only once they are found.
+"""Finds LPIPS weights, or says what to do where there are none.
 
 A weights folder holds, for each network, the backbone's convolutions and the learned channel weights as
 plain npz arrays: ``alexnet_features.npz`` with ``lin_alex_v0.1.npz``, ``squeezenet1_1_features.npz``

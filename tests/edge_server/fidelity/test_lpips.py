@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -112,3 +115,11 @@ def test_the_weights_folder_is_the_nearest_that_was_named(tmp_path, monkeypatch)
     assert weights_folder() == data / "lpips"
     monkeypatch.setenv("FRESHFIELD_LPIPS", str(named))
     assert weights_folder(None, data) == named and weights_folder(tmp_path, data) == tmp_path
+
+
+def test_weights_are_checked_without_torch():
+    code = (
+        "import sys; from edge_server.fidelity.lpips_weights import open_lpips\n"
+        f"found, _ = open_lpips({str(data_dir('lpips'))!r}); print(found is not None, 'torch' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["True", "False"]

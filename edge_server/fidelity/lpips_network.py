@@ -1,0 +1,88 @@
+"""The two frozen networks behind LPIPS, in torch: apart from ``lpips``, so that an edge with weights starts
+without torch, which takes two seconds to import."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+# ImageNet's statistics, restated by the authors for inputs in [-1, 1].
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+EPSILON = 1e-10
+
+Parameters = dict[str, Tensor]
+
+
+class Network:
+    """Distances by one network. Stateless once built, so that threads may share it.
+
+    name: "alex" or "squeeze". parameters: its arrays by name. lin: a vector of channel weights each slice.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, NDArray[np.float32]],
+        lin: Sequence[NDArray[np.float32]],
+    ) -> None:
+        self._slices = {"alex": _alex_slices, "squeeze": _squeeze_slices}[name]
+        self._parameters = {key: torch.from_numpy(array) for key, array in parameters.items()}
+        self._lin = [torch.from_numpy(each) for each in lin]
+
+    def distances(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
+        """Of image pairs (N, H, W, 3), floating in [0, 1]: (N,)."""
+        n = len(renderings)
+        with torch.inference_mode():
+            x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)
+            pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
+            pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
+            total = torch.zeros(n, dtype=torch.float64)
+            for features, lin in zip(self._slices(self._parameters, pixels), self._lin):
+                unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
+                weighted = (unit[:n] - unit[n:]).square() * lin.view(1, -1, 1, 1)
+                total += weighted.double().sum(1).mean((1, 2))
+        found: NDArray[np.float64] = total.numpy()
+        return found
+
+
+def _alex_slices(p: Parameters, x: Tensor) -> list[Tensor]:
+    """AlexNet after each of its five rectified convolutions; x (N, 3, H, W)."""
+
+    def conv(name: str, x: Tensor, stride: int, padding: int) -> Tensor:
+        return F.relu(F.conv2d(x, p[f"{name}.weight"], p[f"{name}.bias"], stride, padding))
+
+    a = conv("0", x, 4, 2)
+    b = conv("3", F.max_pool2d(a, 3, 2), 1, 2)
+    c = conv("6", F.max_pool2d(b, 3, 2), 1, 1)
+    d = conv("8", c, 1, 1)
+    e = conv("10", d, 1, 1)
+    return [a, b, c, d, e]
+
+
+def _squeeze_slices(p: Parameters, x: Tensor) -> list[Tensor]:
+    """SqueezeNet 1.1 after modules 1, 4, 7, 9, 10, 11 and 12; x (N, 3, H, W)."""
+
+    def conv(name: str, x: Tensor, stride: int = 1, padding: int = 0) -> Tensor:
+        return F.relu(F.conv2d(x, p[f"{name}.weight"], p[f"{name}.bias"], stride, padding))
+
+    def fire(name: str, x: Tensor) -> Tensor:
+        s = conv(f"{name}.squeeze", x)
+        return torch.cat([conv(f"{name}.expand1x1", s), conv(f"{name}.expand3x3", s, 1, 1)], 1)
+
+    def pool(x: Tensor) -> Tensor:
+        return F.max_pool2d(x, 3, 2, ceil_mode=True)
+
+    a = conv("0", x, 2)
+    b = fire("4", fire("3", pool(a)))
+    c = fire("7", fire("6", pool(b)))
+    d = fire("9", pool(c))
+    e = fire("10", d)
+    f = fire("11", e)
+    g = fire("12", f)
+    return [a, b, c, d, e, f, g]
