@@ -234,21 +234,22 @@ def following(part: str) -> str:
 
 
 def card() -> str:
-    """What policies show in the scenario card, and the learnt one against all."""
+    """What policies show in the scenario card: with its own seed, and minus `all` with others."""
     found = measured("deploy/scenarios/card/scores.json")
+    measures = ("psnr_db", "psnr_moving_db")
     rows = [
-        [name, *(f"{row['own_seed'][m]:.2f}" for m in ("psnr_db", "psnr_moving_db")),
-         f"{row['own_seed']['views']:.1f}"]
+        [name, *(f"{row['own_seed'][m]:.2f}" for m in measures), f"{row['own_seed']['views']:.1f}",
+         *(_interval(row[f"{m}_over_all"]) if name != "all" else "" for m in measures)]
         for name, row in found["policies"].items()
     ]  # fmt: skip
     learnt = found["policies"]["learnt"]
-    whole, moving = (_interval(learnt[f"{m}_over_all"]) for m in ("psnr_db", "psnr_moving_db"))
     omegas = ", ".join(f"{state} {_interval(ms, 0)} ms" for state, ms in learnt["omega_ms"].items())
+    head = ("policy", "shown, dB", "moving", "views an update", "minus `all`, dB", "moving, minus `all`")
     return (
-        table(("policy", "shown, dB", "moving", "views an update"), rows)
-        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}. The learnt policy "
-        f"minus `all`, paired over {found['seeds']} other seeds and motions: {whole} dB, moving {moving}. "
-        f"Its mean threshold by the channel's state: {omegas}."
+        table(head, rows)
+        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}; minus "
+        f"`all`: paired over {found['seeds']} other seeds and motions. The learnt policy's mean threshold by the "
+        f"channel's state: {omegas}."
     )
 
 

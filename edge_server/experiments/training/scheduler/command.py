@@ -22,6 +22,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker
 from edge_server.experiments.training.scheduler.contest import LEARNT, contest
+from edge_server.experiments.training.scheduler.deployed import Hindsight
 from edge_server.experiments.training.scheduler.evaluation import (
     Evaluation,
     baseline_policies,
@@ -78,8 +79,9 @@ small (--size) and the field is quick (--field), so that there are many decision
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
 apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. With --hold these two
-are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
-Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
+are OUT/scores.json, of the scenario as it is and with hindsight, which knows the time until the next decision
+and takes the best of --omegas; OUT/actor.npz has what deciding needs of the policy. --hold with --episodes 0
+learns nothing and says what there is to be won. After Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
 """
 # Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
 _HOLD_LEAD_MS = 5000.0
@@ -114,6 +116,9 @@ def _train_and_evaluate(
               "ignore how old views are (--on moving)")  # fmt: skip
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
+    if config.spec.hold_ms and not config.episodes:
+        _contest(args, setting, config.spec, None, pool)
+        return
     learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
     # Reports of an earlier call; a call that was refused keeps them.
     for name in REPORTS:
@@ -127,7 +132,7 @@ def _train_and_evaluate(
         return
     if config.spec.hold_ms:
         draw_curve(args.out / "training.png", rows)
-        _contest(args, setting, learner.actor, pool)
+        _contest(args, setting, config.spec, learner.actor, pool)
         return
     kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
@@ -144,19 +149,23 @@ def _train_and_evaluate(
     _report(args.out, evaluation, kinds[0], rows, about)
 
 
-def _contest(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
-    """Fixed policies and the learnt one in the scenario as it is: its own size, all its training cameras."""
+def _contest(
+    args: argparse.Namespace, setting: Setting, spec: Spec, actor: Actor | None, pool: WorkerPool
+) -> None:
+    """Fixed policies, the learnt one and hindsight in the scenario as it is: its own size, all its training
+    cameras."""
     scenario = load(args.scenario)
     report = () if set(setting.report) == set(scenario.held_out) else setting.report
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
-    weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
+    weights = "" if actor is None else content_key((args.out / "policy.npz").read_bytes().hex(), 16)
     found = contest(
-        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "contest.jsonl",
-        lambda line: print(f"  {line}", flush=True),
+        as_it_is, pool, seeds(args.seed, "test", args.test), actor, Hindsight(spec.hold_ms, spec.omegas_ms),
+        weights, args.out / "contest.jsonl", lambda line: print(f"  {line}", flush=True),
     )  # fmt: skip
     write_json(args.out / "scores.json", found, indent=1)
-    actor.save(args.out / "actor.npz")
+    if actor is not None:
+        actor.save(args.out / "actor.npz")
 
 
 def _report(

@@ -1,7 +1,8 @@
-"""What fixed policies and a learnt one show in a scenario as it is, in virtual time with computing charged.
+"""What fixed policies, a learnt one and hindsight show in a scenario as it is, in virtual time with computing
+charged.
 
-All policies with the scenario's own seed, for the page; the learnt one and its reference with other seeds,
-too: one channel, one motion and the same instants for both.
+With the scenario's own seed, for the page; with other seeds minus what the reference shows there, in the same
+channel and motion at the same instants.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import number
+from edge_server.experiments.training.scheduler.deployed import Hindsight, Judged
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.report.machine import machine
 from edge_server.scheduler.learned.actor import Actor
 
-LEARNT = "learnt"
+LEARNT, HINDSIGHT = "learnt", "hindsight"
 REFERENCE = "all"
 CONTESTANTS = (REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6",
-               "age-driven")  # fmt: skip
+               "age-driven", HINDSIGHT)  # fmt: skip
 # What is shown is scored for so long, after the lead of an episode.
 SPAN_MS = 8000.0
 
@@ -33,35 +35,39 @@ def contest(
     setting: Setting,
     pool: WorkerPool,
     seeds: range,
-    learnt: Actor,
+    learnt: Actor | None,
+    hindsight: Hindsight,
     weights: str,
     known: Path,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """The scores of all policies as JSON values (the scenario key ``edge.scores``).
 
-    weights: name of the learnt policy's weights.
+    learnt: None where nothing was learnt. weights: name of its weights.
+    hindsight: what it chooses from.
     known: file of finished runs, read and appended to.
     """
     setting = dataclasses.replace(setting, span_ms=SPAN_MS)
     own = dataclasses.replace(setting, motions=False)
     own_seed = range(setting.scenario.seed, setting.scenario.seed + 1)
     found: dict[str, Any] = {}
+    reference: list[dict[str, Any]] = []
     for name in CONTESTANTS:
-        who = learnt if name == LEARNT else name
+        who: Judged | None = {LEARNT: learnt, HINDSIGHT: hindsight}.get(name, name)
+        if who is None:
+            continue
         found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
-        shown = number(found[name]["own_seed"]["psnr_db"])
-        say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}")
-    runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
-            for who in (REFERENCE, LEARNT)}  # fmt: skip
-    for who, of in runs.items():
+        runs = _runs(setting, pool, seeds, who, weights, known)
+        reference = reference or runs
         for m in ("psnr_db", "psnr_moving_db"):
-            values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
-            found[who][m] = interval(values[who].values()).rounded(4)
-            found[who][f"{m}_over_{REFERENCE}"] = paired(values[who], values[REFERENCE]).rounded(4)
-        if who == LEARNT:
-            found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
-    say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
+            values, of_reference = (dict(zip(seeds, [run[m] for run in r])) for r in (runs, reference))
+            found[name][m] = interval(values.values()).rounded(4)
+            found[name][f"{m}_over_{REFERENCE}"] = paired(values, of_reference).rounded(4)
+        if isinstance(who, Actor):
+            found[name]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in runs])
+        shown = number(found[name]["own_seed"]["psnr_db"])
+        over = found[name][f"psnr_db_over_{REFERENCE}"]
+        say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}; minus {REFERENCE}, others: {over}")
     return {
         "scenario": setting.scenario.name, "seed": setting.scenario.seed, "seeds": len(seeds),
         "lead_s": setting.lead_ms / 1e3, "seconds": setting.span_ms / 1e3, "judged_from": setting.scoring,
@@ -70,10 +76,10 @@ def contest(
 
 
 def _runs(
-    setting: Setting, pool: WorkerPool, seeds: range, who: str | Actor, weights: str, known: Path
+    setting: Setting, pool: WorkerPool, seeds: range, who: Judged, weights: str, known: Path
 ) -> list[dict[str, Any]]:
     """``WorkerPool.judge`` of each seed; those in ``known`` are not run again."""
-    name = weights if isinstance(who, Actor) else who
+    name = weights if isinstance(who, Actor) else str(who)
     keys = {seed: content_key([source_digest(), setting.key, name, seed], 32) for seed in seeds}
     with closing(ResultStore.in_lines(known)) as store:
         missing = [seed for seed in seeds if keys[seed] not in store.results]

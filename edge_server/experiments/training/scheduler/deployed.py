@@ -7,7 +7,9 @@ outcomes of one instant are comparable.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +25,8 @@ from edge_server.experiments.training.scheduler.episode import SCORES, EpisodeFa
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.live.state import Publication
-from edge_server.scheduler import Policy
+from edge_server.scheduler import Epoch, Policy, SelectionWindow
+from edge_server.scheduler.fixed import Threshold
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision import Decision
@@ -31,6 +34,19 @@ from freshfield.scenario import Scenario
 
 # Instants at which what is shown is scored.
 SHOWN_EVERY_MS = 125.0
+
+
+@dataclass(frozen=True)
+class Hindsight:
+    """What no policy can do: every ``hold_ms`` it takes that of some thresholds which will show most until
+    the next decision (PSNR). Greedy: what an action is worth later does not count."""
+
+    hold_ms: float
+    omegas_ms: tuple[float, ...]
+
+
+Judged = str | Actor | Hindsight
+"""A policy's name and value; an actor, which takes its most probable actions; or hindsight."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +64,15 @@ def play(factory: EpisodeFactory, seed: int, actor: Actor, turn: int) -> list[De
     return _run(factory, seed, policy)[1]
 
 
-def judge(factory: EpisodeFactory, seed: int, who: str | Actor) -> dict[str, Any]:
-    """What a policy shows in an episode after its lead, as plain values.
-
-    who: a policy's name and value, or an actor, which takes its most probable actions. An actor's omegas are
-    given by the channel's state, too.
-    """
+def judge(factory: EpisodeFactory, seed: int, who: Judged) -> dict[str, Any]:
+    """What a policy shows in an episode after its lead, as plain values. An actor's omegas are given by the
+    channel's state, too."""
     rng = np.random.default_rng([seed, 0])
-    policy = BanditPolicy(who, "learnt", rng) if isinstance(who, Actor) else named(who)(rng)
+    policy: Policy
+    if isinstance(who, Actor):
+        policy = BanditPolicy(who, "learnt", rng)
+    else:
+        policy = _Forking(who) if isinstance(who, Hindsight) else named(who)(rng)
     deployment, decided = _run(factory, seed, policy)
     outcome = _outcome(deployment, round(factory.setting.lead_ms * 1e6), deployment.clock.now_ns())
     found: dict[str, Any] = {"psnr_db": outcome.psnr_db, "psnr_moving_db": outcome.psnr_moving_db,
@@ -90,13 +107,66 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
         embedder=factory.embedder, on_published=published,
     )  # fmt: skip
     deployment.updates.policy = policy
-    deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
+    if isinstance(policy, _Forking):
+        policy.shown_db = lambda begin_ns, end_ns: _outcome(deployment, begin_ns, end_ns).psnr_db
+    try:
+        deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
+    finally:
+        if isinstance(policy, _Forking):
+            policy.report(deployment.clock.now_ns())
     kept = [d for d in decisions if d.now_ns >= setting.lead_ms * 1e6]
     ends = [*(d.now_ns for d in kept[1:]), deployment.clock.now_ns()]
     states = channel_states(scenario, [d.now_ns for d in kept])
     return deployment, [
         Decided(d, _outcome(deployment, d.now_ns, end), state) for d, end, state in zip(kept, ends, states)
     ]
+
+
+class _Forking(Threshold):
+    """Tries the actions of each decision in forks of this process, which all go on from the same state."""
+
+    def __init__(self, who: Hindsight) -> None:
+        super().__init__(None, np.random.default_rng(0))
+        self._who, self._began_ns, self._until_ns = who, 0, 0
+        self._answer: int | None = None  # a fork writes there what its action showed, and ends
+        self.shown_db: Callable[[int, int], float | None] = lambda begin_ns, end_ns: None
+
+    def plan(self, epoch: Epoch) -> SelectionWindow:
+        if epoch.now_ns >= self._until_ns:
+            self.report(epoch.now_ns)
+            self._began_ns, self._until_ns = epoch.now_ns, epoch.now_ns + round(self._who.hold_ms * 1e6)
+            shown = {}
+            for omega_ms in self._who.omegas_ms:
+                self.value = omega_ms
+                if (found := self._fork()) is None:  # in the fork
+                    return super().plan(epoch)
+                shown[omega_ms] = found
+            # Of equal ones, the largest: leaving frames out has to win something.
+            self.value = max(shown, key=lambda omega_ms: (shown[omega_ms], omega_ms))
+        return super().plan(epoch)
+
+    def _fork(self) -> float | None:
+        """What the fork showed, -inf without a score; None in the fork itself."""
+        read, write = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            os.close(read)
+            self._answer = write
+            return None
+        os.close(write)
+        with os.fdopen(read, "rb") as pipe:
+            answer = pipe.read()
+        os.waitpid(pid, 0)
+        if len(answer) != 8:
+            raise RuntimeError("a fork that tried an action ended without a result")
+        return float(struct.unpack("d", answer)[0])
+
+    def report(self, now_ns: int) -> None:
+        """End a fork with what was shown since its decision; nothing elsewhere."""
+        if self._answer is not None:
+            shown = self.shown_db(self._began_ns, now_ns)
+            os.write(self._answer, struct.pack("d", -np.inf if shown is None else shown))
+            os._exit(0)
 
 
 def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outcome:

@@ -20,7 +20,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.worker import end_at_once, init_worker
-from edge_server.experiments.training.scheduler.deployed import Decided, judge, play
+from edge_server.experiments.training.scheduler.deployed import Decided, Judged, judge, play
 from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.scheduler.learned.actor import Actor
@@ -170,7 +170,7 @@ class WorkerPool:
         sent = [self._send(s, work, setting, [(s, actor, turn) for turn in range(tries)]) for s in seeds]
         return [one.result() for one in sent]
 
-    def judge(self, setting: Setting, seeds: Sequence[int], who: str | Actor) -> Iterator[dict[str, Any]]:
+    def judge(self, setting: Setting, seeds: Sequence[int], who: Judged) -> Iterator[dict[str, Any]]:
         """``deployed.judge`` of each episode."""
         sent: Iterable[Future[list[Any]]] = (
             self._send(s, partial(_each, judge), setting, [(s, who)]) for s in seeds

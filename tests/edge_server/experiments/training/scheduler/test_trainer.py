@@ -16,8 +16,8 @@ from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.training.scheduler import command, contest
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
-from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
-from edge_server.experiments.training.scheduler.episode import Choice, Outcome
+from edge_server.experiments.training.scheduler.deployed import Decided, Hindsight, judge, sibling_advantages
+from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
     baseline_policies,
@@ -272,7 +272,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
 def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored_beside_fixed_ones(
     tmp_path: Path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven"))
+    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven", "hindsight"))
     monkeypatch.setattr(contest, "SPAN_MS", 600.0)
     monkeypatch.setattr(command, "_HOLD_LEAD_MS", 1200.0)
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
@@ -297,6 +297,17 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     assert json.loads((out / "scores.json").read_text())["policies"] == found
     actor = Actor.load(out / "actor.npz")
     assert actor.spec.hold_ms == 200.0 and (out / "actor.npz").stat().st_size < 4e5
+    assert main([*words, "--episodes", "0", "--out", str(tmp_path / "untrained")]) == 0
+    untrained = json.loads((tmp_path / "untrained" / "scores.json").read_text())["policies"]
+    assert "learnt" not in untrained and untrained["hindsight"] == found["hindsight"]
+
+
+def test_hindsight_with_one_decision_shows_what_the_best_threshold_shows():
+    brief = dataclasses.replace(setting(), refresh_ms=0.5, lead_ms=1.0, span_ms=1500.0)
+    factory = EpisodeFactory(brief, NOTHING)
+    fixed = [judge(factory, 5, f"threshold:{omega_ms}")["psnr_db"] for omega_ms in (20, 90, 400)]
+    found = judge(factory, 5, Hindsight(1e6, (20.0, 90.0, 400.0)))
+    assert found["psnr_db"] == max(fixed) > min(fixed)
 
 
 def test_tries_are_compared_with_the_others_that_decided_at_the_same_time():
