@@ -79,9 +79,10 @@ small (--size) and the field is quick (--field), so that there are many decision
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
 apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. With --hold these two
-are OUT/scores.json, of the scenario as it is and with hindsight, which knows the time until the next decision
-and takes the best of --omegas; OUT/actor.npz has what deciding needs of the policy. --hold with --episodes 0
-learns nothing and says what there is to be won. After Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
+are OUT/scores.json, of the scenario as it is and beside hindsight, which knows the time until the next
+decision and takes the best of --omegas; OUT/actor.npz has what deciding needs of the policy. --hold with
+--episodes 0 learns nothing and says what there is to win. After Ctrl-C the same command goes on, bit for bit;
+so it does whatever --jobs is.
 """
 # Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
 _HOLD_LEAD_MS = 5000.0
