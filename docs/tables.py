@@ -247,9 +247,9 @@ def card() -> str:
     head = ("policy", "shown, dB", "moving", "views an update", "minus `all`, dB", "moving, minus `all`")
     return (
         table(head, rows)
-        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}; minus `all`: paired over "
-        f"{found['seeds']} other seeds and motions. The learnt policy's mean threshold by the channel's state: "
-        f"{omegas}."
+        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}; minus `all`: paired "
+        f"over {found['seeds']} other seeds and motions. The learnt policy's mean threshold by the channel's "
+        f"state: {omegas}."
     )
 
 
