@@ -239,7 +239,7 @@ def card() -> str:
     measures = ("psnr_db", "psnr_moving_db")
     rows = [
         [name, *(f"{row['own_seed'][m]:.2f}" for m in measures), f"{row['own_seed']['views']:.1f}",
-         *(_interval(row[f"{m}_over_all"]) if name != "all" else "" for m in measures)]
+         *(_interval(row[f"{m}_over_all"]) if f"{m}_over_all" in row else "" for m in measures)]
         for name, row in found["policies"].items()
     ]  # fmt: skip
     learnt = found["policies"]["learnt"]

@@ -15,7 +15,7 @@ from typing import Any
 
 from freshfield.scenario import read_section
 
-DEFAULT, GRABCUT, BOX = "default", "grabcut", "box"
+DEFAULT, GRABCUT, BOX, OWN = "default", "grabcut", "box", "detector"
 CHOICES = ("surest", "largest")
 PROVIDERS = ("auto", "cpu", "cuda")
 Four = tuple[float, float, float, float]
@@ -29,11 +29,13 @@ class ForegroundError(ValueError):
 class ForegroundConfig:
     """The section ``edge.foreground`` of a scenario.
 
-    detector: YOLO detection ONNX (v8, v11), relative to the scenario, or ``default``, the small one shipped
-    for our own scenes. box: [left, top, right, bottom] as shares of the image, instead of a detector; boxes:
-    one per camera. kinds: class names to detect; none: any. confidence: minimum score. choose: which of
-    several detections, surest or largest. margin: added to each side of a detected box, as a share of it.
-    segment: ``grabcut``, ``box`` (the whole box), or an ONNX with one foreground map (n, 1, h, w).
+    detector: YOLO detection or segmentation ONNX (v8, v11), relative to the scenario, or ``default``, the
+    small one shipped for our own scenes. box: [left, top, right, bottom] as shares of the image, instead of a
+    detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum score.
+    choose: which of several detections, surest or largest. margin: added to each side of a detected box, as a
+    share of it. segment: ``detector`` (its own masks, of a segmentation model), ``grabcut``, ``box`` (the
+    whole box), or an ONNX with one foreground map (n, 1, h, w); none: the detector's masks if it has some,
+    else grabcut.
     iterations: of grabcut. side: longest side, pixels, for grabcut; the mask is then enlarged.
     threshold: of an ONNX's map. normalise: ONNX input, imagenet (most models) or unit (0 to 1).
     doubt: supervision weight, 0 to 1, of background pixels within the box, against 1 outside: a false hole in
@@ -47,7 +49,7 @@ class ForegroundConfig:
     confidence: float = 0.25
     choose: str = "surest"
     margin: float = 0.05
-    segment: str = GRABCUT
+    segment: str | None = None
     iterations: int = 3
     side: int = 160
     threshold: float = 0.5
@@ -84,6 +86,6 @@ def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundCon
     beside: dict[str, Any] = {}
     if config.detector not in (None, DEFAULT):
         beside["detector"] = str(scenario.parent / str(config.detector))
-    if config.segment not in (GRABCUT, BOX):
+    if config.segment not in (None, OWN, GRABCUT, BOX):
         beside["segment"] = str(scenario.parent / config.segment)
     return ForegroundConfig(**{**vars(config), **beside})

@@ -1,9 +1,12 @@
-"""Boxes from any YOLO detection model in ONNX (v8 and v11 heads): letterbox, run, decode, suppress."""
+"""Boxes, and masks, from any YOLO detection or segmentation model in ONNX (v8 and v11 heads): letterbox, run,
+decode, suppress."""
 
 from __future__ import annotations
 
 import ast
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +30,18 @@ _MOST = 300
 
 @dataclass(frozen=True)
 class Detection:
-    """box: left, top, right, bottom in pixels of the image, not clipped to it; kind: the model's name."""
+    """box: left, top, right, bottom in pixels of the image, not clipped to it; kind: the model's name; mask:
+    makes the object's (H, W), not clipped to the box, None of a model that gives no masks."""
 
     box: tuple[float, float, float, float]
     score: float
     kind: str
+    mask: Callable[[], NDArray[np.bool_]] | None = None
 
 
 class Detector:
-    """A YOLO detection model. path: its ONNX file, or ``default`` for the shipped one. ForegroundError: the
-    file is missing or unusable."""
+    """A YOLO detection or segmentation model. path: its ONNX file, or ``default`` for the shipped one.
+    ForegroundError: the file is missing or unusable."""
 
     def __init__(self, path: str, provider: str = "auto", threads: int = 1) -> None:
         file = model_path(path)
@@ -49,6 +54,7 @@ class Detector:
         meta = self._session.get_modelmeta().custom_metadata_map
         self.height, self.width = _size(image.shape, meta, file)
         self.kinds = _kinds(meta)
+        self.gives_masks = len(self._session.get_outputs()) == 2
         self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # a model that cannot run fails here
 
     def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
@@ -58,10 +64,15 @@ class Detector:
         whole = checked(image, 0)
         try:
             given = blob([whole], self.height, self.width, self._dtype)
-            out = self._session.run(None, {self._input: given})[0]
+            out, *prototypes = map(np.asarray, self._session.run(None, {self._input: given}))
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
-        rows = decode(np.asarray(out), confidence, self.name)
+        if self.gives_masks and (prototypes[0].ndim != 4 or len(prototypes[0]) != 1):
+            raise ForegroundError(
+                f"{self.name}: gives {prototypes[0].shape}, not masks (1, n, height, width)"
+            )
+        coefficients = prototypes[0].shape[1] if self.gives_masks else 0
+        rows = decode(out, confidence, self.name, coefficients)
         h, w = whole.shape[:2]
         # From the letterboxed input back to the image.
         scale = min(self.height / h, self.width / w)
@@ -69,18 +80,36 @@ class Detector:
             (side - max(1, round(n * scale))) // 2 for side, n in ((self.width, w), (self.height, h))
         )
         found = []
-        for x0, y0, x1, y1, score, kind in rows:
+        for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
-            found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind)))))
+            mask = partial(self._mask, weights, prototypes[0][0], (h, w)) if self.gives_masks else None
+            found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
+    def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """The weighted sum of prototypes (n, h, w), which cover the model's input, where it is positive, as a
+        mask of the image's ``shape``."""
+        h, w = shape
+        scale = min(self.height / h, self.width / w)
+        size = max(1, round(w * scale)), max(1, round(h * scale))
+        left, top = (self.width - size[0]) // 2, (self.height - size[1]) // 2
+        logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
+        logits = np.nan_to_num(logits, nan=-1.0)
+        whole = cv2.resize(logits, (self.width, self.height), interpolation=cv2.INTER_LINEAR)
+        image = whole[top : top + size[1], left : left + size[0]]
+        mask: NDArray[np.bool_] = cv2.resize(image, (w, h), interpolation=cv2.INTER_LINEAR) > 0.0
+        return mask
 
-def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[tuple[float, ...]]:
-    """Decode a YOLO head's ``output`` (1, 4 + kinds, cells) or (1, cells, 4 + kinds): center, size and a
-    score per class, in pixels of the model's input. Returns rows (left, top, right, bottom, score, kind),
-    best score first, without those that are not finite or have no area. name: of the model, for errors.
-    Raises ForegroundError."""
-    if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5:
+
+def decode(
+    output: NDArray[np.floating], confidence: float, name: str, coefficients: int = 0
+) -> list[tuple[float, ...]]:
+    """Decode a YOLO head's ``output`` (1, 4 + kinds + coefficients, cells) or its transpose: center, size and
+    a score per class, in pixels of the model's input, and the weights of the masks.
+
+    Returns rows (left, top, right, bottom, score, kind, *coefficients), best score first, without those that
+    are not finite or have no area. name: of the model, for errors. Raises ForegroundError."""
+    if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5 + coefficients:
         raise ForegroundError(
             f"{name}: gives {output.shape}, not the boxes and scores (1, 4 + kinds, cells) of a YOLO v8 or "
             "v11 head; export it with format=onnx and nms=False"
@@ -88,7 +117,8 @@ def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[t
     # The longer axis holds the cells: our smallest model has 64 of them, with 8 numbers each.
     table = output[0].T if output.shape[1] < output.shape[2] else output[0]
     table = table.astype(np.float64)
-    scores, kinds = table[:, 4:].max(axis=1), table[:, 4:].argmax(axis=1)
+    end = table.shape[1] - coefficients
+    scores, kinds = table[:, 4:end].max(axis=1), table[:, 4:end].argmax(axis=1)
     sound = np.isfinite(table).all(axis=1) & (scores >= confidence) & (table[:, 2:4] > 0).all(axis=1)
     best = np.flatnonzero(sound)
     best = best[np.argsort(-scores[best], kind="stable")][:_MOST]
@@ -100,7 +130,8 @@ def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[t
     kept = cv2.dnn.NMSBoxesBatched(
         rectangles.tolist(), scores[best].tolist(), kinds[best].tolist(), 0.0, NMS_IOU
     )
-    rows = np.concatenate([low, low + size, scores[best, None], kinds[best, None]], axis=1)
+    columns = (low, low + size, scores[best, None], kinds[best, None], table[best, end:])
+    rows = np.concatenate(columns, axis=1)
     return [tuple(float(v) for v in rows[k]) for k in sorted(int(i) for i in kept)]
 
 

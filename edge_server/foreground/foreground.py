@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.foreground import BOX, DEFAULT, ForegroundConfig, ForegroundError
-from edge_server.foreground.segment import Box, Segmenter, make_segmenter
+from edge_server.foreground import BOX, DEFAULT, OWN, ForegroundConfig, ForegroundError
+from edge_server.foreground.segment import Box, Segmenter, WholeBox, make_segmenter
 
 Image = NDArray[np.uint8]
 Weight = NDArray[np.float32]
@@ -73,10 +74,13 @@ class Foreground:
         found = self._boxes.of(camera, image)
         if found is None:
             return "not_detected"
-        box = clipped(found, width, height)
+        box = clipped(found.box, width, height)
         if box is None:
             return "empty_box"
-        mask = self._segmenter.mask(np.ascontiguousarray(image[..., :3]), box)
+        if self.config.segment in (None, OWN) and found.mask is not None:
+            mask = found.mask() & WholeBox().mask(image, box)
+        else:
+            mask = self._segmenter.mask(np.ascontiguousarray(image[..., :3]), box)
         if not mask.any():
             return "empty_mask"
         return "full_mask" if mask.all() else (mask, box)
@@ -85,6 +89,15 @@ class Foreground:
         """Counts, and milliseconds per image."""
         images = sum(vars(self.counts).values())
         return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / images if images else None}
+
+
+@dataclass(frozen=True)
+class Found:
+    """The object: box (left, top, right, bottom), pixels, possibly beyond the image; mask: the detector's own
+    (H, W), None without one."""
+
+    box: tuple[float, float, float, float]
+    mask: Callable[[], NDArray[np.bool_]] | None = None
 
 
 class Boxes:
@@ -103,16 +116,21 @@ class Boxes:
                     f"kinds: {self._detector.name} knows no {', '.join(sorted(unknown))}; "
                     f"it knows {', '.join(sorted(known))}"
                 )
+        if config.segment == OWN and (self._detector is None or not self._detector.gives_masks):
+            raise ForegroundError(
+                f"segment: {OWN}: {self._detector.name if self._detector else 'a fixed box'} gives no masks; "
+                "name a YOLO segmentation model (-seg), or grabcut"
+            )
 
-    def of(self, camera: str, image: Image) -> tuple[float, float, float, float] | None:
-        """Left, top, right, bottom, pixels, possibly beyond the image; None if nothing was detected."""
+    def of(self, camera: str, image: Image) -> Found | None:
+        """None if nothing was detected."""
         c = self._config
         if self._detector is None:
             share = c.boxes.get(camera, c.box)
             if share is None:
                 return None
             height, width = image.shape[:2]
-            return share[0] * width, share[1] * height, share[2] * width, share[3] * height
+            return Found((share[0] * width, share[1] * height, share[2] * width, share[3] * height))
         found = [d for d in self._detector.detect(image, c.confidence) if not c.kinds or d.kind in c.kinds]
         if not found:
             return None
@@ -120,7 +138,7 @@ class Boxes:
             found.sort(key=lambda d: (d.box[0] - d.box[2]) * (d.box[3] - d.box[1]))
         x0, y0, x1, y1 = found[0].box
         dx, dy = c.margin * (x1 - x0), c.margin * (y1 - y0)
-        return x0 - dx, y0 - dy, x1 + dx, y1 + dy
+        return Found((x0 - dx, y0 - dy, x1 + dx, y1 + dy), found[0].mask)
 
 
 def clipped(box: tuple[float, float, float, float], width: int, height: int) -> Box | None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.foreground import BOX, GRABCUT, ForegroundConfig, ForegroundError
+from edge_server.foreground import BOX, GRABCUT, OWN, ForegroundConfig, ForegroundError
 
 Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
@@ -34,7 +34,7 @@ def make_segmenter(config: ForegroundConfig) -> Segmenter:
     """Create the segmenter that ``config.segment`` names. ForegroundError: its model is unusable."""
     if config.segment == BOX:
         return WholeBox()
-    if config.segment == GRABCUT:
+    if config.segment in (None, OWN, GRABCUT):
         return GrabCut(config.iterations, config.side)
     return SegmentModel(config)
 
@@ -95,7 +95,7 @@ class SegmentModel:
     def __init__(self, config: ForegroundConfig) -> None:
         from edge_server.foreground.detector import open_model
 
-        file = Path(config.segment)
+        file = Path(str(config.segment))
         self._name = file.name
         self._session: Any = open_model(file, config.provider, config.threads)
         image = self._session.get_inputs()[0]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_server.foreground import ForegroundConfig, ForegroundError
-from edge_server.foreground.foreground import Foreground, clipped, make_foreground
+from edge_server.foreground.foreground import Foreground, Found, clipped, make_foreground
 from edge_server.foreground.segment import GrabCut
 
 RNG = np.random.default_rng(0)
@@ -23,7 +23,7 @@ class At:
         self.box = box
 
     def of(self, camera, image):
-        return self.box
+        return None if self.box is None else Found(self.box)
 
 
 class Says:

@@ -15,11 +15,12 @@ CHANNELS = 6
 def save(
     path: Path, nodes, images: list, output: tuple[str, list | None], constants: dict[str, np.ndarray],
     weights: tuple[onnx.TensorProto, ...] = (), opset: int = 17, meta: dict[str, str] | None = None,
+    further: tuple[tuple[str, list], ...] = (),
 ) -> Path:  # fmt: skip
-    """Write a graph from ``images`` (of this shape) to ``output`` (name and shape)."""
+    """Write a graph from ``images`` (of this shape) to ``output`` (name and shape), and ``further`` ones."""
     graph = helper.make_graph(
         nodes, path.stem, [helper.make_tensor_value_info("images", TensorProto.FLOAT, images)],
-        [helper.make_tensor_value_info(output[0], TensorProto.FLOAT, output[1])],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in (output, *further)],
         [*(numpy_helper.from_array(value, name) for name, value in constants.items()), *weights],
     )  # fmt: skip
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)

@@ -32,9 +32,11 @@ def box_of(truth: NDArray[np.bool_], margin: int = 3) -> tuple[float, float, flo
     return max(left / w, 0.0), max(top / h, 0.0), min(right / w, 1.0), min(bottom / h, 1.0)
 
 
-def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed: bool = False) -> Path:
+def save_orange_detector(
+    path: Path, kinds: int = 3, side: int = 64, transposed: bool = False, masks: bool = False
+) -> Path:
     """An ONNX with a YOLO head's output: one cell a pixel of an 8 x 8 grid, of which those on orange score,
-    with boxes of 40 pixels around them."""
+    with boxes of 40 pixels around them. masks: of a segmentation model, orange at a quarter of the side."""
     from onnx import helper
 
     from tests.edge_server.embed.graphs import save
@@ -52,7 +54,7 @@ def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed:
         helper.make_node("Relu", ["orange"], ["score"]),
         helper.make_node("Reshape", ["score", "flat"], ["row"]),
         helper.make_node("Mul", ["row", "spread"], ["scores"]),
-        helper.make_node("Concat", ["boxes", "scores"], ["table"], axis=1),
+        helper.make_node("Concat", ["boxes", "scores", *["ones"] * masks], ["table"], axis=1),
         helper.make_node("Transpose", ["table"], ["output0"], perm=[0, 2, 1])
         if transposed
         else helper.make_node("Identity", ["table"], ["output0"]),
@@ -61,10 +63,20 @@ def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed:
     spread[0, 1] = 1.0
     constants = {"weight": weight, "flat": np.array([1, 1, grid * grid], np.int64), "spread": spread,
                  "boxes": boxes[None].astype(np.float32)}  # fmt: skip
-    shape = [1, grid * grid, 4 + kinds] if transposed else [1, 4 + kinds, grid * grid]
+    if masks:
+        constants |= {"ones": np.ones((1, 1, grid * grid), np.float32), "half": np.float32([0.17])}
+        nodes += [
+            helper.make_node("AveragePool", ["images"], ["fine"], kernel_shape=[4, 4], strides=[4, 4]),
+            helper.make_node("Conv", ["fine", "weight"], ["fine_orange"]),
+            helper.make_node("Sub", ["fine_orange", "half"], ["output1"]),
+        ]
+    columns = 4 + kinds + masks
+    shape = [1, grid * grid, columns] if transposed else [1, columns, grid * grid]
     names = {k: name for k, name in enumerate(["apple", "orange", "pear"][:kinds])}
     meta = {"names": str(names)}
-    return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta)
+    further = (("output1", [1, 1, side // 4, side // 4]),) if masks else ()
+    return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta,
+                further=further)  # fmt: skip
 
 
 def save_orange_segmenter(path: Path, logits: bool = False) -> Path:

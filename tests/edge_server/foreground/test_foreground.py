@@ -145,6 +145,31 @@ def test_detector_and_model_together(tmp_path):
     assert cut.status()["ms_per_image"] > 0
 
 
+@pytest.mark.parametrize("transposed", [False, True])
+def test_the_masks_of_a_segmentation_model_are_taken_through_the_letterbox(tmp_path, transposed):
+    needs_onnx()
+    model = save_orange_detector(tmp_path / "orange-seg.onnx", transposed=transposed, masks=True)
+    picture, truth = disc(96, 128, (48, 72), 14)
+    for segment in (None, "detector"):
+        cut = make_foreground(ForegroundConfig(detector=str(model), kinds=["orange"], segment=segment))
+        mask = cut.apply("cam00", picture)[0][..., 3] == 255
+        assert iou(mask, truth) > 0.8, "at an eighth of the picture's size"
+    with_grabcut = make_foreground(ForegroundConfig(detector=str(model), segment="grabcut"))
+    assert (with_grabcut.apply("cam00", picture)[0][..., 3] == 255).any()
+    # A second object of the same color beside the box is not part of it.
+    picture[:, :20] = picture[48, 72]
+    mask = cut.apply("cam00", picture)[0][..., 3] == 255
+    assert not (mask[:, :20].any() and mask[:, 60:].any())
+
+
+def test_masks_that_a_detector_does_not_give_are_refused(tmp_path):
+    needs_onnx()
+    model = save_orange_detector(tmp_path / "orange.onnx")
+    for section in ({"detector": str(model)}, {"box": (0.0, 0.0, 1.0, 1.0)}):
+        with pytest.raises(ForegroundError, match=r"gives no masks; name a YOLO segmentation model"):
+            make_foreground(ForegroundConfig(**section, segment="detector"))
+
+
 def test_the_shipped_detector_runs():
     needs_onnx()
     from edge_server.foreground.detector import Detector
