@@ -52,6 +52,9 @@ PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
 FINE_FRAMES = 6  # of each camera, before the static field learns from fine plates
+EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # in which cameras agree on an exposure, and steps of each
+EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
+EXPOSURE_RATE = 1.6  # of correction: so few steps show some six tenths of a difference
 MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each taken in 15 times a second
 
 
@@ -317,6 +320,7 @@ class LayeredField:
     def _begin_layers(self) -> MotionTracker:
         """Give the static field its first plates, and the moving set the scene's box."""
         begun = self.now()
+        self._agree_on_exposure()
         self.static.field.learn(self._plates())
         self.plates_s = self.observations.newest_s
         self.make_tracker()
@@ -363,6 +367,25 @@ class LayeredField:
             else:
                 self.static.field.learn_again(plates)
         self.part_s.add("static field", begun)
+
+    def _agree_on_exposure(self) -> None:
+        """Correct the cameras' exposures by how their plates differ from what a field learns of all of them
+        in its first steps. Later it tells nothing: Gaussians that one camera alone sees have its exposure.
+        Their geometric mean stays."""
+        for _ in range(EXPOSURE_ROUNDS):
+            self.static.field.learn(self._plates())
+            self.static.field.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
+            self.static.publish()
+            self.static.render([camera.view for camera in self.cameras.values()])
+            renderings, self.static.rendered = self.static.rendered, {}
+            self.static.reset()
+            told = [c.plate.exposure_over(renderings[n][1].color) for n, c in self.cameras.items()]
+            logs = np.log(np.stack([np.ones(3, np.float32) if each is None else each for each in told]))
+            logs -= logs.mean(axis=0)
+            if logs.std(axis=0).max() < EXPOSURES_AGREE:
+                return
+            for camera, ratio in zip(self.cameras.values(), np.exp(EXPOSURE_RATE * logs), strict=True):
+                camera.correct_exposure(ratio.astype(np.float32))
 
     def _plates(self) -> list[PlateImage]:
         return [camera.plate_image(self.fine) for camera in self.cameras.values()]

@@ -52,12 +52,18 @@ class FixedCamera:
         """The plate as it is now, copied. fine: at the full resolution, where there is such a plate."""
         if fine and self.fine is not None:
             return PlateImage(self.fine.view, self.fine.color.copy(), self.fine.known)
-        return PlateImage(self.view, self.plate.at_first_exposure(), self.plate.known.copy())
+        return PlateImage(self.view, self.plate.at_common_exposure(), self.plate.known.copy())
 
     def take_rendering(self, step: int, rendering: Rendering) -> None:
         """Take over what the static field shows from here, and the step at which it does."""
         self.depth_m, self.rendered_step = rendering.depth, step
         self.plate.fill_unknown(rendering.color)
+
+    def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
+        """Take its exposure as ``ratio`` times what it was thought to be."""
+        self.plate.correct_exposure(ratio)
+        if self.fine is not None:
+            self.fine.color /= ratio
 
 
 @dataclass(order=True)

@@ -34,6 +34,9 @@ Arrays = dict[str, NDArray]
 LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
 GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
+COMMON_SHARE = (
+    0.25  # and that over other cameras: of what is cut off at white, edges are left, which tell wrong
+)
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
@@ -45,7 +48,8 @@ class Plate:
 
     arrays: ``PlateArrays``.
     picture: float32 (H, W, 3), the plate; where it is unknown, the static field's rendering.
-    gain: float32 (3,), exposure of the newest frame over that of the first, by channel.
+    gain: float32 (3,), exposure of the newest frame over the one that all cameras have in common, by channel:
+        that of this camera's first frame, until ``correct_exposure``.
     count: number of frames taken in.
     """
 
@@ -74,9 +78,26 @@ class Plate:
         """bool (H, W), where there is a plate."""
         return self.arrays.known
 
-    def at_first_exposure(self) -> NDArray[np.float32]:
-        """The plate as the camera would see it with the exposure of its first frame, float32 (H, W, 3)."""
+    def at_common_exposure(self) -> NDArray[np.float32]:
+        """The plate as the camera would see it with the common exposure, float32 (H, W, 3)."""
         return self.picture / self.gain
+
+    def exposure_over(self, color: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Median ratio by channel of the plate at the common exposure to the static field's rendering at it,
+        float32 (H, W, 3) in [0, 1]; None where too few pixels tell."""
+        theirs = color[::2, ::2] * np.float32(255.0)
+        use = self.known[::2, ::2]
+        for picture in (self.picture[::2, ::2], theirs):
+            use = use & (picture.min(axis=2) > DARK) & (picture.max(axis=2) < BRIGHT)
+        if use.sum() < COMMON_SHARE * use.size:
+            return None
+        ours = self.at_common_exposure()[::2, ::2]
+        ratio: NDArray[np.float32] = np.median(ours[use] / theirs[use], axis=0).astype(np.float32)
+        return ratio
+
+    def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
+        """Take this camera's exposure as ``ratio`` times what it was thought to be."""
+        self.gain = self.gain * ratio
 
     def take(self, image: NDArray[np.uint8], may_refuse: bool = False) -> NDArray[np.bool_] | None:
         """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W).
@@ -124,8 +145,8 @@ class Plate:
         self._held = cv2.dilate(explained, np.ones((3, 3), np.uint8))
 
     def fill_unknown(self, color: NDArray[np.float32]) -> None:
-        """Use the static field's rendering, float32 (H, W, 3) in [0, 1] at the exposure of the first frame,
-        where there is no plate."""
+        """Use the static field's rendering, float32 (H, W, 3) in [0, 1] at the common exposure, where there
+        is no plate."""
         self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)
         self._has_static = True
         self._blur()
@@ -192,7 +213,7 @@ class FinePlate:
     outside their foregrounds.
 
     view: a frame at full resolution.
-    color: float32 (H, W, 3), at the exposure of the camera's first frame, steps of 255.
+    color: float32 (H, W, 3), at the exposure that all cameras have in common, steps of 255.
     frames: uint8 (H, W), in how many each pixel was seen, up to FINE_MEMORY.
     count: number of frames taken in.
     """
@@ -212,7 +233,7 @@ class FinePlate:
 
         image: uint8 (H, W, 3).
         away: bool, at the lower resolution, where it does not show the plate.
-        gain: float32 (3,), its exposure over that of the first frame.
+        gain: float32 (3,), its exposure over the common one.
         """
         grown = cv2.dilate(away.astype(np.uint8), np.ones((3, 3), np.uint8))
         use = cv2.resize(grown, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0

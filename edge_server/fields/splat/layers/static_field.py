@@ -31,7 +31,7 @@ CHANGED_PIXELS = 40  # a camera, above which the field is trained again
 class PlateImage(NamedTuple):
     """A plate as it was at one moment.
 
-    view: the camera's first frame. color: float32 (H, W, 3), at the exposure of that frame, steps of 255.
+    view: the camera's first frame. color: float32 (H, W, 3), at the cameras' common exposure, steps of 255.
     known: bool (H, W), where there is a plate.
     """
 

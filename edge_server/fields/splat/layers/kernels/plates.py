@@ -23,7 +23,7 @@ SLOWEST_RATE = 1.0 / 24.0  # of a mode's running mean
 RUN = 12  # arrivals in a row that join another mode: it becomes the plate
 KNOWN_VOTES, KNOWN_SHARE, EARLY_SHARE = 8.0, 0.3, 0.9  # see ``_is_known``
 LEAST_WEIGHT = 0.05  # a mode of less is forgotten
-GAIN_STEP = 0.03  # smaller changes of exposure are left to the running mean
+GAIN_STEP = 0.01  # smaller changes of exposure are left to the running mean
 DARK, BRIGHT = 20.0, 235.0  # plates between these tell the exposure
 
 # Bits that ``compare_with_plate`` writes.

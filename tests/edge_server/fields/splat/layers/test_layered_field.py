@@ -72,6 +72,36 @@ def _score(shown: Any, instant_s: float, moves: bool = True) -> float:
     return psnr(shown.render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
 
 
+@pytest.mark.parametrize("level", [0.7, 1.0])
+def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyPatch, level: float) -> None:
+    """At level 1, three of the cameras see nearly all in white: of them nothing is believed."""
+    stops = np.random.default_rng(3).uniform(-0.45, 0.45, len(CAMERAS))
+    gains = 2.0 ** (stops - stops.mean())
+
+    def begun(exposures: np.ndarray) -> LayeredField:
+        field = LayeredField(SMALL)
+        for frame in range(22):
+            views = [_frame(k, frame, False) for k in range(len(CAMERAS))]
+            images = [np.clip(v.image * g, 0, 255).astype(np.uint8) for v, g in zip(views, exposures)]
+            field.fit([replace(v, image=i) for v, i in zip(views, images)], Budget(steps=30))
+        assert field.shown
+        return field
+
+    def score(field: LayeredField) -> float:
+        truth = level * picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(0.0, False)) / 255.0
+        return psnr(field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color, truth)
+
+    differing = begun(level * gains)
+    found = np.array([camera.plate.gain.mean() for camera in differing.cameras.values()])
+    if level < 1.0:
+        assert np.log(found / gains).std() < 0.3 * np.log(gains).std()
+        alike = begun(np.full(len(CAMERAS), level))
+        assert all((camera.plate.gain == 1.0).all() for camera in alike.cameras.values())
+        assert score(differing) > score(alike) - 2.0
+    monkeypatch.setattr(layered_field, "EXPOSURE_ROUNDS", 0)
+    assert score(differing) > score(begun(level * gains)) + (1.5 if level < 1.0 else -0.5)
+
+
 def test_the_option_makes_it() -> None:
     assert type(make_field("splat", {"layers": True, "threads": 1})) is LayeredField
     assert type(make_field("splat", {"threads": 1})) is SplatField

@@ -59,7 +59,7 @@ def test_a_change_of_exposure_is_no_foreground() -> None:
     darker = (WALL * 0.8 + 0.5).astype(np.uint8)
     assert not plate.take(darker).any()
     np.testing.assert_allclose(plate.gain, 0.8, atol=0.02)
-    np.testing.assert_allclose(plate.at_first_exposure(), WALL, atol=3.0)
+    np.testing.assert_allclose(plate.at_common_exposure(), WALL, atol=3.0)
 
 
 def test_what_is_unknown_is_compared_with_the_static_field() -> None:
