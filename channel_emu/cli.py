@@ -112,7 +112,7 @@ def _serve(
 ) -> tuple[int, Report | None]:
     """Run a proxy until told to stop: the exit status, and the report if nothing broke."""
     from channel_emu.live.live_link import HardLimit
-    from channel_emu.live.priority import SWITCH_INTERVAL_S
+    from channel_emu.live.priority import SWITCH_INTERVAL_S, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
     from channel_emu.model import trace
 
@@ -123,6 +123,7 @@ def _serve(
         replay=trace.read(args.replay) if args.replay else None, **options,
     )  # fmt: skip
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    return_freed_memory()
 
     async def live() -> Report:
         stop = asyncio.Event()

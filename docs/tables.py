@@ -319,7 +319,26 @@ def soak(name: str) -> str:
     )
 
 
+def attacks() -> str:
+    """Refusals, neighbours and memory of a run of tests/chaos/attacks.py."""
+    run = measured("docs/results/attacks.json")
+
+    def ms(found: dict[str, float] | None) -> str:
+        return "" if found is None else " / ".join(f"{found[q]:.1f}" for q in ("p50", "p99"))
+
+    rows = [
+        [r["sent"], r["at"], r["answer"], ms(r["refused_ms"]),
+         ms(r["neighbours"]["emulator" if r["at"] == "emulator" else "edge"]["ms"]),
+         " / ".join(map(str, r["memory_mb"])), f"`{r['test']}`" if r["test"] else ""]
+        for r in run["attacks"]
+    ]  # fmt: skip
+    head = ["attack", "on", "answers", "after, ms: p50 / p99", "neighbour's answers, ms: p50 / p99",
+            "MB before / most / after", "test"]  # fmt: skip
+    return f"Load average {run['load_average']:.0f}, {run['cores']} cores.\n\n" + table(head, rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "attacks": attacks,
     "soak": lambda: soak("soak"),
     "kills": lambda: soak("kills"),
     "peers": peers,

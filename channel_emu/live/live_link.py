@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import grpc
@@ -179,12 +179,12 @@ class LiveLink:
                 event.transit.item.duplicated = True
         for event in events:
             message: Message = event.transit.item
-            # An offer's own events come before ``offer`` knows the transit.
-            message.transit = event.transit
             kind = event.kind
             if kind is EventKind.STARTED:
                 self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
+            # Without a circle of references, which would keep the bytes until the next garbage collection.
+            message.transit = replace(event.transit, item=None)
             if kind is not EventKind.DUPLICATED:
                 self._room.held_bytes -= len(message.raw)
             if kind is EventKind.DELIVERED and event.transit.flips:

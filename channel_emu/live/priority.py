@@ -18,6 +18,7 @@ SWITCH_INTERVAL_S = 0.0005
 (``sys.setswitchinterval``)."""
 # A thread that asks for short slices is scheduled sooner when it wakes (Linux 6.12 and later).
 _SLICE_NS = 100_000
+_M_MMAP_THRESHOLD = -3
 
 
 class _Attributes(ctypes.Structure):
@@ -49,6 +50,13 @@ def raise_priority() -> str:
         os.nice(-5)
         reached = "nice"
     return "short-slice" if _shorten_slice() else reached
+
+
+def return_freed_memory() -> None:
+    """Have the C library give blocks of 1 MB and more back to the system once they are free. Otherwise it
+    keeps those below the largest that was ever freed: after a flood of 8 MB messages, hundreds of MB."""
+    with contextlib.suppress(OSError, AttributeError):  # not glibc
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1 << 20)
 
 
 def _shorten_slice() -> bool:

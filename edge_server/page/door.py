@@ -109,6 +109,7 @@ class Door:
         self._access = access
         self._tls = tls
         self._secret = secrets.token_bytes(32)
+        self._handshakes: dict[asyncio.Task[Any], None] = {}
         self._connections: dict[VisitorConnection, None] = {}
         self.used = False
 
@@ -126,7 +127,7 @@ class Door:
                 "close_timeout": 2.0,
                 "ssl": self._tls,
                 "process_request": lambda connection, request: self._answer(connection, request, process),
-                "create_connection": lambda *words, **more: VisitorConnection(self, *words, **more),
+                "create_connection": self._accepted,
             }
             if self._tls is not None:
                 options["ssl_handshake_timeout"] = TLS_HANDSHAKE_TIMEOUT_S
@@ -137,6 +138,18 @@ class Door:
             yield
         finally:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+    def _accepted(self, *words: Any, **more: Any) -> VisitorConnection:
+        """Called in the task that accepts a connection, which over TLS lasts until the end of the handshake.
+        Of too many of them the oldest ends."""
+        if self._tls is not None and (task := asyncio.current_task()) is not None:
+            self._handshakes[task] = None
+            task.add_done_callback(lambda done: self._handshakes.pop(done, None))
+            if len(self._handshakes) > MAX_PAGE_CONNECTIONS:
+                oldest = next(iter(self._handshakes))
+                del self._handshakes[oldest]
+                oldest.cancel()
+        return VisitorConnection(self, *words, **more)
 
     def opened(self, connection: VisitorConnection) -> None:
         """Of too many connections the oldest ends that is no visitor's."""

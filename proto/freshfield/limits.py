@@ -95,10 +95,10 @@ MAX_VIEW_SIDE_PX = 16384
 
 MAX_PAGE_CONNECTIONS = 128
 """To the page, visitors and requests, at once: a browser opens six. A new one ends the oldest request.
-Over TLS a connection counts once its handshake is done."""
+Over TLS as many more may be in their handshake, of which a new one ends the oldest."""
 
 TLS_HANDSHAKE_TIMEOUT_S = 5.0
-"""Of a connection to the page: without a handshake it ends."""
+"""Of a connection to the page or to gRPC: without a handshake it ends."""
 
 MAX_QUEUED_BYTES = 256 * 2**20
 """Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""

@@ -52,7 +52,9 @@ class ServedCall:
         self.open = False
         if self._status is not None and kind is asyncio.CancelledError:
             self.task.uncancel()
-            await self._context.abort(*self._status)
+            # In the midst of an answer that the client does not take, gRPC has no way to say why it ends.
+            with contextlib.suppress(grpc.aio.InternalError):
+                await self._context.abort(*self._status)
 
 
 class OpenStreams:

@@ -20,7 +20,12 @@ import grpc.aio
 import numpy as np
 
 from freshfield.access import Access, is_loopback
-from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES, MAX_PEER_TEXT_CHARS
+from freshfield.limits import (
+    MAX_CONCURRENT_STREAMS,
+    MAX_MESSAGE_BYTES,
+    MAX_PEER_TEXT_CHARS,
+    TLS_HANDSHAKE_TIMEOUT_S,
+)
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +56,7 @@ SERVER_OPTIONS = [
     ("grpc.http2.lookahead_bytes", 1 << 20),
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
     ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
+    ("grpc.server_handshake_timeout_ms", round(TLS_HANDSHAKE_TIMEOUT_S * 1e3)),
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),
 ]

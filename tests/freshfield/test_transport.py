@@ -15,6 +15,7 @@ import grpc.aio
 import numpy as np
 import pytest
 
+from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import (
     Transport,
@@ -214,6 +215,19 @@ def test_tls_and_mutual_tls(pem):
         assert refusal(scene(server_side, client)) == grpc.StatusCode.UNAVAILABLE
     other = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
     assert refusal(scene(mutual, other)) == grpc.StatusCode.UNAUTHENTICATED  # its name is no caller's
+
+
+def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
+    sooner = [(name, 500 if "handshake" in name else value) for name, value in transport.SERVER_OPTIONS]
+    monkeypatch.setattr(transport, "SERVER_OPTIONS", sooner)
+
+    async def scene():
+        async with serving(Transport(cert=pem / "server.pem", key=pem / "server.key")) as port:
+            reader, writer = await asyncio.open_connection("localhost", port)
+            assert await asyncio.wait_for(reader.read(1), 10.0) == b""
+            writer.close()
+
+    asyncio.run(scene())
 
 
 LISTENING = {

@@ -41,7 +41,8 @@ from freshfield.machine_load import usable_cores
 
 DESCRIPTION = """\
 Run small deployments in virtual time, each with faults that its seed draws: processes that crash and stall,
-full disks, cameras that go away, clocks that step, hostile messages, policies switched, checkpoints resumed.
+full and slow disks, cameras that go away, clocks that step, hostile messages, policies switched, checkpoints
+resumed.
 
   edge-server chaos --seeds 0..99 --jobs 2
   edge-server chaos --seeds 0..9999 --out runs/chaos.jsonl     # resumes where it was stopped

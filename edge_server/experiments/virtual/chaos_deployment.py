@@ -39,6 +39,8 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, seed_sequence
 from freshfield.v1 import frames_pb2 as pb
 
+# A slow disk takes as long for a checkpoint as for so many lines.
+_CHECKPOINT_LINES = 20
 # A node asks for the edge's time this often; until then it goes by the clock before a step.
 _CLOCK_PERIOD_NS = 10**9
 
@@ -68,6 +70,8 @@ class ChaosDeployment(VirtualDeployment):
         self._out = out
         self._down: set[str] = set()
         self._stalled: set[str] = set()
+        self._stands_until_ns = dict.fromkeys(ROLES, 0)
+        self._line_ns = dict.fromkeys(ROLES, 0)  # what a process waits for its disk
         self._away: Counter[str] = Counter()
         self._steps: dict[str, list[tuple[int, int]]] = {camera.name: [] for camera in cameras}
         self._synced_ns = 0  # when the node last asked for the edge's time for other reasons than its period
@@ -108,6 +112,7 @@ class ChaosDeployment(VirtualDeployment):
             return
         self._down.add(role)
         self._stalled.discard(role)
+        self._stands_until_ns[role] = 0
         ledger = self._ledgers.pop(role)
         ledger._lines.close()  # without the line ``closed``
         self.lines_lost += ledger.lines_lost
@@ -149,20 +154,23 @@ class ChaosDeployment(VirtualDeployment):
 
     def _do_stall(self, fault: Fault) -> None:
         """SIGSTOP of a process, and SIGCONT ``for_ms`` later."""
-        role = fault.target
-        if role in self._down | self._stalled:
-            return
+        if fault.target not in self._down:
+            self._stand(fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6))
+
+    def _stand(self, role: str, until_ns: int) -> None:
+        """A process does nothing until then."""
         self._stalled.add(role)
-        self._after(fault, lambda: self._go_on(role))
+        self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
+        self.at(until_ns, lambda: self._go_on(role))
 
     def _go_on(self, role: str) -> None:
-        if role not in self._stalled:
-            return  # killed meanwhile
+        if role not in self._stalled or self.clock.now_ns() < self._stands_until_ns[role]:
+            return  # killed meanwhile, or it stands for longer
         self._stalled.discard(role)
         if role == "emulator":
             self._advance_links(self.clock.now_ns())
         self._send_waiting()
-        while role == "edge" and self._upstream:
+        while role == "edge" and self._upstream and role not in self._stalled:
             self._arrive(self._upstream.popleft())
 
     def _do_full_disk(self, fault: Fault) -> None:
@@ -181,6 +189,16 @@ class ChaosDeployment(VirtualDeployment):
 
         self._after(fault, space_again)
 
+    def _do_slow_disk(self, fault: Fault) -> None:
+        """A process stands for ``value`` ms after each line of its ledger, and a checkpoint takes long."""
+        line_ns = round(fault.value * 1e6)
+        self._line_ns[fault.target] += line_ns
+
+        def fast_again() -> None:
+            self._line_ns[fault.target] -= line_ns
+
+        self._after(fault, fast_again)
+
     def _do_away(self, fault: Fault) -> None:
         """A camera is unplugged for a while."""
         self._away[fault.target] += 1
@@ -195,8 +213,18 @@ class ChaosDeployment(VirtualDeployment):
         self.next_policy = make_policy(name, value, self.scenario.rng("policy", name))
 
     def _do_checkpoint(self, fault: Fault) -> None:
-        if "edge" not in self._down | self._stalled:
-            checkpoint.save(self._out / "field.npz", self.updates.field.state(), durable=False)
+        line_ns, life = self._line_ns["edge"], self.restarts["edge"]
+        if "edge" in self._down or ("edge" in self._stalled and not line_ns):
+            return
+        # After the line that it may be writing.
+        over_ns = max(self.clock.now_ns(), self._stands_until_ns["edge"]) + _CHECKPOINT_LINES * line_ns
+
+        def rename() -> None:
+            if "edge" not in self._down and self.restarts["edge"] == life:  # not killed while it wrote
+                checkpoint.save(self._out / "field.npz", self.updates.field.state(), durable=False)
+
+        self.at(over_ns, rename)
+        self._stand("edge", over_ns)
 
     def _do_hostile(self, fault: Fault) -> None:
         """Messages to the edge from somebody who is no node of this deployment."""
@@ -358,7 +386,10 @@ class ChaosDeployment(VirtualDeployment):
     def _write(
         self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = ""
     ) -> None:
-        self._ledgers[role].write(self.clock.now_ns(), camera, session, sequence, event, detail)
+        now_ns = self.clock.now_ns()
+        self._ledgers[role].write(now_ns, camera, session, sequence, event, detail)
+        if self._line_ns[role]:
+            self._stand(role, max(now_ns, self._stands_until_ns[role]) + self._line_ns[role])
 
     def _after(self, fault: Fault, action: Callable[[], None]) -> None:
         self.at(self.clock.now_ns() + round(fault.for_ms * 1e6), action)

@@ -37,10 +37,10 @@ _SMALL: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """kind: crash, stall and full_disk of the process ``target``, ``value``: whether an edge that crashed
-    resumes its last checkpoint; away and clock_step (by ``value`` ms) of the camera ``target``; hostile
-    (``value`` messages), policy (``target``) and checkpoint at the edge. for_ms: until it is over, where it
-    lasts."""
+    """kind: crash, stall, full_disk and slow_disk of the process ``target``, ``value``: whether an edge that
+    crashed resumes its last checkpoint, milliseconds that a line takes on a slow disk; away and clock_step
+    (by ``value`` ms) of the camera ``target``; hostile (``value`` messages), policy (``target``) and
+    checkpoint at the edge. for_ms: until it is over, where it lasts."""
 
     number: int
     kind: str
@@ -93,11 +93,14 @@ def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
 
 def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
     kind = str(
-        rng.choice(["crash", "stall", "full_disk", "away", "clock_step", "hostile", "policy", "checkpoint"])
-    )
+        rng.choice(["crash", "stall", "full_disk", "slow_disk", "away", "clock_step", "hostile", "policy",
+                    "checkpoint"])
+    )  # fmt: skip
     for_ms, value, target = float(rng.uniform(20.0, 1e3 * FAULTS_OVER_S - _FAULTS_BEGIN_S[1] * 1e3)), 0.0, ""
-    if kind in ("crash", "stall", "full_disk"):
+    if kind in ("crash", "stall", "full_disk", "slow_disk"):
         target, value = str(rng.choice(ROLES)), float(kind == "crash" and rng.random() < 0.7)
+        if kind == "slow_disk":
+            value = round(float(rng.uniform(1.0, 20.0)), 3)
     elif kind in ("away", "clock_step"):
         target = str(rng.choice(cameras))
         if kind == "clock_step":

@@ -32,6 +32,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     """A thread for each connection, of which there are at most MAX_SCRAPES: a new one ends the oldest."""
 
     daemon_threads = True
+    request_queue_size = 128  # with five, whoever comes beside a flood waits for seconds to be accepted
 
     def __init__(self, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET

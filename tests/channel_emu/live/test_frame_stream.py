@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 from collections import Counter
 from pathlib import Path
@@ -285,6 +286,23 @@ def test_what_is_inside_the_links_is_bounded_in_bytes(
 
     run(live())
     frame_account(tmp_path)
+
+
+def test_a_message_that_left_keeps_no_memory_until_a_garbage_collection(tmp_path: Path) -> None:
+    async def live() -> None:
+        _, (flow,) = make(tmp_path, "127.0.0.1:1", {**QUICK, "discipline": "fcfs"})
+        for sequence in range(9):
+            offer(flow, sequence)
+        assert any(isinstance(each, Message) for each in gc.get_objects())
+        flow.link.advance(10**12)
+        assert not any(isinstance(each, Message) for each in gc.get_objects())
+
+    gc.collect()
+    gc.disable()
+    try:
+        run(live())
+    finally:
+        gc.enable()
 
 
 def test_the_credits_at_the_edge_hold_for_bytes_too(tmp_path: Path) -> None:

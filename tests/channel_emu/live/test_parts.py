@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import platform
 import re
 import subprocess
 import sys
@@ -109,6 +110,27 @@ def test_priority_says_what_it_reached_and_never_fails() -> None:
     code = "from channel_emu.live.priority import raise_priority; print(raise_priority())"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() in ("realtime", "short-slice", "nice", "normal")
+
+
+_MEMORY_AFTER_A_FLOOD = """
+from channel_emu.live.priority import return_freed_memory
+def rss_mb(): return int(open("/proc/self/status").read().split("VmRSS:")[1].split()[0]) / 1e3
+return_freed_memory()
+large, between, before_mb = [b"x" * (8 << 20)], [], rss_mb()
+large.clear()
+for _ in range(20):
+    large.append(b"x" * (4 << 20))
+    between.append(b"x" * 100_000)
+large.clear()
+print(rss_mb() - before_mb)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="for glibc alone")
+def test_freed_memory_is_returned() -> None:
+    code = _MEMORY_AFTER_A_FLOOD
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(found.stdout) < 10.0  # 80 otherwise
 
 
 @pytest.mark.parametrize("package", ["model", "live", "virtual", "estimate"])

@@ -9,6 +9,7 @@ import socket
 import ssl
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,11 +17,12 @@ import pytest
 import websocket
 
 from edge_server.live.keys import make_keys
+from edge_server.live.output import guarded_http
 from edge_server.live.output.prometheus import serve_metrics
 from edge_server.live.state import EdgeState
 from edge_server.page import Page, door, start_page
 from edge_server.page.door import Door
-from freshfield.limits import MAX_VISITOR_MESSAGE_BYTES
+from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.test_page import bare_state
 from tests.edge_server.page.visitor import Visitor
@@ -308,15 +310,35 @@ def test_half_requests_end_for_new_ones(monkeypatch) -> None:
         visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
 
 
+def tls_of(folder: Path) -> Transport:
+    make_keys(folder / "keys", [], [], [])
+    pem = {part: folder / "keys" / "edge" / f"{part}.pem" for part in ("cert", "key")}
+    return Transport(**pem, tokens=TOKENS)
+
+
 def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(door, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
-    make_keys(tmp_path / "keys", [], [], [])
-    files = {part: tmp_path / "keys" / "edge" / f"{part}.pem" for part in ("cert", "key")}
     with (
-        page_of(bare_state(), Transport(**files, tokens=TOKENS), "0.0.0.0") as page,
+        page_of(bare_state(), tls_of(tmp_path), "0.0.0.0") as page,
         socket.create_connection(("127.0.0.1", page.port), timeout=4.0) as silent,
     ):
         assert silent.recv(1) == b""
+
+
+@pytest.mark.parametrize("what", ["page", "metrics"])
+def test_unfinished_handshakes_are_few_and_shut_nobody_out(tmp_path, monkeypatch, what: str) -> None:
+    monkeypatch.setattr(door, "TLS_HANDSHAKE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(guarded_http._Handler, "timeout", 60.0)
+    monkeypatch.setattr(door, "MAX_PAGE_CONNECTIONS", MAX_SCRAPES)
+    transport, port = tls_of(tmp_path), free_port()
+    with page_of(bare_state(), transport, "0.0.0.0") as page, contextlib.ExitStack() as open_:
+        serve_metrics(bare_state(), INGEST, "0.0.0.0", port, transport)
+        at = ("127.0.0.1", page.port if what == "page" else port)
+        silent = [open_.enter_context(socket.create_connection(at, timeout=10.0)) for _ in range(30)]
+        for oldest in silent[:-MAX_SCRAPES]:
+            assert oldest.recv(1) == b""
+        with socket.create_connection(at, timeout=10.0) as new:
+            ssl._create_unverified_context().wrap_socket(new).close()
 
 
 def test_who_does_not_read_is_sent_away_and_what_was_held_with_them(monkeypatch) -> None:

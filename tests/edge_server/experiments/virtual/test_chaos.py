@@ -85,6 +85,25 @@ def test_a_full_disk_keeps_the_account_from_closing(tmp_path: Path) -> None:
     assert f"{account.lines_lost} lines of the ledgers were lost" in account.doubts
 
 
+@pytest.mark.parametrize("role", ["node", "emulator", "edge"])
+def test_a_process_waits_for_its_slow_disk_and_loses_no_frame_unsaid(tmp_path: Path, role: str) -> None:
+    delivered = []
+    for line_ms in (0.0, 100.0):
+        (folder := tmp_path / str(line_ms)).mkdir()
+        deployment = run(folder, (Fault(0, "slow_disk", 500.0, 1000.0, role, line_ms),))
+        assert list(chaos._accounting(deployment, frame_accounting.account_frames(folder))) == []
+        delivered.append(deployment.really["delivered"])
+    assert delivered[1] < 0.9 * delivered[0]
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_checkpoint_that_a_kill_cuts_short_is_not_there(tmp_path: Path, killed: bool) -> None:
+    slow = Fault(0, "slow_disk", 400.0, 1000.0, "edge", 10.0)
+    faults = (slow, Fault(1, "checkpoint", 500.0), *((replace(CRASHES[2], at_ms=600.0),) if killed else ()))
+    run(tmp_path, faults)
+    assert (tmp_path / "field.npz").exists() is not killed
+
+
 def lose_a_line(patch: pytest.MonkeyPatch) -> None:
     written = []
     whole = ChaosDeployment._write
@@ -153,9 +172,9 @@ def break_a_part(patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "broken, seed, says, kind",
     [
-        (lose_a_line, 6, "off by", None),
+        (lose_a_line, 10, "off by", None),
         (forget_kills, 20, "in no ledger", "crash emulator"),
-        (never_restart_the_edge, 2, "never up to date again", "crash edge"),
+        (never_restart_the_edge, 17, "never up to date again", "crash edge"),
         (learn_what_is_no_number, 2, "the field's params is not finite", None),
         (check_no_checksum, 6, "with a wrong checksum were taken in", "hostile"),
         (draw_without_seed, 2, "a second run has another digest", None),
