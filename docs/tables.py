@@ -1,6 +1,6 @@
 """Writes the tables of docs/ that come from measured files.
 
-    python docs/tables.py            after `make bench` or `edge-server frontier --shipped`
+    python docs/tables.py            after `make bench`, `make figures` or `edge-server frontier --shipped`
 
 A table stands between the lines ``<!-- table NAME -->`` and ``<!-- end -->``; what stands between them is
 replaced. tests/deploy/test_docs.py fails while a page says something else than the files.
@@ -58,6 +58,34 @@ UPDATE_OPTIONS = (
     ("movement followed", "room, moving"),
     ("wrong views refused", "room, moving"),
     ("wrong views refused", "kitchen, moving"),
+)
+
+# The rows of docs/studies.md: study, scene and setting of the verdict, and a word of its claim.
+VERDICTS = (
+    ("mat", "room, drop-new, PSNR (dB)", ""),
+    ("mat", "room, drop-new, PSNR, moving pixels (dB)", ""),
+    ("mat", "room, parallel, PSNR, moving pixels (dB)", ""),
+    ("mat", "kitchen, drop-new, PSNR, moving pixels (dB)", ""),
+    ("mat-delay", "room, PSNR (dB)", ""),
+    ("mat-delay", "room, PSNR, moving pixels (dB)", ""),
+    ("lambda", "room, threshold, whole image, ages of all cameras (5.8)", ""),
+    ("lambda", "room, threshold, whole image, ages of used views (6.35)", ""),
+    ("omega", "room, high traffic, threshold, PSNR (dB)", ""),
+    ("omega", "room, high traffic, threshold, PSNR, moving pixels (dB)", ""),
+    ("omega", "room, low traffic, threshold, PSNR, moving pixels (dB)", ""),
+    ("omega", "room, high traffic, wait, PSNR (dB)", "longer"),
+    ("omega", "room, high traffic, wait, PSNR (dB)", "threshold"),
+    ("omega", "room, high traffic, wait-flush, PSNR (dB)", "threshold"),
+    ("omega", "room, low traffic, wait, PSNR (dB)", "threshold"),
+    ("omega", "room, high traffic, wait, F_w (6.37)", "inside"),
+    ("images", "room, LPIPS", ""),
+    ("images", "room, mean age of used views (ms)", ""),
+    ("images", "tower, LPIPS", ""),
+    ("images", "tower, mean age of used views (ms)", ""),
+    ("representations", "room, threshold, PSNR (dB)", ""),
+    ("representations", "room, threshold, PSNR, moving pixels (dB)", ""),
+    ("metrics", "LPIPS", ""),
+    ("metrics", "SSIM", "lowest"),
 )
 
 
@@ -252,6 +280,60 @@ def card() -> str:
     )
 
 
+def studies() -> list[Any]:
+    """The files of the thesis's figures, in the order of their numbers."""
+    found = [json.loads(path.read_text()) for path in (DOCS / "results" / "thesis").glob("*.json")]
+    return sorted(found, key=lambda s: [int(n) for n in re.findall(r"\d+", _figure(s))] or [99])
+
+
+def _figure(study: Any) -> str:
+    """The figures, tables or equations that a study makes anew; they end its title."""
+    number = re.search(r"\(([^()]*\d)\)$", study["title"])
+    return number[1] if number else ""
+
+
+def verdicts() -> str:
+    """The verdicts of ``VERDICTS``, as far as they were measured."""
+    rows, by_name = [], {study["study"]: study for study in studies()}
+    for name, about, word in VERDICTS:
+        for v in by_name[name]["verdicts"] if name in by_name else ():
+            if v["about"] == about and word in v["claim"]:
+                figure = f"{re.sub('^figures? ', '', _figure(by_name[name]))} (`{name}`)"
+                rows.append([figure, v["claim"], about, v["found"], v["verdict"]])
+    return table(["figure", "claim", "where", "found here", "verdict"], rows)
+
+
+def figures() -> str:
+    """A paragraph for each study: how it was run, and each claim with its verdicts and intervals."""
+    names = [study["study"] for study in studies()]
+    parts = []
+    for study in studies():
+        name = study["study"]
+        seeds = f", {study['seeds']} seeds a point" if study["seeds"] else ""
+        field = ", ".join(f"`{f}`" for f in study["field"])
+        claims: dict[str, dict[str, list[str]]] = {}
+        for v in study["verdicts"]:
+            known = v["interval"] and v["interval"][0] is not None
+            span = f" {_interval(v['interval'], 2 if abs(v['interval'][0]) >= 0.1 else 4)}" if known else ""
+            claims.setdefault(v["claim"], {}).setdefault(v["verdict"], []).append(v["about"] + span)
+        lines = [f"- {claim} " + ". ".join(f"**{verdict[0].upper()}{verdict[1:]}**: {'; '.join(where)}"
+                 for verdict, where in found.items()) + "." for claim, found in claims.items()]  # fmt: skip
+        longer = tuple(n for n in names if n != name and n.startswith(name))
+        drawn = [p.name for p in sorted((DOCS / "results" / "thesis").glob(f"{name}*.png"))
+                 if not (longer and p.name.startswith(longer))]  # fmt: skip
+        more = "".join(f", [{p.removesuffix('.png')}]({p})" for p in drawn[1:])
+        parts += [
+            f"## {study['title']}\n",
+            f"`{study['command']}`: {'quick pass' if study['quick'] else 'full run'}{seeds}"
+            f"{', ' if field else ''}{field}, commit {study['commit']}. "
+            f"[Rows]({name}.csv), [verdicts and means]({name}.json){more}.\n",
+            *lines,
+            *(f"\n![{study['title']}]({p})" for p in drawn[:1]),
+            "",
+        ]
+    return "\n".join(parts).rstrip()
+
+
 def _interval(values: Sequence[float | None], digits: int = 2) -> str:
     mean, low, high = ("-" if v is None else f"{v:.{digits}f}" for v in values)
     return f"{mean} [{low}, {high}]"
@@ -337,6 +419,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "drift": lambda: following("drift"),
     "limits": limits,
     "card": card,
+    "figures": figures,
+    "verdicts": verdicts,
 }
 
 

@@ -87,7 +87,7 @@ class Omega:
         )
         claim = f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1)."
         about = f"{scene}, {state} traffic, threshold, {name}"
-        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])))]
+        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])), best.over_last)]
 
     def _wait(self, table: Table, scene: str, state: str, metric: str, policy: str) -> list[Verdict]:
         labels = {"scene": scene, "state": state}
@@ -119,8 +119,8 @@ class Omega:
         )
         ahead = "better than threshold, each at its own best omega (6.5.2)."
         return [
-            Verdict(about, claim, text, by_bool(answer)),
-            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better)),
+            Verdict(about, claim, text, by_bool(answer), loss),
+            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better), over),
         ]
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:
