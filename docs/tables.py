@@ -316,11 +316,14 @@ def figures() -> str:
             known = v["interval"] and v["interval"][0] is not None
             span = f" {_interval(v['interval'], 2 if abs(v['interval'][0]) >= 0.1 else 4)}" if known else ""
             claims.setdefault(v["claim"], {}).setdefault(v["verdict"], []).append(v["about"] + span)
-        lines = [f"- {claim} " + ". ".join(f"**{verdict[0].upper()}{verdict[1:]}**: {'; '.join(where)}"
-                 for verdict, where in found.items()) + "." for claim, found in claims.items()]  # fmt: skip
+        lines = []
+        for claim, found in claims.items():
+            answers = (f"**{verdict}**: {'; '.join(where)}" for verdict, where in found.items())
+            lines.append(f"- {claim[0].upper()}{claim[1:]} {'. '.join(answers)}.")
         longer = tuple(n for n in names if n != name and n.startswith(name))
-        drawn = [p.name for p in sorted((DOCS / "results" / "thesis").glob(f"{name}*.png"))
+        drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
                  if not (longer and p.name.startswith(longer))]  # fmt: skip
+        drawn.sort(key=lambda p: ("room" not in p, p))  # the usual scene first
         more = "".join(f", [{p.removesuffix('.png')}]({p})" for p in drawn[1:])
         parts += [
             f"## {study['title']}\n",
