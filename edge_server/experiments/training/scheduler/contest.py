@@ -24,7 +24,7 @@ from edge_server.scheduler.learned.actor import Actor
 LEARNT = "learnt"
 REFERENCE = "all"
 CONTESTANTS = (REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6",
-               "age-driven")  # fmt: skip
+               "aoii:6", "covariance:6", "age-driven")  # fmt: skip
 # What is shown is scored for so long, after the lead of an episode.
 SPAN_MS = 8000.0
 
