@@ -21,7 +21,7 @@ from edge_server.experiments.common.arguments import (
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.contest import LEARNT, contest
+from edge_server.experiments.training.scheduler.contest import LEAD_MS, LEARNT, contest
 from edge_server.experiments.training.scheduler.evaluation import (
     Evaluation,
     baseline_policies,
@@ -81,8 +81,6 @@ apart, OUT/contest.csv and summary.json how it does on seeds it was never traine
 are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
 Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
 """
-# Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
-_HOLD_LEAD_MS = 5000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -197,7 +195,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     return Setting(
         given, report=report, motions=not args.same_motion,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
-        scratch=args.scratch, decisions=args.decisions, lead_ms=_HOLD_LEAD_MS if args.hold else 1000.0,
+        scratch=args.scratch, decisions=args.decisions, lead_ms=LEAD_MS if args.hold else 1000.0,
         span_ms=args.hold * args.decisions or 6000.0, compute=read_config(given).compute,
         parts=_parts(args.parts),
     )  # fmt: skip
