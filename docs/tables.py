@@ -294,12 +294,17 @@ def _figure(study: Any) -> str:
 
 def verdicts() -> str:
     """The verdicts of ``VERDICTS``, as far as they were measured."""
-    rows, by_name = [], {study["study"]: study for study in studies()}
+    rows: list[list[str]] = []
+    by_name, said = {study["study"]: study for study in studies()}, ("", "")
     for name, about, word in VERDICTS:
         for v in by_name[name]["verdicts"] if name in by_name else ():
             if v["about"] == about and word in v["claim"]:
                 figure = f"{re.sub('^figures? ', '', _figure(by_name[name]))} (`{name}`)"
-                rows.append([figure, v["claim"], about, v["found"], v["verdict"]])
+                rows.append(
+                    [figure if figure != said[0] else "", v["claim"] if v["claim"] != said[1] else ""]
+                )
+                rows[-1] += [about, v["found"], v["verdict"]]
+                said = figure, v["claim"]
     return table(["figure", "claim", "where", "found here", "verdict"], rows)
 
 

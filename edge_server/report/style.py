@@ -50,14 +50,13 @@ _RC: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "figure.dpi": 110,
-    "savefig.dpi": 110,
     "figure.constrained_layout.use": True,
 }
 
 
 @contextmanager
 def figure(
-    path: Path, rows: int = 1, columns: int = 1, height_inch: float = 2.6, **kwargs
+    path: Path, rows: int = 1, columns: int = 1, height_inch: float = 2.6, dpi: int = 110, **kwargs
 ) -> Iterator[tuple]:
     """``with figure(path, rows) as (fig, axes):`` draws in the common style and writes ``path`` (PNG).
 
@@ -70,7 +69,7 @@ def figure(
         try:
             yield fig, axes
             drawn = io.BytesIO()
-            fig.savefig(drawn)
+            fig.savefig(drawn, dpi=dpi)
             few = Image.open(drawn).convert("RGB").quantize(_COLORS, dither=Image.Dither.NONE)
             # Without a creation date, so that the same run draws the same bytes.
             few.save(path, optimize=True)

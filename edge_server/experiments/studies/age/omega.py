@@ -126,12 +126,12 @@ class Omega:
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
         common: dict[str, Any] = {"channel": {"preset": "ch6-high"}, "lpips": False, "every_ms": 2400.0}
-        rows = [
-            (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
-            for s in table.distinct("scene")
-            for p in ("threshold", "wait")
-        ]
-        draw_trials(request.out / "omega-pictures.png", request, rows)
+        for s in table.distinct("scene"):
+            rows = [
+                (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
+                for p in ("threshold", "wait")
+            ]
+            draw_trials(request.out / f"omega-pictures-{s}.png", request, rows)
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:
