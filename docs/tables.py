@@ -280,6 +280,24 @@ def card() -> str:
     )
 
 
+def compared() -> str:
+    """What policies without learning show in the scenario card, and minus the first, over seeds."""
+    found = measured("docs/results/learning/policies.json")
+    first = next(iter(found["policies"]))
+    columns = ("psnr_db", f"psnr_db_over_{first}", "psnr_moving_db", f"psnr_moving_db_over_{first}")
+    rows = [
+        [f"`{name}`", *("" if name == first and "over" in c else _interval(row[c]) for c in columns),
+         f"{row['views'][0]:.1f}", f"{row['aaoi_ms'][0]:.0f}"]
+        for name, row in found["policies"].items()
+    ]  # fmt: skip
+    less = f"minus `{first}`"
+    head = ("policy", "shown, dB", less, "moving, dB", less, "views an update", "their mean age, ms")
+    return table(head, rows) + (
+        f"\n\n{found['seeds']} seeds, each with a motion of its own; {found['seconds']:g} s after "
+        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds."
+    )
+
+
 def studies() -> list[Any]:
     """The files of the thesis's figures, in the order of their numbers."""
     found = [json.loads(path.read_text()) for path in (DOCS / "results" / "thesis").glob("*.json")]
@@ -427,6 +445,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "drift": lambda: following("drift"),
     "limits": limits,
     "card": card,
+    "compared": compared,
     "figures": figures,
     "verdicts": verdicts,
 }

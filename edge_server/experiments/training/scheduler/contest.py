@@ -3,7 +3,7 @@
 All policies with the scenario's own seed, for the page; the learnt one and its reference with other seeds,
 too: one channel, one motion and the same instants for both. Policies without learning, with other seeds:
 
-    python -m edge_server.experiments.training.scheduler.contest card all whittle:6 aoii:6 --json FILE
+    python -m edge_server.experiments.training.scheduler.contest card all whittle:1 aoii:1 --json FILE
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ from freshfield.scenario import load
 
 LEARNT = "learnt"
 REFERENCE = "all"
-CONTESTANTS = (REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6",
-               "aoii:6", "covariance:6", "age-driven")  # fmt: skip
+CONTESTANTS = (
+    REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6", "whittle:1",
+    "aoii:1", "covariance:1", "age-driven",
+)  # fmt: skip
 # Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
 LEAD_MS = 5000.0
 # What is shown is scored for so long, after the lead of an episode.
