@@ -22,6 +22,12 @@ DATA ?=
 # Options of `make bench`, for edge-server bench: --quick, or --resume to go on where Ctrl-C stopped it.
 BENCH ?=
 
+# Options of `make figures`: studies (names, or groups as edge-server study has them), processes, and more for each
+# study, such as --quick or --seeds 40.
+FIGURES ?= all viewpoints preferences learning
+JOBS ?=
+STUDY ?=
+
 # Options of `make images`: docker or podman, and more for its build, such as --build-arg TORCH=cpu.
 ENGINE ?= docker
 BUILD ?=
@@ -51,7 +57,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format types bench proto proto-check lock images clean
+.PHONY: help demo test lint format types bench figures proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -93,6 +99,15 @@ bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, run
 	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
 	$(PY) -m camera_node.synthetic.effect_costs --json runs/bench-world.json
 	$(PY) docs/tables.py  # the tables of docs/ are made from these files
+
+figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
+	for name in $(FIGURES); do \
+	  $(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli study $$name --out runs/figures \
+	    $(if $(JOBS),--jobs $(JOBS)) $(STUDY) || exit 1; \
+	done  # after Ctrl-C the same command goes on
+	@mkdir -p docs/results/thesis
+	cp runs/figures/*.json runs/figures/*.csv runs/figures/*.png docs/results/thesis
+	$(PY) docs/tables.py
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)

@@ -1,6 +1,6 @@
 """Writes the tables of docs/ that come from measured files.
 
-    python docs/tables.py            after `make bench` or `edge-server frontier --shipped`
+    python docs/tables.py            after `make bench`, `make figures` or `edge-server frontier --shipped`
 
 A table stands between the lines ``<!-- table NAME -->`` and ``<!-- end -->``; what stands between them is
 replaced. tests/deploy/test_docs.py fails while a page says something else than the files.
@@ -58,6 +58,34 @@ UPDATE_OPTIONS = (
     ("movement followed", "room, moving"),
     ("wrong views refused", "room, moving"),
     ("wrong views refused", "kitchen, moving"),
+)
+
+# The rows of docs/studies.md: study, scene and setting of the verdict, and a word of its claim.
+VERDICTS = (
+    ("mat", "room, drop-new, PSNR (dB)", ""),
+    ("mat", "room, drop-new, PSNR, moving pixels (dB)", ""),
+    ("mat", "room, parallel, PSNR, moving pixels (dB)", ""),
+    ("mat", "kitchen, drop-new, PSNR, moving pixels (dB)", ""),
+    ("mat-delay", "room, PSNR (dB)", ""),
+    ("mat-delay", "room, PSNR, moving pixels (dB)", ""),
+    ("lambda", "room, threshold, whole image, ages of all cameras (5.8)", ""),
+    ("lambda", "room, threshold, whole image, ages of used views (6.35)", ""),
+    ("omega", "room, high traffic, threshold, PSNR (dB)", ""),
+    ("omega", "room, high traffic, threshold, PSNR, moving pixels (dB)", ""),
+    ("omega", "room, low traffic, threshold, PSNR, moving pixels (dB)", ""),
+    ("omega", "room, high traffic, wait, PSNR (dB)", "longer"),
+    ("omega", "room, high traffic, wait, PSNR (dB)", "threshold"),
+    ("omega", "room, high traffic, wait-flush, PSNR (dB)", "threshold"),
+    ("omega", "room, low traffic, wait, PSNR (dB)", "threshold"),
+    ("omega", "room, high traffic, wait, F_w (6.37)", "inside"),
+    ("images", "room, LPIPS", ""),
+    ("images", "room, mean age of used views (ms)", ""),
+    ("images", "tower, LPIPS", ""),
+    ("images", "tower, mean age of used views (ms)", ""),
+    ("representations", "room, threshold, PSNR (dB)", ""),
+    ("representations", "room, threshold, PSNR, moving pixels (dB)", ""),
+    ("metrics", "LPIPS", ""),
+    ("metrics", "SSIM", "lowest"),
 )
 
 
@@ -234,23 +262,102 @@ def following(part: str) -> str:
 
 
 def card() -> str:
-    """What policies show in the scenario card: with its own seed, and minus `all` with others."""
+    """What policies show in the scenario card, and the learnt one against all."""
     found = measured("deploy/scenarios/card/scores.json")
-    measures = ("psnr_db", "psnr_moving_db")
     rows = [
-        [name, *(f"{row['own_seed'][m]:.2f}" for m in measures), f"{row['own_seed']['views']:.1f}",
-         *(_interval(row[f"{m}_over_all"]) if f"{m}_over_all" in row else "" for m in measures)]
+        [name, *(f"{row['own_seed'][m]:.2f}" for m in ("psnr_db", "psnr_moving_db")),
+         f"{row['own_seed']['views']:.1f}"]
         for name, row in found["policies"].items()
     ]  # fmt: skip
     learnt = found["policies"]["learnt"]
+    whole, moving = (_interval(learnt[f"{m}_over_all"]) for m in ("psnr_db", "psnr_moving_db"))
     omegas = ", ".join(f"{state} {_interval(ms, 0)} ms" for state, ms in learnt["omega_ms"].items())
-    head = ("policy", "shown, dB", "moving", "views an update", "minus `all`, dB", "moving, minus `all`")
     return (
-        table(head, rows)
-        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}; minus `all`: paired "
-        f"over {found['seeds']} other seeds and motions. The learnt policy's mean threshold by the channel's "
-        f"state: {omegas}."
+        table(("policy", "shown, dB", "moving", "views an update"), rows)
+        + f"\n\nSeed {found['seed']}, {found['seconds']:g} s after {found['lead_s']:g}. The learnt policy "
+        f"minus `all`, paired over {found['seeds']} other seeds and motions: {whole} dB, moving {moving}. "
+        f"Its mean threshold by the channel's state: {omegas}."
     )
+
+
+def compared() -> str:
+    """What policies without learning show in the scenario card, and minus the first, over seeds."""
+    found = measured("docs/results/learning/policies.json")
+    first = next(iter(found["policies"]))
+    columns = ("psnr_db", f"psnr_db_over_{first}", "psnr_moving_db", f"psnr_moving_db_over_{first}")
+    rows = [
+        [f"`{name}`", *("" if name == first and "over" in c else _interval(row[c]) for c in columns),
+         f"{row['views'][0]:.1f}", f"{row['aaoi_ms'][0]:.0f}"]
+        for name, row in found["policies"].items()
+    ]  # fmt: skip
+    less = f"minus `{first}`"
+    head = ("policy", "shown, dB", less, "moving, dB", less, "views an update", "their mean age, ms")
+    return table(head, rows) + (
+        f"\n\n{found['seeds']} seeds, each with a motion of its own; {found['seconds']:g} s after "
+        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds."
+    )
+
+
+def studies() -> list[Any]:
+    """The files of the thesis's figures, in the order of their numbers."""
+    found = [json.loads(path.read_text()) for path in (DOCS / "results" / "thesis").glob("*.json")]
+    return sorted(found, key=lambda s: [int(n) for n in re.findall(r"\d+", _figure(s))] or [99])
+
+
+def _figure(study: Any) -> str:
+    """The figures, tables or equations that a study makes anew; they end its title."""
+    number = re.search(r"\(([^()]*\d)\)$", study["title"])
+    return number[1] if number else ""
+
+
+def verdicts() -> str:
+    """The verdicts of ``VERDICTS``, as far as they were measured."""
+    rows: list[list[str]] = []
+    by_name, said = {study["study"]: study for study in studies()}, ("", "")
+    for name, about, word in VERDICTS:
+        for v in by_name[name]["verdicts"] if name in by_name else ():
+            if v["about"] == about and word in v["claim"]:
+                figure = f"{re.sub('^figures? ', '', _figure(by_name[name]))} (`{name}`)"
+                rows.append(
+                    [figure if figure != said[0] else "", v["claim"] if v["claim"] != said[1] else ""]
+                )
+                rows[-1] += [about, v["found"], v["verdict"]]
+                said = figure, v["claim"]
+    return table(["figure", "claim", "where", "found here", "verdict"], rows)
+
+
+def figures() -> str:
+    """A paragraph for each study: how it was run, and each claim with its verdicts and intervals."""
+    names = [study["study"] for study in studies()]
+    parts = []
+    for study in studies():
+        name = study["study"]
+        seeds = f", {study['seeds']} seeds a point" if study["seeds"] else ""
+        field = ", ".join(f"`{f}`" for f in study["field"])
+        claims: dict[str, dict[str, list[str]]] = {}
+        for v in study["verdicts"]:
+            known = v["interval"] and v["interval"][0] is not None
+            span = f" {_interval(v['interval'], 2 if abs(v['interval'][0]) >= 0.1 else 4)}" if known else ""
+            claims.setdefault(v["claim"], {}).setdefault(v["verdict"], []).append(v["about"] + span)
+        lines = []
+        for claim, found in claims.items():
+            answers = (f"**{verdict}**: {'; '.join(where)}" for verdict, where in found.items())
+            lines.append(f"- {claim[0].upper()}{claim[1:]} {'. '.join(answers)}.")
+        longer = tuple(n for n in names if n != name and n.startswith(name))
+        drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
+                 if not (longer and p.name.startswith(longer))]  # fmt: skip
+        drawn.sort(key=lambda p: ("room" not in p, p))  # the usual scene first
+        more = "".join(f", [{p.removesuffix('.png')}]({p})" for p in drawn[1:])
+        parts += [
+            f"## {study['title']}\n",
+            f"`{study['command']}`: {'quick pass' if study['quick'] else 'full run'}{seeds}"
+            f"{', ' if field else ''}{field}, commit {study['commit']}. "
+            f"[Rows]({name}.csv), [verdicts and means]({name}.json){more}.\n",
+            *lines,
+            *(f"\n![{study['title']}]({p})" for p in drawn[:1]),
+            "",
+        ]
+    return "\n".join(parts).rstrip()
 
 
 def _interval(values: Sequence[float | None], digits: int = 2) -> str:
@@ -357,6 +464,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "drift": lambda: following("drift"),
     "limits": limits,
     "card": card,
+    "compared": compared,
+    "figures": figures,
+    "verdicts": verdicts,
 }
 
 

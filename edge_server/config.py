@@ -170,7 +170,7 @@ class EdgeConfig:
 def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
     """How frames are embedded: as the scenario says, else, if the policy needs embeddings, as policies are
     trained. None where neither asks for them."""
-    if config.embedding is not None or not policy.embedding[0]:
+    if config.embedding is not None or policy.embedding[0] == 0:
         return config.embedding
     from edge_server.embed import EmbeddingConfig
 

@@ -134,11 +134,11 @@ class FieldUpdater:
         """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or
         not the one that it was trained with."""
         dim, name = policy.embedding
-        if not dim:
+        if dim == 0:
             return
         if self.embedder is None:
             raise ValueError(f"{policy.name} decides by what cameras see: it needs an edge.embedding section")
-        if dim != self.embedder.dim or (name and name != self.embedder.name):
+        if dim not in (None, self.embedder.dim) or (name and name != self.embedder.name):
             raise ValueError(
                 f"{policy.name} was trained with {name or 'embeddings'} of {dim} numbers, edge.embedding "
                 f"is {self.embedder.name} of {self.embedder.dim}"

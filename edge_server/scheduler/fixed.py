@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
 
@@ -83,35 +79,6 @@ class AgeDriven(Policy):
             return ()
         youngest = max(epoch.generated_ns.values())
         return tuple(c for c, generated in epoch.generated_ns.items() if generated == youngest)
-
-
-class Whittle(Policy):
-    """Whittle-type index: the k views that take most from the squared ages of what the field knows.
-
-    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D that of its frame used last:
-    where a new frame is always at hand (a = 0) that is the Whittle index of the age of information over a
-    reliable channel (Kadota et al., IEEE/ACM ToN 2018, with p = 1 and up to half a slot).
-    """
-
-    name = "whittle"
-    parameter = "k"
-    value: int = 6
-
-    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        super().__init__(value, rng)
-        self._used_ns: dict[str, int] = {}
-
-    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-        def index(camera: str) -> float:
-            used_ns = self._used_ns.get(camera)
-            if used_ns is None:
-                return math.inf
-            known_ms = (epoch.now_ns - used_ns) / 1e6
-            return (known_ms**2 - epoch.age_ms(camera) ** 2) / 2
-
-        chosen = set(sorted(epoch.generated_ns, key=index, reverse=True)[: self.value])
-        self._used_ns |= {c: epoch.generated_ns[c] for c in chosen}
-        return tuple(c for c in epoch.generated_ns if c in chosen)
 
 
 class Threshold(Policy):

@@ -64,15 +64,15 @@ class Policy:
 
     parameter: name and unit of the one value a user may set, such as ``omega_ms`` or the count ``k``; None if
     there is none. value: that value. treatment: applied to the selected views before they supervise the
-    field. embedding: width of the embeddings it decides by (0: it needs none) and the name of their embedder
-    (empty: not said).
+    field. embedding: width of the embeddings it decides by (0: it needs none; None: any) and the name of
+    their embedder (empty: not said).
     """
 
     name: str
     parameter: str | None = None
     value: float | None = None
     treatment: Treatment | None = None
-    embedding: tuple[int, str] = (0, "")
+    embedding: tuple[int | None, str] = (0, "")
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
         """value: of ``parameter``; None keeps the default. rng: for policies that draw. Raises ValueError."""

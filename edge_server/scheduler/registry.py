@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_server.scheduler import fixed
+from edge_server.scheduler import fixed, index
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitFlush
 
@@ -25,7 +25,9 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
     "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
-    "whittle": (fixed.Whittle, "the k views that take most from the squared ages of what is known; value: k"),
+    "whittle": (index.Whittle, "the k views that take most from the squared ages of what is known; value: k"),
+    "aoii": (index.IncorrectAge, "the k views of whose change the field has not known for longest; value: k"),
+    "covariance": (index.PredictedCovariance, "the k views whose predicted variance falls most; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-flush": (WaitFlush, "as wait, what is on its way at the decision broken off (6.5)"),

@@ -41,8 +41,8 @@ class Interval:
         return f"{mean} [{low}, {high}]"
 
     def rounded(self, digits: int) -> list[float | None]:
-        """Mean, low and high as JSON values, None for NaN."""
-        return [None if np.isnan(v) else round(v, digits) for v in (self.mean, self.low, self.high)]
+        """Mean, low and high as JSON values, None for NaN and infinity."""
+        return [round(v, digits) if np.isfinite(v) else None for v in (self.mean, self.low, self.high)]
 
     def above(self, bound: float) -> bool | None:
         """Whether the mean lies above ``bound``; None where the interval contains it."""

@@ -22,7 +22,6 @@ from edge_server.experiments.studies.trial import SCENARIOS
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fields.registry import field_names
-from freshfield.files import write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
@@ -133,16 +132,9 @@ def make_study(name: str) -> Any:
 def _run(name: str, request: StudyRequest, engine: Engine) -> None:
     study, began = make_study(name), time.monotonic()
     print(f"== {name}: {study.title}", flush=True)
-    verdicts = run_study(study, request, engine)
-    for verdict in verdicts:
+    for verdict in run_study(study, request, engine):
         print("  " + verdict.line())
-    seconds = time.monotonic() - began
-    found = {
-        "study": name, "title": study.title, "quick": request.quick, "seconds": round(seconds, 1),
-        "verdicts": [vars(v) for v in verdicts],
-    }  # fmt: skip
-    write_json(request.out / f"{name}.json", found)
-    print(f"  {seconds:.0f} s; {request.out / name}.csv, .md, .json and figures", flush=True)
+    print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.csv, .md, .json and figures", flush=True)
 
 
 def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[str]:

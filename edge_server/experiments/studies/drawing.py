@@ -63,7 +63,7 @@ def draw_metrics(
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:
     """Draw rows of images (title, [(label, image), ...]), all of one height, to ``path`` (PNG)."""
     columns = max(len(images) for _, images in rows)
-    with figure(path, len(rows), columns, height_inch=2.3) as (_, axes):
+    with figure(path, len(rows), columns, height_inch=2.3, dpi=80) as (_, axes):
         for line, (title, images) in zip(axes, rows):
             for at in line:
                 at.axis("off")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from edge_server.experiments.common.statistics import Interval, all_of, interval, negated, paired
+from edge_server.experiments.common.statistics import Interval, all_of, interval, paired
 from edge_server.experiments.studies.drawing import draw_images
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -103,17 +103,26 @@ class Metrics:
             print(f"  LPIPS is left out: {missing}")
             return verdicts
         order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
-        rising = all_of(_gap(b, a).above(0.0) for a, b in pairwise(order))
+        gaps = [_gap(b, a) for a, b in pairwise(order)]
         text = ", ".join(f"{interval(values).mean:.3f}" for values in order)
         claim = "brightness shift < ghosting < blur (figure 3.6's table)."
-        return [*verdicts, Verdict("LPIPS", claim, text + ".", by_bool(rising))]
+        rising = by_bool(all_of(gap.above(0.0) for gap in gaps))
+        return [*verdicts, Verdict("LPIPS", claim, text + ".", rising, min(gaps, key=lambda gap: gap.mean))]
 
     def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
         mine = scores[case][metric]
-        above = [_gap(v[metric], mine).above(0.0) for c, v in scores.items() if c != case]
-        answer = all_of(above if lowest else map(negated, above))
+        gaps = [
+            _gap(v[metric], mine) if lowest else _gap(mine, v[metric]) for c, v in scores.items() if c != case
+        ]
+        answer = by_bool(all_of(gap.above(0.0) for gap in gaps))
         text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
-        return Verdict(metric.upper(), f"{claim} (figure 3.6's table).", text + ".", by_bool(answer))
+        return Verdict(
+            metric.upper(),
+            f"{claim} (figure 3.6's table).",
+            text + ".",
+            answer,
+            min(gaps, key=lambda gap: gap.mean),
+        )
 
 
 def _gap(a: list[float | None], b: list[float | None]) -> Interval:

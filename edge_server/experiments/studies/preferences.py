@@ -191,7 +191,7 @@ def judge_answers(rows: list[Row]) -> list[Verdict]:
         verdicts.append(Verdict(
             f"simulated expert, {taste}, 10 % wrong",
             f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
-            f"{share.text(3)} of it, on unseen pairs.", by_bool(share.above(0.9)),
+            f"{share.text(3)} of it, on unseen pairs.", by_bool(share.above(0.9)), share,
         ))  # fmt: skip
     unsure = [not r["knows"] for r in rows if r["habit"] == "contradicting" and r["answers"] == ASKED[-1]]
     sure = [r["knows"] for r in rows if r["habit"] == "careful" and r["answers"] == ASKED[-1]]
@@ -211,7 +211,7 @@ def judge_captures(captures: list[Row]) -> list[Verdict]:
             way = paired(_of(captures, "path_m", arm=arm), _of(captures, "path_m", arm=other))
             verdicts.append(Verdict(
                 f"{arm}, {JUDGED} views", f"better than {other} (table 4.3).",
-                f"{gain.text(2)} dB, with a path {way.text(2)} m longer.", by_bool(gain.above(0.0)),
+                f"{gain.text(2)} dB, with a path {way.text(2)} m longer.", by_bool(gain.above(0.0)), gain,
             ))  # fmt: skip
     return verdicts
 

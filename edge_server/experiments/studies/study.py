@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.statistics import interval, paired
+from edge_server.experiments.common.statistics import Interval, interval, paired
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.trial import Row, Trial
+from edge_server.report.machine import commit
 from edge_server.scheduler.learned.rewards import f_w
-from freshfield.files import write_csv, write_text
+from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
 # metric -> (label of an axis, lower is better, digits)
@@ -70,6 +71,16 @@ class StudyRequest:
         """Number of episodes of one training. episodes: the study's default, keyed by ``quick``."""
         return self.episodes or episodes[self.quick]
 
+    def command(self, study: str) -> str:
+        """The command that repeats this request, without folders and processes, which change nothing."""
+        words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
+        words += [f"--seeds {self.seeds}"] if self.seeds else []
+        words += [f"--scene {','.join(self.scenes)}"] if self.scenes else []
+        words += [f"--case {case!r}" for case in self.cases]
+        words += [f"--episodes {self.episodes}"] if self.episodes else []
+        words += [f"--field {self.field}"] if self.field != "splat" else []
+        return " ".join(words)
+
     def repeats(self, quick: int, full: int) -> range:
         """Seeds of a point: the requested number, else that of a quick or full pass."""
         return range(self.seeds or (quick if self.quick else full))
@@ -77,12 +88,21 @@ class StudyRequest:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The thesis's claim, the result here, and whether the claim holds. about: scene and setting."""
+    """The thesis's claim, the result here, and whether the claim holds.
+
+    about: scene and setting.
+    interval: of the difference that the claim is about; None where it is about several, or a single value.
+    """
 
     about: str
     claim: str
     found: str
     verdict: str
+    interval: Interval | None = None
+
+    def mapping(self) -> Row:
+        """As JSON values; the interval as [mean, low, high]."""
+        return {**vars(self), "interval": None if self.interval is None else self.interval.rounded(4)}
 
     def line(self) -> str:
         return f"[{self.verdict}] {self.about}: {self.claim} Found: {self.found}"
@@ -129,6 +149,18 @@ class Table:
         """The label's values in order of appearance."""
         return list(dict.fromkeys(row[label] for row in self.rows if row.get(label) is not None))
 
+    def means(self) -> list[Row]:
+        """The labels of each point, and [mean, low, high] over its seeds of everything measured."""
+        groups: dict[str, list[Row]] = {}
+        for point, row in zip(self.points, self.rows):
+            groups.setdefault(repr(point.labels), []).append(row)
+        labels = {repr(p.labels): p.labels for p in self.points}
+        measured = [n for n in (self.results[0] if self.results else {}) if n != "decisions"]
+        return [
+            {**labels[key], **{n: interval(row[n] for row in rows).rounded(4) for n in measured}}
+            for key, rows in groups.items()
+        ]
+
 
 class Study(Protocol):
     """One study. name: of the command. title: one line for people."""
@@ -144,7 +176,7 @@ class Study(Protocol):
 
 
 def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
-    """Run what is missing, write OUT/NAME.csv, figures and OUT/NAME.md, return the verdicts."""
+    """Run what is missing, write OUT/NAME.csv, .json, .md and figures, return the verdicts."""
     request.out.mkdir(parents=True, exist_ok=True)
     points = study.points(request)
     table = Table(points, engine.run([p.trial for p in points], study.name))
@@ -153,6 +185,13 @@ def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdi
     verdicts = study.report(request, table)
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
     write_text(request.out / f"{study.name}.md", text)
+    found = {
+        "study": study.name, "title": study.title, "command": request.command(study.name),
+        "quick": request.quick, "seeds": len({p.trial.seed for p in points}) or request.seeds,
+        "field": list(dict.fromkeys(p.trial.field for p in points)), "commit": commit(),
+        "verdicts": [v.mapping() for v in verdicts], "rows": table.means(),
+    }  # fmt: skip
+    write_json(request.out / f"{study.name}.json", found)
     return verdicts
 
 

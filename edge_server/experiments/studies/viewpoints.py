@@ -151,20 +151,20 @@ def judge(scene: str, rows: list[Row], counts: tuple[int, ...]) -> list[Verdict]
         gain = paired(of[counts[-1]], of[counts[0]])
         verdicts.append(Verdict(
             f"{scene}, {arm}", "more views are better (table 4.1: 20.2 dB with 5 to 22.7 dB with 20).",
-            f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.", by_bool(gain.above(0.0)),
+            f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.", by_bool(gain.above(0.0)), gain,
         ))  # fmt: skip
     chance, way = curve(rows, "random", "psnr_db")[JUDGED], curve(rows, "random", "path_m")[JUDGED]
     for arm in list(ARMS)[1:]:
         gain = paired(curve(rows, arm, "psnr_db")[JUDGED], chance)
         verdicts.append(Verdict(
             f"{scene}, {arm}, {JUDGED} views", "better than random views (table 4.3: FisherRF 4.8 dB).",
-            f"{gain.text(2)} dB.", by_bool(gain.above(0.0)),
+            f"{gain.text(2)} dB.", by_bool(gain.above(0.0)), gain,
         ))  # fmt: skip
     shorter = paired(curve(rows, "FisherRF", "path_m")[JUDGED], way)
     verdicts.append(Verdict(
         f"{scene}, FisherRF, {JUDGED} views, path",
         "shorter than a random one (table 4.3: 2.61 m, 3.28 m).",
-        f"{shorter.text(2)} m longer.", by_bool(negated(shorter.above(0.0))),
+        f"{shorter.text(2)} m longer.", by_bool(negated(shorter.above(0.0))), shorter,
     ))  # fmt: skip
     return verdicts
 

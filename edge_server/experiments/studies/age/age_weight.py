@@ -66,7 +66,7 @@ class Weighing:
                     f"{no_delay_gain(table, metric, scene=scene)}."
                 )
                 about = f"{scene}, {policy}, {where}, ages of {label}"
-                verdicts.append(Verdict(about, CLAIM, text, by_bool(_falls(move))))
+                verdicts.append(Verdict(about, CLAIM, text, by_bool(_falls(move)), move))
             with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
                 at = axes[0, 0]
                 for k, ((policy, label), xs) in enumerate(best.items()):

@@ -66,5 +66,5 @@ class Images:
                     f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}."
                 )
                 answer = change.above(0.0) if rises else negated(change.above(0.0))
-                verdicts.append(Verdict(f"{scene}, {name}", claim, text, by_bool(answer)))
+                verdicts.append(Verdict(f"{scene}, {name}", claim, text, by_bool(answer), change))
         return verdicts

@@ -77,7 +77,8 @@ class Mat:
                 f"{no_delay_gain(table, metric, **labels)}."
             )
             about = f"{scene}, {discipline}, {name}"
-            found.append(Verdict(about, CLAIM, text, by_bool(best.interior(LEAST[metric]))))
+            answer = by_bool(best.interior(LEAST[metric]))
+            found.append(Verdict(about, CLAIM, text, answer, best.over_last))
         return found
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:

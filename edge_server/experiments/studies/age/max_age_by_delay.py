@@ -78,6 +78,7 @@ class MatDelay:
             f"by mean delay {text}{none}; {slope} ms of threshold a ms of delay; "
             f"{no_delay_gain(table, metric, scene=scene, delay_ms=max(best))} at {max(best):g} ms.",
             by_bool(slope.above(0.0)),
+            slope,
         )
 
     def _draw(

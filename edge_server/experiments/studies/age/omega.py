@@ -87,7 +87,7 @@ class Omega:
         )
         claim = f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1)."
         about = f"{scene}, {state} traffic, threshold, {name}"
-        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])))]
+        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])), best.over_last)]
 
     def _wait(self, table: Table, scene: str, state: str, metric: str, policy: str) -> list[Verdict]:
         labels = {"scene": scene, "state": state}
@@ -119,19 +119,19 @@ class Omega:
         )
         ahead = "better than threshold, each at its own best omega (6.5.2)."
         return [
-            Verdict(about, claim, text, by_bool(answer)),
-            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better)),
+            Verdict(about, claim, text, by_bool(answer), loss),
+            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better), over),
         ]
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
         common: dict[str, Any] = {"channel": {"preset": "ch6-high"}, "lpips": False, "every_ms": 2400.0}
-        rows = [
-            (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
-            for s in table.distinct("scene")
-            for p in ("threshold", "wait")
-        ]
-        draw_trials(request.out / "omega-pictures.png", request, rows)
+        for s in table.distinct("scene"):
+            rows = [
+                (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
+                for p in ("threshold", "wait")
+            ]
+            draw_trials(request.out / f"omega-pictures-{s}.png", request, rows)
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:

@@ -150,15 +150,15 @@ class Phase:
             return []
         nothing = " (nothing to win)" if gap.above(LEAST_DB) is False else ""
         text = [f"no delay is {gap} dB above use-all{nothing}"]
-        answers = []
+        gains = []
         for policy, (omega, values) in best.items():
-            gain = paired(values, use_all)
-            answers.append(gain.above(LEAST_DB))
+            gains.append(gain := paired(values, use_all))
             text.append(f"best {policy} ({omega:g} ms) {gain}")
         about = f"{cell.text}; {name}"
         found = [
             Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
-                    "; ".join(text) + " dB.", by_bool(any_of(answers)))
+                    "; ".join(text) + " dB.", by_bool(any_of(g.above(LEAST_DB) for g in gains)),
+                    max(gains, key=lambda g: g.mean))
         ]  # fmt: skip
         for policy in OWN:
             treated = table.values(metric, policy=policy, **cell.labels)
@@ -169,7 +169,7 @@ class Phase:
                 f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
                 f"{over[0]} above the best threshold, {over[1]} above the best wait "
                 f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
-                by_bool(all_of(o.above(0.0) for o in over)),
+                by_bool(all_of(o.above(0.0) for o in over)), min(over, key=lambda o: o.mean),
             ))  # fmt: skip
         return found
 

@@ -125,7 +125,7 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
                 f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
                 f"{span(best_values['gain'])} over the best fixed one, as another fit has it; "
                 "whether the state tells it is another question.",
-                by_bool(best_values["gain"].above(0.0))),
+                by_bool(best_values["gain"].above(0.0)), best_values["gain"]),
     ]  # fmt: skip
 
 
@@ -173,6 +173,7 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
         # Where the limit is no better than random there is no share; half of the way is still defined, and so
         # is an interval over trainings.
         by_bool(above.above(0.0)),
+        above,
     )  # fmt: skip
 
 

@@ -102,7 +102,7 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
                     f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
                     f"{span(best_values['gain'])} over the best fixed one, as another fit has it; learnt "
                     f"{span(crossed(mine))}.",
-                    by_bool(best_values["gain"].above(0.0)))
+                    by_bool(best_values["gain"].above(0.0)), best_values["gain"])
         )  # fmt: skip
     wait, threshold = trained["wait"], trained["threshold"]
     found.append(
@@ -117,5 +117,5 @@ def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
     return Verdict(
         f"room, {case}, {kind}", "the ages tell which omega is best: there is something to learn.",
         f"a rule fitted to the rewards of every omega at every decision of the other seeds wins {span(gain)} "
-        f"over the best fixed one, over {gain.count} seeds.", by_bool(gain.above(0.0)),
+        f"over the best fixed one, over {gain.count} seeds.", by_bool(gain.above(0.0)), gain,
     )  # fmt: skip

@@ -112,6 +112,7 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
         "for the same number of decisions a cheap reward teaches as much as a dear one (no worse by 0.01).",
         f"{cheap} less {dear} steps: {span(same)}; {text}.",
         by_bool(same.above(-0.01)),
+        same,
     )
     claim = f"in the same time {cheap} steps a fit teach more than {dear}."
     theirs = _in_the_same_time(spent[cheap][-1], spent[dear])

@@ -59,7 +59,7 @@ def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdi
                f"the best is {fixed}; "),
         Verdict(about, "it matters: what was learnt by other weights is worse by these.",
                 "; ".join(f"{o} {span(loss)}" for o, loss in losses.items()) + f"; most: {worst}.",
-                by_bool(any_of(loss.above(0.0) for loss in losses.values()))),
+                by_bool(any_of(loss.above(0.0) for loss in losses.values())), losses[worst]),
     ]  # fmt: skip
 
 

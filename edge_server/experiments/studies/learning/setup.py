@@ -288,8 +288,8 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
     difference = paired_difference(mine, other)
     text = _describe_difference(difference, len(_runs(mine)))
     if difference.low == difference.high == 0.0:
-        return Verdict(about, claim, f"{found}{text}: it does the very same.", by_bool(False))
-    return Verdict(about, claim, f"{found}{text}.", by_bool(difference.above(0.0)))
+        return Verdict(about, claim, f"{found}{text}: it does the very same.", by_bool(False), difference)
+    return Verdict(about, claim, f"{found}{text}.", by_bool(difference.above(0.0)), difference)
 
 
 def no_worse(
@@ -302,9 +302,10 @@ def no_worse(
     difference, base = paired_difference(mine, other), crossed(_runs(other))
     text = f"{_describe_difference(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
     if base.low <= 0.0 <= base.high:
-        return Verdict(about, claim, f"{text}no percentage: too near zero.", by_bool(None))
+        return Verdict(about, claim, f"{text}no percentage: too near zero.", by_bool(None), difference)
     text += f"{100 * difference.mean / abs(base.mean):+.2f} %"
     limit = paired_difference(evaluation.rewards(HINDSIGHT), evaluation.rewards("random"))
     if limit.above(0.0):
         text += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
-    return Verdict(about, claim, f"{text}.", by_bool(difference.above(-share * abs(base.mean))))
+    answer = by_bool(difference.above(-share * abs(base.mean)))
+    return Verdict(about, claim, f"{text}.", answer, difference)

@@ -21,8 +21,7 @@ from edge_server.experiments.common.arguments import (
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.contest import LEARNT, contest
-from edge_server.experiments.training.scheduler.deployed import Hindsight
+from edge_server.experiments.training.scheduler.contest import LEAD_MS, LEARNT, contest
 from edge_server.experiments.training.scheduler.evaluation import (
     Evaluation,
     baseline_policies,
@@ -79,13 +78,9 @@ small (--size) and the field is quick (--field), so that there are many decision
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
 apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. With --hold these two
-are OUT/scores.json, of the scenario as it is and beside hindsight, which knows the time until the next
-decision and takes the best of --omegas; OUT/actor.npz has what deciding needs of the policy. --hold with
---episodes 0 learns nothing and says what there is to win. After Ctrl-C the same command goes on, bit for bit;
-so it does whatever --jobs is.
+are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
+Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
 """
-# Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
-_HOLD_LEAD_MS = 5000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -117,9 +112,6 @@ def _train_and_evaluate(
               "ignore how old views are (--on moving)")  # fmt: skip
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
-    if config.spec.hold_ms and not config.episodes:
-        _contest(args, setting, config.spec, None, pool)
-        return
     learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
     # Reports of an earlier call; a call that was refused keeps them.
     for name in REPORTS:
@@ -133,7 +125,7 @@ def _train_and_evaluate(
         return
     if config.spec.hold_ms:
         draw_curve(args.out / "training.png", rows)
-        _contest(args, setting, config.spec, learner.actor, pool)
+        _contest(args, setting, learner.actor, pool)
         return
     kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
@@ -150,23 +142,19 @@ def _train_and_evaluate(
     _report(args.out, evaluation, kinds[0], rows, about)
 
 
-def _contest(
-    args: argparse.Namespace, setting: Setting, spec: Spec, actor: Actor | None, pool: WorkerPool
-) -> None:
-    """Fixed policies, the learnt one and hindsight in the scenario as it is: its own size, all its training
-    cameras."""
+def _contest(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
+    """Fixed policies and the learnt one in the scenario as it is: its own size, all its training cameras."""
     scenario = load(args.scenario)
     report = () if set(setting.report) == set(scenario.held_out) else setting.report
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
-    weights = "" if actor is None else content_key((args.out / "policy.npz").read_bytes().hex(), 16)
+    weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
     found = contest(
-        as_it_is, pool, seeds(args.seed, "test", args.test), actor, Hindsight(spec.hold_ms, spec.omegas_ms),
-        weights, args.out / "contest.jsonl", lambda line: print(f"  {line}", flush=True),
+        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "contest.jsonl",
+        lambda line: print(f"  {line}", flush=True),
     )  # fmt: skip
     write_json(args.out / "scores.json", found, indent=1)
-    if actor is not None:
-        actor.save(args.out / "actor.npz")
+    actor.save(args.out / "actor.npz")
 
 
 def _report(
@@ -207,7 +195,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     return Setting(
         given, report=report, motions=not args.same_motion,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
-        scratch=args.scratch, decisions=args.decisions, lead_ms=_HOLD_LEAD_MS if args.hold else 1000.0,
+        scratch=args.scratch, decisions=args.decisions, lead_ms=LEAD_MS if args.hold else 1000.0,
         span_ms=args.hold * args.decisions or 6000.0, compute=read_config(given).compute,
         parts=_parts(args.parts),
     )  # fmt: skip

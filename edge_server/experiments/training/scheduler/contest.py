@@ -1,73 +1,85 @@
-"""What fixed policies, a learnt one and hindsight show in a scenario as it is, in virtual time with computing
-charged.
+"""What fixed policies and a learnt one show in a scenario as it is, in virtual time with computing charged.
 
-With the scenario's own seed, for the page; with other seeds minus what the reference shows there, in the same
-channel and motion at the same instants.
+All policies with the scenario's own seed, for the page; the learnt one and its reference with other seeds,
+too: one channel, one motion and the same instants for both. Policies without learning, with other seeds, and
+what hindsight of each second would win with these thresholds:
+
+    python -m edge_server.experiments.training.scheduler.contest card all whittle:1 hindsight:100,250,1000
+        --json FILE
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from edge_server.config import read_config
+from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.training.scheduler.deployed import Hindsight, Judged
 from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.experiments.training.scheduler.setting import seeds as seeds_of
 from edge_server.experiments.training.scheduler.workers import WorkerPool
-from edge_server.report.machine import machine
+from edge_server.report.machine import commit, machine
+from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
+from freshfield.files import write_json
+from freshfield.scenario import load
 
-LEARNT, HINDSIGHT = "learnt", "hindsight"
+LEARNT = "learnt"
 REFERENCE = "all"
-CONTESTANTS = (REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6",
-               "age-driven", HINDSIGHT)  # fmt: skip
+CONTESTANTS = (
+    REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6", "whittle:1",
+    "aoii:1", "covariance:1", "age-driven",
+)  # fmt: skip
+# Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
+LEAD_MS = 5000.0
 # What is shown is scored for so long, after the lead of an episode.
 SPAN_MS = 8000.0
+HINDSIGHT, HINDSIGHT_HOLD_MS = "hindsight:", 1000.0
+_SHOWN = ("psnr_db", "psnr_moving_db")
 
 
 def contest(
     setting: Setting,
     pool: WorkerPool,
     seeds: range,
-    learnt: Actor | None,
-    hindsight: Hindsight,
+    learnt: Actor,
     weights: str,
     known: Path,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """The scores of all policies as JSON values (the scenario key ``edge.scores``).
 
-    learnt: None where nothing was learnt. weights: name of its weights.
-    hindsight: what it chooses from.
+    weights: name of the learnt policy's weights.
     known: file of finished runs, read and appended to.
     """
     setting = dataclasses.replace(setting, span_ms=SPAN_MS)
     own = dataclasses.replace(setting, motions=False)
     own_seed = range(setting.scenario.seed, setting.scenario.seed + 1)
     found: dict[str, Any] = {}
-    reference: list[dict[str, Any]] = []
     for name in CONTESTANTS:
-        who: Judged | None = {LEARNT: learnt, HINDSIGHT: hindsight}.get(name, name)
-        if who is None:
-            continue
+        who = learnt if name == LEARNT else name
         found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
-        runs = _runs(setting, pool, seeds, who, weights, known)
-        reference = reference or runs
-        for m in ("psnr_db", "psnr_moving_db"):
-            values, of_reference = (dict(zip(seeds, [run[m] for run in r])) for r in (runs, reference))
-            found[name][m] = interval(values.values()).rounded(4)
-            found[name][f"{m}_over_{REFERENCE}"] = paired(values, of_reference).rounded(4)
-        if isinstance(who, Actor):
-            found[name]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in runs])
         shown = number(found[name]["own_seed"]["psnr_db"])
-        over = found[name][f"psnr_db_over_{REFERENCE}"]
-        say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}; minus {REFERENCE}, others: {over}")
+        say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}")
+    runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
+            for who in (REFERENCE, LEARNT)}  # fmt: skip
+    for who, of in runs.items():
+        for m in _SHOWN:
+            values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
+            found[who][m] = interval(values[who].values()).rounded(4)
+            found[who][f"{m}_over_{REFERENCE}"] = paired(values[who], values[REFERENCE]).rounded(4)
+        if who == LEARNT:
+            found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
+    say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
     return {
         "scenario": setting.scenario.name, "seed": setting.scenario.seed, "seeds": len(seeds),
         "lead_s": setting.lead_ms / 1e3, "seconds": setting.span_ms / 1e3, "judged_from": setting.scoring,
@@ -92,3 +104,61 @@ def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
     """Mean omega in each state of the channel, with the interval over the runs that were in it."""
     states = sorted({state for run in runs for state in run})
     return {state: interval([run.get(state) for run in runs]).rounded(4) for state in states}
+
+
+def compare(
+    setting: Setting, pool: WorkerPool, seeds: range, names: Sequence[str], known: Path
+) -> dict[str, dict[str, Any]]:
+    """What each policy shows, mean and interval over seeds, and minus the first of them, paired.
+
+    names: policies without learning, and their values; ``hindsight:`` and its thresholds. known: as in
+    ``contest``.
+    """
+    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for seed in seeds:  # of one motion after the other: its pictures are rendered once
+        for name in names:
+            runs[name] += _runs(setting, pool, range(seed, seed + 1), _named(name), "", known)
+    found: dict[str, dict[str, Any]] = {}
+    for name, of in runs.items():
+        found[name] = {m: interval(run[m] for run in of).rounded(4) for m in (*_SHOWN, "views", "aaoi_ms")}
+        for m in _SHOWN:
+            mine, first = (dict(zip(seeds, [run[m] for run in r])) for r in (of, runs[names[0]]))
+            found[name][f"{m}_over_{names[0]}"] = paired(mine, first).rounded(4)
+    return found
+
+
+def _named(name: str) -> Judged:
+    if not name.startswith(HINDSIGHT):
+        return name
+    omegas_ms = tuple(float(ms) for ms in name.removeprefix(HINDSIGHT).split(","))
+    return Hindsight(HINDSIGHT_HOLD_MS, omegas_ms)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=compare.__doc__)
+    parser.add_argument("scenario")
+    parser.add_argument("policies", nargs="+", metavar="NAME[:VALUE]")
+    parser.add_argument("--seeds", type=int, default=8, metavar="N", help="[%(default)s]")
+    parser.add_argument("--seconds", type=float, default=SPAN_MS / 1e3, help="that are scored [%(default)g]")
+    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes [%(default)s]")
+    parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="finished runs: beside it")
+    add_folders(parser)
+    args = parser.parse_args(argv)
+    scenario = load(args.scenario)
+    scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
+    setting = Setting(
+        scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=read_config(scenario).compute,
+        parts=STATE_PARTS,
+    )  # fmt: skip
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    with WorkerPool(folders_of(args), args.jobs) as pool:
+        seeds = seeds_of(scenario.seed, "test", args.seeds)
+        found = compare(setting, pool, seeds, args.policies, args.json.with_suffix(".jsonl"))
+    write_json(args.json, {
+        "scenario": scenario.name, "seeds": args.seeds, "lead_s": LEAD_MS / 1e3, "seconds": args.seconds,
+        "judged_from": setting.scoring, "commit": commit(), "policies": found,
+    }, indent=1)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -71,8 +71,7 @@ class TrainingConfig:
     stages: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        episodes = self.episodes or bool(self.spec.hold_ms)  # none of a running deployment: nothing is learnt
-        if min(episodes, self.batch, self.tries, self.checkpoint_every) < 1:
+        if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
             raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
         if not all(1 <= stage <= self.batches for stage in self.stages):
             raise TrainingError(f"stages: expected numbers of batches from 1 to {self.batches}")

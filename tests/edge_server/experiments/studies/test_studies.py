@@ -18,6 +18,7 @@ from edge_server.experiments.studies.engine import Engine
 from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, run_study
 from edge_server.experiments.studies.trial import run_trial
 from edge_server.scheduler import make_policy
+from tests.conftest import ROOT
 
 NAMES = [n for n in STUDIES if n not in ("metrics", *CAPTURING, *LEARNING)]
 
@@ -103,6 +104,22 @@ def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
     assert (tmp_path / "mat-room.png").stat().st_size > 10_000
     rows = list(csv.DictReader((tmp_path / "mat.csv").open()))
     assert {r["policy"] for r in rows} == {"all", "threshold", "no delay"} and rows[0]["seed"] == "0"
+
+
+def test_the_file_of_a_study_says_what_was_run_and_found(tmp_path: Path):
+    judged("mat", tmp_path, peak(80.0))
+    found = json.loads((tmp_path / "mat.json").read_text())
+    assert found["command"] == "edge-server study mat --quick --seeds 6 --scene room"
+    assert (found["seeds"], found["field"]) == (6, ["splat"])
+    assert found["commit"] or not (ROOT / ".git").exists()
+    first = found["verdicts"][0]
+    mean, low, high = first["interval"]
+    assert f"{mean:.2f} [{low:.2f}, {high:.2f}] better than the largest threshold" in first["found"]
+    rows = [r for r in found["rows"] if (r["discipline"], r.get("gamma_ms")) == ("drop-new", 120.0)]
+    assert [r["policy"] for r in rows] == ["threshold"]
+    of = [float(r["psnr_db"]) for r in csv.DictReader((tmp_path / "mat.csv").open())
+          if (r["discipline"], r["gamma_ms"]) == ("drop-new", "120.0")]  # fmt: skip
+    assert rows[0]["psnr_db"][0] == pytest.approx(sum(of) / 6, abs=1e-4)
 
 
 def test_studies_judge_a_best_value_on_other_seeds_than_chose_it():

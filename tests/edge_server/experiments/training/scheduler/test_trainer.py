@@ -272,9 +272,10 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
 def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored_beside_fixed_ones(
     tmp_path: Path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven", "hindsight"))
+    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven"))
     monkeypatch.setattr(contest, "SPAN_MS", 600.0)
-    monkeypatch.setattr(command, "_HOLD_LEAD_MS", 1200.0)
+    for module in (command, contest):
+        monkeypatch.setattr(module, "LEAD_MS", 1200.0)
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
     edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals"}
     asked = (
@@ -297,9 +298,27 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     assert json.loads((out / "scores.json").read_text())["policies"] == found
     actor = Actor.load(out / "actor.npz")
     assert actor.spec.hold_ms == 200.0 and (out / "actor.npz").stat().st_size < 4e5
-    assert main([*words, "--episodes", "0", "--out", str(tmp_path / "untrained")]) == 0
-    untrained = json.loads((tmp_path / "untrained" / "scores.json").read_text())["policies"]
-    assert "learnt" not in untrained and untrained["hindsight"] == found["hindsight"]
+    compared = tmp_path / "policies.json"
+    contest.main(
+        [
+            words[0],
+            "all",
+            "aoii:2",
+            "covariance:2",
+            "hindsight:50,200",
+            "--seeds",
+            "2",
+            "--seconds",
+            "0.6",
+            "--json",
+            str(compared),
+        ]
+    )
+    shown = json.loads(compared.read_text())["policies"]
+    assert shown["all"]["psnr_db_over_all"] == [0.0, 0.0, 0.0] and shown["all"]["views"][0] > 3.0
+    for name in ("aoii:2", "covariance:2"):
+        assert shown[name]["views"][0] == 2.0 and shown[name]["psnr_db"][0] > 5.0
+    assert shown["hindsight:50,200"]["psnr_db"][0] > 5.0
 
 
 def test_hindsight_with_one_decision_shows_what_the_best_threshold_shows():

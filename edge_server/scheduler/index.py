@@ -1,0 +1,139 @@
+"""Index policies: the k cameras of the largest index, which compares what the field knows of each with its
+newest frame. Cameras of which nothing was used yet come first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
+
+Embedding = NDArray[np.float32]
+
+
+class IndexPolicy(Policy):
+    """A subclass says what the index of a camera is."""
+
+    parameter = "k"
+    value: int = 6
+
+    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
+        super().__init__(value, rng)
+        self._used_ns: dict[str, int] = {}
+
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+        self._look(epoch)
+
+        def index(camera: str) -> float:
+            used_ns = self._used_ns.get(camera)
+            if used_ns is None:
+                return math.inf
+            return self._index(camera, (epoch.now_ns - used_ns) / 1e6, epoch.age_ms(camera))
+
+        chosen = set(sorted(epoch.generated_ns, key=index, reverse=True)[: self.value])
+        self._used_ns |= {c: epoch.generated_ns[c] for c in chosen}
+        self._use(chosen)
+        return tuple(c for c in epoch.generated_ns if c in chosen)
+
+    def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
+        """known_ms: age of the camera's frame used last. age_ms: of its newest."""
+        raise NotImplementedError
+
+    def _look(self, epoch: Epoch) -> None:
+        """Before the indices are computed."""
+
+    def _use(self, cameras: set[str]) -> None:
+        """Their newest frames are used."""
+
+
+class Whittle(IndexPolicy):
+    """Whittle-type index: the k views that take most from the squared ages of what the field knows.
+
+    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D that of its frame used last:
+    where a new frame is always at hand (a = 0) that is the Whittle index of the age of information over a
+    reliable channel (Kadota et al., IEEE/ACM ToN 2018, with p = 1 and up to half a slot).
+    """
+
+    name = "whittle"
+
+    def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
+        return (known_ms**2 - age_ms**2) / 2
+
+
+class _SeeingPolicy(IndexPolicy):
+    """Its index needs embeddings (6.31), of any width. A frame without one is judged by its age alone."""
+
+    embedding = None, ""
+
+    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
+        super().__init__(value, rng)
+        self._seen: Mapping[str, Embedding] = {}
+
+    def _look(self, epoch: Epoch) -> None:
+        state = None if epoch.state is None else epoch.state(("semantics",))
+        if state is not None and state.embeddings is not None:
+            rows = zip(state.cameras, state.embeddings)
+            self._seen = {camera: z for camera, z in rows if np.isfinite(z).all()}
+
+
+class IncorrectAge(_SeeingPolicy):
+    """Age of incorrect information: the k views of whose change the field has not known for longest.
+
+    A camera's index is D |z - z'|, with D the age of its frame used last, z' the embedding of that frame and
+    z that of its newest: the age of incorrect information with linear time and distance as penalty (Maatouk
+    et al., IEEE/ACM ToN 2020). The edge cannot see the source itself: its newest frame stands for it, and
+    what the field knows was correct when the frame used last was taken.
+    """
+
+    name = "aoii"
+
+    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
+        super().__init__(value, rng)
+        self._known: dict[str, Embedding] = {}
+
+    def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
+        z, known = self._seen.get(camera), self._known.get(camera)
+        if z is None or known is None:
+            return known_ms if known_ms > age_ms else 0.0
+        return known_ms * float(np.linalg.norm(z - known))
+
+    def _use(self, cameras: set[str]) -> None:
+        self._known |= {c: self._seen[c] for c in cameras if c in self._seen}
+
+
+class PredictedCovariance(_SeeingPolicy):
+    """Largest predicted covariance: the k views that take most from the variance of what the field knows.
+
+    What a camera sees is taken for a random walk: between its frame used last, of age D, and now the variance
+    of its embedding grows by q D, and its newest frame, of age a, leaves q a of that. The index is q (D - a),
+    the reduction of the predicted covariance (value of information in Ayan et al., ICCPS 2019). q, per
+    camera, is the squared change of embeddings between successive newest frames, over their time.
+    """
+
+    name = "covariance"
+
+    def __init__(self, value: float | None, rng: np.random.Generator) -> None:
+        super().__init__(value, rng)
+        self._last: dict[str, tuple[int, Embedding]] = {}
+        self._walk: dict[str, tuple[float, float]] = {}
+        """camera -> sum of squared changes, and of the milliseconds that they took."""
+
+    def _look(self, epoch: Epoch) -> None:
+        super()._look(epoch)
+        for camera in epoch.generated_ns:
+            z, at_ns = self._seen.get(camera), epoch.generated_ns[camera]
+            if z is None:
+                continue
+            before = self._last.setdefault(camera, (at_ns, z))
+            if at_ns > before[0]:
+                squares, ms = self._walk.get(camera, (0.0, 0.0))
+                change = float(((z - before[1]) ** 2).sum())
+                self._walk[camera] = squares + change, ms + (at_ns - before[0]) / 1e6
+                self._last[camera] = at_ns, z
+
+    def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
+        squares, ms = self._walk.get(camera, (1.0, 1.0))
+        return squares / ms * (known_ms - age_ms)
