@@ -31,7 +31,7 @@ _MOST = 300
 @dataclass(frozen=True)
 class Detection:
     """box: left, top, right, bottom in pixels of the image, not clipped to it; kind: the model's name; mask:
-    makes the object's (H, W), not clipped to the box, None of a model that gives no masks."""
+    computes the object's mask (H, W), not clipped to the box, None of a model that gives no masks."""
 
     box: tuple[float, float, float, float]
     score: float
@@ -54,7 +54,8 @@ class Detector:
         meta = self._session.get_modelmeta().custom_metadata_map
         self.height, self.width = _size(image.shape, meta, file)
         self.kinds = _kinds(meta)
-        self.gives_masks = len(self._session.get_outputs()) == 2
+        outputs = self._session.get_outputs()
+        self.gives_masks = len(outputs) == 2 and len(outputs[1].shape) == 4
         self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # a model that cannot run fails here
 
     def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
@@ -67,7 +68,7 @@ class Detector:
             out, *prototypes = map(np.asarray, self._session.run(None, {self._input: given}))
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
-        if self.gives_masks and (prototypes[0].ndim != 4 or len(prototypes[0]) != 1):
+        if self.gives_masks and len(prototypes[0]) != 1:
             raise ForegroundError(
                 f"{self.name}: gives {prototypes[0].shape}, not masks (1, n, height, width)"
             )

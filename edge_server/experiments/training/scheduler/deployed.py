@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -111,9 +112,12 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
         policy.shown_db = lambda begin_ns, end_ns: _outcome(deployment, begin_ns, end_ns).psnr_db
     try:
         deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
-    finally:
         if isinstance(policy, _Forking):
             policy.report(deployment.clock.now_ns())
+    except BaseException:
+        if isinstance(policy, _Forking):
+            policy.fail()
+        raise
     kept = [d for d in decisions if d.now_ns >= setting.lead_ms * 1e6]
     ends = [*(d.now_ns for d in kept[1:]), deployment.clock.now_ns()]
     states = channel_states(scenario, [d.now_ns for d in kept])
@@ -167,6 +171,12 @@ class _Forking(Threshold):
             shown = self.shown_db(self._began_ns, now_ns)
             os.write(self._answer, struct.pack("d", -np.inf if shown is None else shown))
             os._exit(0)
+
+    def fail(self) -> None:
+        """End a fork that has failed, without a result; nothing elsewhere."""
+        if self._answer is not None:
+            traceback.print_exc()
+            os._exit(1)
 
 
 def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outcome:

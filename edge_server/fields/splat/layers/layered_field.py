@@ -52,7 +52,7 @@ PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field
 RENDERINGS_A_FIT = 2  # of the static field that plates take over
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
 FINE_FRAMES = 6  # of each camera, before the static field learns from fine plates
-EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # in which cameras agree on an exposure, and steps of each
+EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # fits in which cameras agree on an exposure, and steps of each
 EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
 EXPOSURE_RATE = 1.6  # of correction: so few steps show some six tenths of a difference
 MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each taken in 15 times a second
@@ -95,6 +95,7 @@ class LayeredField:
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
         self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
         self.fine = False  # whether the static field learns from fine plates
+        self.exposure_rounds = 0  # in which cameras have agreed on an exposure
         self._published: LayeredSnapshot | None = None
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
@@ -132,7 +133,7 @@ class LayeredField:
             self._begin_again()
         taken = self._take_in(views)
         if self.tracker is None:
-            if not self._plates_are_known():
+            if not self._plates_are_known() or not self._exposures_agree():
                 return self._fit_first(views, budget, pace)
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
@@ -320,7 +321,6 @@ class LayeredField:
     def _begin_layers(self) -> MotionTracker:
         """Give the static field its first plates, and the moving set the scene's box."""
         begun = self.now()
-        self._agree_on_exposure()
         self.static.field.learn(self._plates())
         self.plates_s = self.observations.newest_s
         self.make_tracker()
@@ -335,7 +335,7 @@ class LayeredField:
         log.info("layers begin again: another camera has changed the box of the scene")
         self.static.reset()
         self.tracker = self._published = self._still = None
-        self.shown = False
+        self.shown, self.exposure_rounds = False, 0
         self.observations = Observations()
         for camera in self.cameras.values():
             camera.row, camera.depth_m, camera.rendered_step = None, None, -1
@@ -368,24 +368,33 @@ class LayeredField:
                 self.static.field.learn_again(plates)
         self.part_s.add("static field", begun)
 
-    def _agree_on_exposure(self) -> None:
+    def _exposures_agree(self) -> bool:
         """Correct the cameras' exposures by how their plates differ from what a field learns of all of them
-        in its first steps. Later it tells nothing: Gaussians that one camera alone sees have its exposure.
-        Their geometric mean stays."""
-        for _ in range(EXPOSURE_ROUNDS):
-            self.static.field.learn(self._plates())
-            self.static.field.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
-            self.static.publish()
-            self.static.render([camera.view for camera in self.cameras.values()])
-            renderings, self.static.rendered = self.static.rendered, {}
-            self.static.reset()
-            told = [c.plate.exposure_over(renderings[n][1].color) for n, c in self.cameras.items()]
-            logs = np.log(np.stack([np.ones(3, np.float32) if each is None else each for each in told]))
-            logs -= logs.mean(axis=0)
-            if logs.std(axis=0).max() < EXPOSURES_AGREE:
-                return
-            for camera, ratio in zip(self.cameras.values(), np.exp(EXPOSURE_RATE * logs), strict=True):
-                camera.correct_exposure(ratio.astype(np.float32))
+        in its first steps. Later it shows nothing: Gaussians that one camera alone sees have its exposure.
+        Their geometric mean stays, and a camera of too few well exposed pixels is left as it is.
+
+        One round a call. Returns whether it was the last."""
+        if self.exposure_rounds >= EXPOSURE_ROUNDS:
+            return True
+        begun = self.now()
+        self.exposure_rounds += 1
+        self.static.field.learn(self._plates())
+        self.static.field.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
+        self.static.publish()
+        self.static.render([camera.view for camera in self.cameras.values()])
+        renderings = {name: rendering.color for name, (_, rendering) in self.static.rendered.items()}
+        self.static.reset()
+        ratios = {n: c.plate.exposure_over(renderings[n]) for n, c in self.cameras.items()}
+        logs = {name: np.log(ratio) for name, ratio in ratios.items() if ratio is not None}
+        spread = np.stack(list(logs.values())) if logs else np.zeros((1, 3), np.float32)
+        self.part_s.add("exposures", begun)
+        if spread.std(axis=0).max() < EXPOSURES_AGREE:
+            self.exposure_rounds = EXPOSURE_ROUNDS
+            return True
+        for name, log_ratio in logs.items():
+            ratio = np.exp(EXPOSURE_RATE * (log_ratio - spread.mean(axis=0)))
+            self.cameras[name].correct_exposure(ratio.astype(np.float32))
+        return self.exposure_rounds >= EXPOSURE_ROUNDS
 
     def _plates(self) -> list[PlateImage]:
         return [camera.plate_image(self.fine) for camera in self.cameras.values()]

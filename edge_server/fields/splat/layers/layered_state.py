@@ -23,7 +23,7 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-COUNTERS = ("layered", "shown", "origin_ns", "plates_s", "fine_s", "fine")  # attributes of the field
+COUNTERS = ("layered", "shown", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 
@@ -60,7 +60,7 @@ def pack(field: Any) -> Arrays:
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
         tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
-    meta = {"version": 2, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
+    meta = {"version": 3, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
             "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 

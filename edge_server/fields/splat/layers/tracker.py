@@ -88,9 +88,9 @@ class MotionTracker:
             for _ in range(PASSES):
                 if self._solve(until_s, pace) < AGAIN_M or not pace.within(ALIGNING_SHARE):
                     break
-        if moving.alive:
             for o in self.observations:
-                o.fresh = False
+                o.fresh &= o.instant_s > until_s
+        if moving.alive:
             publish()
         since_s, begun = newest_s - self.seeded_s, self.times.now()
         has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= SEED_AT_LEAST_EVERY_S
@@ -102,7 +102,9 @@ class MotionTracker:
 
     def _strides(self) -> list[float]:
         """Instants up to which motion is followed, one after the other: the last is the newest frame's, and
-        those before it divide what is new since the last fit, where it is longer than ``STRIDE_S``."""
+        those before it divide what is new since the last fit, where it is longer than ``STRIDE_S``. Where no
+        frame of that fit is left, motion is lost and begins at the newest: strides from the oldest on follow
+        it worse."""
         newest_s = self.observations.newest_s
         fresh_s = np.array([o.instant_s for o in self.observations if o.fresh])
         since_s = max((o.instant_s for o in self.observations if not o.fresh), default=newest_s)
