@@ -99,7 +99,8 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     run.add_argument(
         "--response-timeout", type=float, default=5.0, metavar="S",
-        help="reconnect when a frame is not answered for so long (default %(default)s)",
+        help="reconnect when a frame is not answered for so long, or for much longer than those before "
+        "(default %(default)s)",
     )  # fmt: skip
     run.add_argument("-q", "--quiet", action="store_true", help="only warnings")
     transport.add_arguments(run)

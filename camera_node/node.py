@@ -44,7 +44,7 @@ class NodeOptions:
     clock: true time, which decides when frames are taken; a camera with a wrong clock stamps by that.
     out: folder for ledger and status; None for neither.
     seconds: how long to capture; None until stopped.
-    response_timeout_s: an answer that takes longer means a dead stream.
+    response_timeout_s: see ``Sender``.
     """
 
     to: str

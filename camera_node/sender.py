@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -29,6 +30,9 @@ CONNECT_S = 6.0
 # How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
 OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
+# An answer is waited for so many times as long as the slowest of the last ones took, this long at least.
+_PATIENCE, _LEAST_PATIENCE_S = 8.0, 1.25
+_FORGET = 0.95  # by answer, of how long the slowest took
 # An offset that was never measured may be anything: zero with a small uncertainty would be wrong.
 UNKNOWN_OFFSET = Offset(0, MAX_CAPTURE_AGE_NS)
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
@@ -49,7 +53,8 @@ class Sender:
 
     offset: returns the current estimate of the peer's clock, which each frame carries.
     jitter: of the pauses between attempts.
-    response_timeout_s: an answer that takes longer means a dead stream.
+    response_timeout_s: an answer that takes longer means a dead stream, and one that takes much longer than
+        those before as well. After each such stream the next answer may take twice as long.
     """
 
     def __init__(
@@ -71,7 +76,8 @@ class Sender:
         self._metadata = metadata
         self._offset = offset
         self._jitter = jitter
-        self._timeout = response_timeout_s
+        self._timeout = self._patience_s = response_timeout_s
+        self._slowest_s = 0.0
         self._reasons: dict[str, int] = {}
         self._offset_awaited = False
 
@@ -142,10 +148,10 @@ class Sender:
         self._offset_awaited = True
 
     async def _exchange(self, call: grpc.aio.StreamStreamCall, frame: Frame) -> None:
-        answered = False
+        answered, patience_s, begun_s = False, self._patience_s, time.monotonic()
         self.busy = True
         try:
-            async with asyncio.timeout(self._timeout):
+            async with asyncio.timeout(patience_s):
                 await call.write(to_request(self._stamped(frame)))
                 response = await call.read()
             if response is grpc.aio.EOF:
@@ -155,8 +161,11 @@ class Sender:
             if response.sequence != frame.sequence:
                 raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
             answered = True
+            self._slowest_s = max(time.monotonic() - begun_s, _FORGET * self._slowest_s)
+            self._patience_s = min(max(_PATIENCE * self._slowest_s, _LEAST_PATIENCE_S), self._timeout)
         except TimeoutError:
-            raise TimeoutError(f"no answer within {self._timeout:g} s") from None
+            self._patience_s = min(2.0 * patience_s, self._timeout)
+            raise TimeoutError(f"no answer within {patience_s:.3g} s") from None
         finally:
             self.busy = False
             if not answered:

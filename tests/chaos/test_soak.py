@@ -34,7 +34,8 @@ def test_real_processes_recover_from_every_kind_of_fault(tmp_path: Path) -> None
     kinds = {fault["kind"] for fault in result["faults"]}
     assert kinds | {"full disk"} == {kind for kind, _ in (*soak.KILLS, *soak.FAULTS, soak.FULL_DISK)}
     assert result["frames"]["closes"] and result["frames"]["delivered"] > 500, result["frames"]
-    # A length that is corrupted may leave both ends waiting, until the node's time-out of 5 s for an answer.
+    # A length that is corrupted may leave both ends waiting: the node waits 1.25 s for an answer, and twice
+    # as long after each stream that fails, up to 5 s.
     assert not [line for line in soak.problems(result) if not line.startswith("corrupted bytes")]
 
 

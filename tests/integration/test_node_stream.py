@@ -166,6 +166,28 @@ def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
         assert sequences == sorted(set(sequences))  # nothing is ever sent twice
 
 
+def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link_is_given_time(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=60.0)
+
+        async def work():
+            await peer.until(40)
+            peer.respond = silence
+            async with asyncio.timeout(20.0):
+                while peer.streams < 4:
+                    await asyncio.sleep(0.05)
+            peer.respond = answer(after_s=1.6)  # more than was waited for until then
+            await peer.until(len(peer.frames) + 12)
+
+        await run_while(node, work())
+        await peer.stop()
+
+    asyncio.run(scene())
+    for c in check_books(tmp_path / "out").values():
+        assert 1 <= c["broken"] <= 4 and c["answered"] >= 23
+
+
 def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
     ahead_ns = 7_000_000_000
     peer = Peer(clock=WallClock(offset_ns=ahead_ns))
