@@ -183,7 +183,7 @@ class LiveLink:
             if kind is EventKind.STARTED:
                 self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
-            # Without a circle of references, which would keep the bytes until the next garbage collection.
+            # Without a reference cycle, which would keep the bytes until the next garbage collection.
             message.transit = replace(event.transit, item=None)
             if kind is not EventKind.DUPLICATED:
                 self._room.held_bytes -= len(message.raw)

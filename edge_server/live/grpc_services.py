@@ -106,7 +106,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             try:
                 self._state.set_policy(request.name, value)
             except ValueError as error:
-                # ``abort`` raises an error that holds the request, in a circle: 8 MB each until collected.
+                # ``abort`` raises an error that a reference cycle keeps, and with it 8 MB of request.
                 context.set_code(grpc.StatusCode.INVALID_ARGUMENT)
                 context.set_details(str(error))
                 return edge_pb2.SetPolicyResponse()

@@ -70,9 +70,11 @@ def figure(
             yield fig, axes
             drawn = io.BytesIO()
             fig.savefig(drawn, dpi=dpi)
-            few = Image.open(drawn).convert("RGB").quantize(_COLORS, dither=Image.Dither.NONE)
+            image = Image.open(drawn).convert("RGB")
+            if not any(axis.images for axis in fig.axes):  # curves, no pictures
+                image = image.quantize(_COLORS, dither=Image.Dither.NONE)
             # Without a creation date, so that the same run draws the same bytes.
-            few.save(path, optimize=True)
+            image.save(path, optimize=True)
         finally:
             plt.close(fig)
 

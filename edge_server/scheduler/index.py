@@ -4,7 +4,7 @@ newest frame. Cameras of which nothing was used yet come first."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class Whittle(IndexPolicy):
 
 
 class _SeeingPolicy(IndexPolicy):
-    """Its index needs embeddings (6.31), of any width. A frame without one is judged by its age alone."""
+    """Its index needs embeddings (6.31), of any width. A camera without one is taken for an average one."""
 
     embedding = None, ""
 
@@ -74,6 +74,7 @@ class _SeeingPolicy(IndexPolicy):
 
     def _look(self, epoch: Epoch) -> None:
         state = None if epoch.state is None else epoch.state(("semantics",))
+        self._seen = {}
         if state is not None and state.embeddings is not None:
             rows = zip(state.cameras, state.embeddings)
             self._seen = {camera: z for camera, z in rows if np.isfinite(z).all()}
@@ -93,14 +94,21 @@ class IncorrectAge(_SeeingPolicy):
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
         super().__init__(value, rng)
         self._known: dict[str, Embedding] = {}
+        self._distance: dict[str, float] = {}
+
+    def _look(self, epoch: Epoch) -> None:
+        super()._look(epoch)
+        both = self._seen.keys() & self._known.keys()
+        self._distance = {c: float(np.linalg.norm(self._seen[c] - self._known[c])) for c in both}
 
     def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
-        z, known = self._seen.get(camera), self._known.get(camera)
-        if z is None or known is None:
-            return known_ms if known_ms > age_ms else 0.0
-        return known_ms * float(np.linalg.norm(z - known))
+        if known_ms <= age_ms:  # its newest frame was used
+            return 0.0
+        return known_ms * self._distance.get(camera, _average(self._distance.values()))
 
     def _use(self, cameras: set[str]) -> None:
+        for camera in cameras:
+            self._known.pop(camera, None)
         self._known |= {c: self._seen[c] for c in cameras if c in self._seen}
 
 
@@ -135,5 +143,9 @@ class PredictedCovariance(_SeeingPolicy):
                 self._last[camera] = at_ns, z
 
     def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
-        squares, ms = self._walk.get(camera, (1.0, 1.0))
-        return squares / ms * (known_ms - age_ms)
+        rates = {c: squares / ms for c, (squares, ms) in self._walk.items()}
+        return rates.get(camera, _average(rates.values())) * (known_ms - age_ms)
+
+
+def _average(values: Collection[float]) -> float:
+    return sum(sorted(values)) / len(values) if values else 1.0

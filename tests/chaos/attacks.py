@@ -428,7 +428,9 @@ def main() -> int:
         files.write_json(args.json, result, indent=1)
     print(json.dumps({key: value for key, value in result.items() if key != "attacks"}))
     held = all(result["alive"].values()) and not result["escapes_in_logs"] + result["tracebacks_in_logs"]
-    return 0 if held else 1
+    refused = not any(row["answer"].startswith("read") for row in result["attacks"])
+    heard = all(each["frames"] for row in result["attacks"] for each in row["neighbours"].values())
+    return 0 if held and refused and heard else 1
 
 
 if __name__ == "__main__":

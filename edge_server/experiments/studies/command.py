@@ -101,16 +101,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     folders = folders_of(args)
     scenes = tuple(args.scene.split(",")) if args.scene else None
     request = StudyRequest(
-        args.quick,
-        args.out,
-        folders,
-        args.seeds,
-        scenes,
-        args.jobs,
-        tuple(args.case),
-        args.episodes,
-        args.field,
-    )
+        quick=args.quick, out=args.out, folders=folders, seeds=args.seeds, scenes=scenes, jobs=args.jobs,
+        cases=tuple(args.case), episodes=args.episodes, field=args.field,
+    )  # fmt: skip
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
 
     def work() -> None:
@@ -152,8 +145,9 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
     if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
         raise StudyError("--scene and --ray: captures are made here, and those of preferences of tile")
-    if set(names) <= {*LEARNING, *CAPTURING} and request.field != "splat":
-        raise StudyError("--field: studies that learn or capture have representations of their own")
+    own = {*LEARNING, *CAPTURING, "metrics", "representations"}
+    if set(names) <= own and request.field != "splat":
+        raise StudyError(f"--field: {', '.join(names)} has representations of its own, or none")
     if request.cases and not set(names) <= set(CASED):
         raise StudyError(f"--case is for {', '.join(CASED)}")
     if request.episodes is not None and not set(names) <= set(LEARNING):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -132,6 +133,7 @@ class _Forking(Threshold):
     def __init__(self, who: Hindsight) -> None:
         super().__init__(None, np.random.default_rng(0))
         self._who, self._began_ns, self._until_ns = who, 0, 0
+        cv2.setNumThreads(1)  # a fork has no other threads
         self._answer: int | None = None  # a fork writes there what its action showed, and ends
         self.shown_db: Callable[[int, int], float | None] = lambda begin_ns, end_ns: None
 
