@@ -280,9 +280,9 @@ def card() -> str:
     )
 
 
-def compared() -> str:
+def compared(file: str) -> str:
     """What policies without learning show in the scenario card, and minus the first, over seeds."""
-    found = measured("docs/results/learning/policies.json")
+    found = measured(f"docs/results/learning/{file}.json")
     first = next(iter(found["policies"]))
     columns = ("psnr_db", f"psnr_db_over_{first}", "psnr_moving_db", f"psnr_moving_db_over_{first}")
     rows = [
@@ -464,7 +464,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "drift": lambda: following("drift"),
     "limits": limits,
     "card": card,
-    "compared": compared,
+    "compared": lambda: compared("policies"),
+    "hindsight": lambda: compared("hindsight"),
     "figures": figures,
     "verdicts": verdicts,
 }
