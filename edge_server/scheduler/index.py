@@ -95,16 +95,18 @@ class IncorrectAge(_SeeingPolicy):
         super().__init__(value, rng)
         self._known: dict[str, Embedding] = {}
         self._distance: dict[str, float] = {}
+        self._average = 1.0
 
     def _look(self, epoch: Epoch) -> None:
         super()._look(epoch)
         both = self._seen.keys() & self._known.keys()
         self._distance = {c: float(np.linalg.norm(self._seen[c] - self._known[c])) for c in both}
+        self._average = _average(self._distance.values())
 
     def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
         if known_ms <= age_ms:  # its newest frame was used
             return 0.0
-        return known_ms * self._distance.get(camera, _average(self._distance.values()))
+        return known_ms * self._distance.get(camera, self._average)
 
     def _use(self, cameras: set[str]) -> None:
         for camera in cameras:
@@ -128,6 +130,8 @@ class PredictedCovariance(_SeeingPolicy):
         self._last: dict[str, tuple[int, Embedding]] = {}
         self._walk: dict[str, tuple[float, float]] = {}
         """camera -> sum of squared changes, and of the milliseconds that they took."""
+        self._rate: dict[str, float] = {}
+        self._average = 1.0
 
     def _look(self, epoch: Epoch) -> None:
         super()._look(epoch)
@@ -141,10 +145,11 @@ class PredictedCovariance(_SeeingPolicy):
                 change = float(((z - before[1]) ** 2).sum())
                 self._walk[camera] = squares + change, ms + (at_ns - before[0]) / 1e6
                 self._last[camera] = at_ns, z
+        self._rate = {c: squares / ms for c, (squares, ms) in self._walk.items()}
+        self._average = _average(self._rate.values())
 
     def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
-        rates = {c: squares / ms for c, (squares, ms) in self._walk.items()}
-        return rates.get(camera, _average(rates.values())) * (known_ms - age_ms)
+        return self._rate.get(camera, self._average) * (known_ms - age_ms)
 
 
 def _average(values: Collection[float]) -> float:
