@@ -158,7 +158,8 @@ class FieldUpdater:
             return observe(self.buffer.cameras, seen, now_ns, self.embeddings, parts, keep_frames=True)
 
         generated = {c: item.generated_ns for c, item in newest.items()}
-        return Epoch(now_ns, self.number, generated, state)
+        received = {c: item.received_ns for c, item in newest.items()}
+        return Epoch(now_ns, self.number, generated, state, received)
 
     def plan(self, now_ns: int) -> SelectionWindow:
         """The first half of a decision: how long to wait for frames."""

@@ -8,7 +8,7 @@ arguments (and of the policy's own seeded stream), so that live and virtual time
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -30,15 +30,17 @@ class Observer(Protocol):
 class Epoch:
     """What a policy may look at.
 
-    now_ns: time of the decision on the edge's clock. number: counts the epochs. generated_ns: generation time
-    of the newest frame of every camera that has reported; others are missing. state: of all cameras, with
-    poses and embeddings, for policies that look at more than ages; None where it is not available.
+    now_ns: time of the decision on the edge's clock. number: counts the epochs. generated_ns, received_ns:
+    when the newest frame of every camera that has reported was generated, and arrived; others are missing.
+    state: of all cameras, with poses and embeddings, for policies that look at more than ages; None where it
+    is not available.
     """
 
     now_ns: int
     number: int
     generated_ns: Mapping[str, int]
     state: Observer | None = None
+    received_ns: Mapping[str, int] = field(default_factory=dict)
 
     def age_ms(self, camera: str) -> float:
         return (self.now_ns - self.generated_ns[camera]) / 1e6
@@ -49,13 +51,14 @@ class SelectionWindow:
     """The first half of a decision: when to select, and which frames qualify.
 
     omega_ms: shown to people; None for policies without one. wait_until_ns: earliest instant of selection.
-    generated_after_ns: only frames generated later qualify (omega-wait); None admits all. flush: abort what
-    is in transit at the decision.
+    generated_after_ns, received_after_ns: only frames generated, or arrived, later qualify (omega-wait); None
+    admits all. flush: abort what is in transit at the decision.
     """
 
     omega_ms: float | None = None
     wait_until_ns: int = 0
     generated_after_ns: int | None = None
+    received_after_ns: int | None = None
     flush: bool = False
 
 

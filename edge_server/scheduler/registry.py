@@ -15,7 +15,7 @@ import numpy as np
 
 from edge_server.scheduler import fixed, index
 from edge_server.scheduler.policy import Policy
-from edge_server.scheduler.wait import Wait, WaitFlush
+from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
 
 # name -> (class, one line of help)
 POLICIES: dict[str, tuple[type[Policy], str]] = {
@@ -30,6 +30,7 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "covariance": (index.PredictedCovariance, "the k views whose predicted variance falls most; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
+    "wait-arrived": (WaitArrived, "as wait, but frames that arrive meanwhile, however old (6.16)"),
     "wait-flush": (WaitFlush, "as wait, what is on its way at the decision broken off (6.5)"),
 }
 

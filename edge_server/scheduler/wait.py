@@ -1,10 +1,13 @@
-"""omega-wait (6.15-6.17): wait omega, then use the newest frame of each camera *generated* meanwhile.
+"""omega-wait (6.15-6.17): wait omega, then use the newest frame of each camera if it is of the meantime.
 
 The horizon is (t, t + omega] and ages are taken at its end. omega = 0 uses the buffer as it is (6.34). If
-nothing qualifies at the end, the wait goes on until the first frame that does.
+nothing qualifies at the end, the wait goes on until the first frame that does. The thesis has two readings of
+what qualifies: frames *generated* in the horizon (6.5: ``wait``), or those that *arrive* in it, however old
+(6.16 and algorithm 2: ``wait-arrived``).
 
-A frame in transit at the decision blocks a link that serves one frame at a time, though it will not be used.
-``wait-flush`` aborts it: the thesis's reading (6.5: "no packets are considered in transit").
+A frame in transit at the decision blocks a link that serves one frame at a time, though ``wait`` will not use
+it. ``wait-flush`` aborts it (6.5: "no packets are considered in transit"), and then both readings are the
+same.
 """
 
 from __future__ import annotations
@@ -23,7 +26,14 @@ class Wait(Policy):
         return wait_window(epoch.now_ns, self.value)
 
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-        return generated_in(epoch, window)
+        return qualified(epoch, window)
+
+
+class WaitArrived(Wait):
+    name = "wait-arrived"
+
+    def plan(self, epoch: Epoch) -> SelectionWindow:
+        return wait_window(epoch.now_ns, self.value, arrived=True)
 
 
 class WaitFlush(Wait):
@@ -34,14 +44,18 @@ class WaitFlush(Wait):
         return replace(window, flush=window.generated_after_ns is not None)
 
 
-def wait_window(now_ns: int, omega_ms: float) -> SelectionWindow:
-    """The horizon (now, now + omega]; omega = 0 admits the buffer as it is, at once."""
+def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> SelectionWindow:
+    """The horizon (now, now + omega]; omega = 0 admits the buffer as it is, at once. arrived: admits frames
+    that arrive in it, else those generated in it."""
     if omega_ms == 0.0:
         return SelectionWindow(omega_ms=0.0)
-    return SelectionWindow(omega_ms, wait_until_ns=now_ns + round(omega_ms * 1e6), generated_after_ns=now_ns)
+    after = {"received_after_ns" if arrived else "generated_after_ns": now_ns}
+    return SelectionWindow(omega_ms, wait_until_ns=now_ns + round(omega_ms * 1e6), **after)
 
 
-def generated_in(epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-    """Cameras whose newest frame was generated after the window opened; all where it admits all."""
+def qualified(epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+    """Cameras whose newest frame is of the window; all where it admits all."""
+    if (after := window.received_after_ns) is not None:
+        return tuple(c for c, received in epoch.received_ns.items() if received > after)
     after = window.generated_after_ns
     return tuple(c for c, generated in epoch.generated_ns.items() if after is None or generated > after)

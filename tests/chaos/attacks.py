@@ -133,7 +133,10 @@ def opened(at: str, method: str, count: int, most: int, *first: bytes) -> Run:
     async def run(to: dict[str, str]) -> tuple[list[float], str]:
         async with Transport().aio_channel(to[at]) as channel:
             begun_s, took_ms = time.monotonic(), []
-            calls = [channel.stream_stream(method)(iter(first) if first else None) for _ in range(count)]
+            calls: list[Any] = [
+                channel.unary_stream(method)(*first) if first else channel.stream_stream(method)()
+                for _ in range(count)
+            ]
             while time.monotonic() < begun_s + SECONDS:
                 await asyncio.sleep(0.01)
                 if not took_ms and sum(not call.done() for call in calls) <= most:

@@ -113,6 +113,7 @@ class Trial:
             grace_ms=0.0,
             first_ms=self.first_ms,
             scratch=self.scratch,
+            shown_every_ms=self.every_ms / 2.0,
         )
 
 
@@ -127,20 +128,31 @@ class Stage:
 def run_trial(trial: Trial, folders: Folders) -> Row:
     """Means over the trial's decisions.
 
-    psnr_db, psnr_moving_db, ssim, lpips: None where there are none. views: number of used views. aaoi_ms:
+    psnr_db, psnr_moving_db, ssim, lpips: of what was published; None where there are none. shown_db,
+    shown_moving_db: PSNR of what was shown at random instants since. views: number of used views. aaoi_ms:
     their mean age at publication (6.35). age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from
     decision to publication. decisions: their number.
 
     Raises ScenarioError or DatasetError.
     """
     rows: list[Row] = []
-    deployment: VirtualDeployment = _deploy(trial, folders, lambda p: rows.append(_row(p, deployment)))
+    shown_before = [0]  # each publication
+
+    def published(publication: Publication) -> None:
+        rows.append(_row(publication, deployment))
+        shown_before.append(len(deployment.shown))
+
+    deployment = _deploy(trial, folders, published)
     _finish(deployment, trial)
     kept = rows[trial.settle : trial.settle + trial.decisions]
     if not kept:
         raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
-    names = [n for n in kept[0] if n != "decisions"]
-    return {**{n: mean_or_none([row[n] for row in kept]) for n in names}, "decisions": len(kept)}
+    shown = deployment.shown[shown_before[trial.settle + 1] :]
+    return {
+        **{n: mean_or_none([row[n] for row in kept]) for n in kept[0]},
+        **{f"shown_{n}": mean_or_none([getattr(s, f"psnr_{n}") for s in shown]) for n in ("db", "moving_db")},
+        "decisions": len(kept),
+    }
 
 
 def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:
@@ -187,7 +199,6 @@ def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
         "aaoi_ms": publication.aaoi_ms,
         "age_sum_ms": float(sum(a for a in ages.values() if a is not None)),
         "wait_ms": (publication.published_ns - deployment.decided_ns) / 1e6,
-        "decisions": 1,
     }
 
 

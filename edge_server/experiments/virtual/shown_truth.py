@@ -35,6 +35,7 @@ LONGEST_LAG_MS, EARLIEST_LAG_MS = 600.0, -100.0
 _IMAGES_KEPT = 4096
 _MOMENT_S = 1e-3  # over which velocities are taken
 PARTS = ("whole", "moving", "still")
+PERFECT = ("newest", "mean", "frozen")
 
 
 def carried_on(body: MovingBody, known_s: float) -> MovingBody:
@@ -112,7 +113,8 @@ class ShownTruth:
     from_ns: what is shown before is not looked at.
     instants: of each picture when it was looked at, its mean squared errors (``PARTS``; None where nothing
     moves), those of the perfect field that knows the scene up to the capture of the newest view (``newest``)
-    and up to the mean capture of all cameras' newest views (``mean``), content lag and ages.
+    and up to the mean capture of all cameras' newest views (``mean``), and of the scene as it was at the
+    latter (``frozen``), content lag and ages.
     """
 
     world: KnownWorld
@@ -149,6 +151,9 @@ class ShownTruth:
             "shown": squared_errors(shown, truth, moving),
             **{known: squared_errors(world.carried(present_ns - 1e6 * age_ms, present_ns), truth, moving)
                for known, age_ms in ages_ms.items()},
+            "frozen": squared_errors(
+                world.image(index - round(1e6 * ages_ms["mean"] / GRID_NS)), truth, moving
+            ),
             "lag_ms": world.lag_ms(shown, index, moving),
             "age_ms": {
                 **ages_ms, "network": publication.network_ms, "waiting": waiting_ms,

@@ -17,7 +17,7 @@ from edge_server.scheduler.fixed import within_threshold
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
-from edge_server.scheduler.wait import generated_in, wait_window
+from edge_server.scheduler.wait import qualified, wait_window
 
 
 class BanditPolicy(Policy):
@@ -42,13 +42,15 @@ class BanditPolicy(Policy):
         if action == "select":
             return SelectionWindow()
         omega_ms = self.actor.spec.omegas_ms[int(self._decide(epoch))]
-        return wait_window(epoch.now_ns, omega_ms) if action == "wait" else SelectionWindow(omega_ms)
+        if action == "threshold":
+            return SelectionWindow(omega_ms)
+        return wait_window(epoch.now_ns, omega_ms, arrived=action == "wait-arrived")
 
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         if not epoch.generated_ns:
             return ()
-        if self.actor.spec.action == "wait":
-            return generated_in(epoch, window)
+        if self.actor.spec.action.startswith("wait"):
+            return qualified(epoch, window)
         if self.actor.spec.action == "threshold":
             assert window.omega_ms is not None  # this policy's own window
             return within_threshold(epoch, window.omega_ms)

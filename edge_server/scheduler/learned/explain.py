@@ -98,8 +98,7 @@ def describe_action(actor: Actor, action: Any, names: Sequence[str]) -> str:
     if actor.spec.action == "select":
         used = [name for name, chosen in zip(names, action) if chosen]
         return f"{len(used)} of {len(names)} views"
-    verb = "wait" if actor.spec.action == "wait" else "threshold"
-    return f"{verb} {actor.spec.omegas_ms[int(action)]:g} ms"
+    return f"{actor.spec.action} {actor.spec.omegas_ms[int(action)]:g} ms"
 
 
 def occlusion_map(

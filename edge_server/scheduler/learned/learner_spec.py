@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from edge_server.scheduler.learned.state import StateLayout, require_int
 
-Action = Literal["select", "wait", "threshold"]
-ACTIONS: tuple[Action, ...] = ("select", "wait", "threshold")
+Action = Literal["select", "wait", "wait-arrived", "threshold"]
+ACTIONS: tuple[Action, ...] = ("select", "wait", "wait-arrived", "threshold")
 # A specification may come from an untrusted file. These bound what is allocated for it: with both networks
 # and Adam's moments half a gigabyte, far more than a decision needs.
 MAX_HIDDEN = 1024
@@ -23,8 +23,8 @@ MAX_FIRST_WEIGHTS = 2**22
 class Spec:
     """Actions, state, network and hyperparameters of a learner.
 
-    action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait`` and ``threshold`` choose
-    one of ``omegas_ms`` (6.34, 6.39).
+    action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait``, ``wait-arrived`` and
+    ``threshold`` choose one of ``omegas_ms`` (6.34, 6.39).
     layout: the features of a state.
     network: ``pooled`` shares one encoder among any number of cameras; ``flat`` is the thesis's, one layer
     over ``cameras`` cameras in their order.
@@ -58,7 +58,7 @@ class Spec:
         if self.action not in ACTIONS:
             raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
         if (self.action == "select") != (not self.omegas_ms):
-            raise ValueError(f"action {self.action}: omegas_ms belong to wait and threshold, and only there")
+            raise ValueError(f"action {self.action}: omegas_ms belong to all but select, and only there")
         if len(self.omegas_ms) > MAX_OMEGAS:
             raise ValueError(f"omegas_ms: expected at most {MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))

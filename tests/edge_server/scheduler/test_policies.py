@@ -51,6 +51,16 @@ def test_wait_counts_only_what_was_generated_after_the_decision():
     assert policy.select(epoch(260, a=190, b=80), window) == ()  # the wait goes on
 
 
+def test_wait_arrived_counts_what_came_in_meanwhile_however_old():
+    policy = make_policy("wait-arrived", 60, np.random.default_rng(0))
+    window = policy.plan(AT)
+    assert (window.wait_until_ns, window.generated_after_ns, window.received_after_ns) == (
+        260 * MS, None, 200 * MS,
+    )  # fmt: skip
+    at = replace(epoch(260, a=100, b=201, c=150), received_ns={"a": 220 * MS, "b": 230 * MS, "c": 200 * MS})
+    assert policy.select(at, window) == ("a", "b")
+
+
 def test_wait_of_zero_uses_the_buffer_as_it_is():
     assert choose("wait", AT, 0) == ("a", "b", "c", "d")
     assert make_policy("wait", 0, np.random.default_rng(0)).plan(AT).omega_ms == 0.0

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from edge_server.experiments.bench.shown.rows import ROWS
 from edge_server.experiments.bench.shown.runs import FIRST_VARIANT, SHOWN_EVERY_MS, VARIANTS
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table, mean_or_none, number
@@ -25,6 +26,11 @@ _SHOWN_TEXT = (
     "seeds. Content lag: the tau, up to 600 ms, at which truth(t - tau) matches the moving pixels shown "
     "best. Age: of the cameras' newest views that the picture rests on, when it was looked at; display: "
     "since it was published. The page adds what the browser takes."
+)
+_SLOWER_TEXT = (
+    "Slower processors: the same scenes, first seed, where an update and a frame are charged twice and four "
+    "times as much. *A perfect field that stands still*: the true moving pixels as they were at the mean "
+    "capture of the newest views that the same run showed."
 )
 _CEILINGS_TEXT = (
     "Ceilings, whole / moving, first seed. *Nothing late*: the same field, ideal network, computing free: "
@@ -57,6 +63,7 @@ def table(figures: Figures) -> str:
             _SHOWN_TEXT,
             *meaning,
             _shown_table(figures),
+            *_slower_table(figures),
             *_trends(figures),
             _CEILINGS_TEXT,
             _ceilings_table(figures),
@@ -78,13 +85,35 @@ def _trends(figures: Figures) -> list[str]:
     return ["Long runs, minute by minute:", markdown_table(["scene", *map(str, minutes)], rows)]
 
 
+def _slower_table(figures: Figures) -> list[str]:
+    """Rows on slower processors beside the same on this one, with a heading; nothing without such runs."""
+    slower = {row.name: row for row in ROWS if row.slower > 1.0 and row.name in figures and not row.minutes}
+    if not slower:
+        return []
+    rows = []
+    for of in dict.fromkeys(row.charged_as for row in slower.values()):
+        for name, speed in ((of, 1.0), *((n, 1 / r.slower) for n, r in slower.items() if r.charged_as == of)):
+            if (run := _first(figures, name, "shown")) is None or "frozen" not in run["perfect"]:
+                continue
+            rows.append((
+                of, f"{speed:g}", *(number(run["psnr_db"][part], 1) for part in PARTS),
+                number(run["perfect"]["frozen"]["psnr_db"]["moving"], 1), number(run["age_ms"]["mean"], 0),
+                number(run["updates"] / run["seconds"], 0), f"{run['left_out'] / run['arrivals']:.0%}",
+            ))  # fmt: skip
+    head = (
+        "scene|speed|whole|moving|still|a perfect field that stands still|mean age, ms|updates a second|"
+        "frames left out"
+    )
+    return [_SLOWER_TEXT, markdown_table(head.split("|"), rows)]
+
+
 def _shown_table(figures: Figures) -> str:
     head = (
         "scene|mode|runs|whole|moving|still|content lag p50 / p95, ms|newest view, ms|"
         "mean age = network + waiting + computing + display, ms"
     )
     rows = []
-    for name in figures:
+    for name in _own(figures):
         for mode, variant in (("layers", "shown"), ("before", "before")):
             if not (runs := list(figures[name].get(variant, {}).values())):
                 continue
@@ -103,7 +132,7 @@ def _ceilings_table(figures: Figures) -> str:
         f"error of moving pixels, %: {' + '.join(_SHARES)}|charged, ms"
     )
     rows = []
-    for name in figures:
+    for name in _own(figures):
         if (shown := _first(figures, name, "shown")) is None:
             continue
         of = (shown, *(_first(figures, name, v) for v in ("computing free", FIRST_VARIANT)))
@@ -112,6 +141,12 @@ def _ceilings_table(figures: Figures) -> str:
         charged = "{ms_per_update:.1f} an update, {ms_per_view:.2f} a view".format(**shown["charged"])
         rows.append((name, *map(_pair, (*of, *perfect)), shares, charged))
     return markdown_table(head.split("|"), rows)
+
+
+def _own(figures: Figures) -> list[str]:
+    """The scenes that have costs of their own."""
+    others = {row.name for row in ROWS if row.charged_as}
+    return [name for name in figures if name not in others]
 
 
 def _first(figures: Figures, name: str, variant: str) -> dict[str, Any] | None:
@@ -148,7 +183,7 @@ def draw(figures: Figures, path: Path) -> None:
     (PNG)."""
     from edge_server.report.style import CYCLE, figure
 
-    names = [name for name in figures if _first(figures, name, "shown")]
+    names = [name for name in _own(figures) if _first(figures, name, "shown")]
     if not names:
         return
     lines: dict[str, list[Figures | None]] = {v: [_first(figures, n, v) for n in names] for v in VARIANTS}

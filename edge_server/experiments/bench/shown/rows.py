@@ -28,8 +28,9 @@ class Row:
     base: a scenario, shipped or a file. changes: keys of its sections, instead of its own.
     seeds: how often what is shown is measured, with seeds from FIRST_SEED on.
     split: whether network and computing are told apart.
-    minutes: of a long run, to see whether age or fidelity has a trend: nothing else is measured then.
-    charged_as: the row whose costs are charged, which has to be known.
+    minutes: of a long run, to see whether age or fidelity has a trend.
+    charged_as: the row whose costs are charged, which has to be known; only what is shown is measured then.
+    slower: how many times as much is charged: a processor of 1 / ``slower`` the speed.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Row:
     split: bool = True
     minutes: int = 0
     charged_as: str = ""
+    slower: float = 1.0
 
     def scenario(self, seed: int, edge: str) -> Scenario:
         """The scene under one of ``EDGES``. Raises ScenarioError."""
@@ -80,16 +82,19 @@ def _case(name: str, **changes: Any) -> Row:
     return Row(f"room, {name}", "room", changes, split=False)
 
 
+_HARD = (
+    _case("stop and go", source={"params": {"course": "stops"}}),
+    _case("reversals", source={"params": {"course": "reverses"}}),
+    _case("teleports", source={"params": {"course": "jumps"}}),
+    _case("two people", source={"params": {"people": 2}}),
+)
 ROWS: tuple[Row, ...] = (
     Row("room", seeds=5),
     Row("room19", "room19", {"cameras": {"phase": "spread"}}, seeds=3),
     Row("tower", "tower", seeds=3),
     Row("room, 3 m/s", "room", {"source": {"speed_m_per_s": 3.0}}, seeds=3),
     *map(drawn, DRAWN),
-    _case("stop and go", source={"params": {"course": "stops"}}),
-    _case("reversals", source={"params": {"course": "reverses"}}),
-    _case("teleports", source={"params": {"course": "jumps"}}),
-    _case("two people", source={"params": {"people": 2}}),
+    *_HARD,
     _case("exposure drifts", source={"effects": {"exposure_drift": None}}),
     _case("a lamp goes out", source={"effects": {"light_switch": {"in_truth": True, "period_s": 4.8}}}),
     _case("noise", source={"effects": {"sensor_noise": {"read_noise_counts": 5.0}}}),
@@ -98,11 +103,17 @@ ROWS: tuple[Row, ...] = (
     _case("4 cameras", cameras={"count": 5}),
     _case("1 camera", cameras={"count": 2}),
     _case("cameras locked", cameras={"phase": "locked"}),
-    # Ages follow from what is charged, so that small pictures will do.
+    *(
+        replace(row, name=f"{row.name}, {speed} the speed", charged_as=row.name, slower=slower)
+        for speed, slower in (("half", 2.0), ("a quarter of", 4.0))
+        for row in (Row("room", split=False), *_HARD)
+    ),
+    # Offered twice what it can take. Ages follow from what is charged, so that small pictures will do.
     replace(
-        _case("30 fps, ten minutes", source={"fps": 30.0, "width": 32, "height": 32}),
+        _case("a quarter of the speed, ten minutes", source={"width": 32, "height": 32}),
         minutes=10,
         charged_as="room",
+        slower=4.0,
     ),
 )
 

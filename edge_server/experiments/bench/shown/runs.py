@@ -23,7 +23,7 @@ from edge_server.experiments.common.result_store import ResultStore, settings_di
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.shown_truth import PARTS, KnownWorld, ShownTruth
+from edge_server.experiments.virtual.shown_truth import PARTS, PERFECT, KnownWorld, ShownTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.fidelity.psnr import psnr_of_mse
 from edge_server.live.state import Publication
@@ -73,7 +73,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
             world = KnownWorld(row.scenario(FIRST_SEED, "layers"))
             for name, variant in VARIANTS.items():
                 repeats = row.seeds if variant.repeats and not run.quick else 1
-                if row.minutes and name != "shown":
+                if row.charged_as and name != "shown":
                     continue
                 long_s = 60.0 * row.minutes * (not run.quick)
                 for seed in range(FIRST_SEED, FIRST_SEED + repeats):
@@ -97,7 +97,9 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
                 f"{row.name} is charged as {of}, which is not known: measure that first (--resume)"
             )
         cost = store.results[of][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
-        compute = Compute(ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
+        compute = Compute(
+            ms_per_update=row.slower * cost["update_ms"], ms_per_view=row.slower * cost["view_ms"]
+        )
     sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
     settings = variant.settings(compute)
     if seconds > SETTLED_S:
@@ -136,6 +138,7 @@ def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: 
         found["by_minute"] = by_minute(truth.instants)
     return {
         **found, "updates": len(deployment.publications), "charged": vars(settings.compute),
+        "seconds": seconds, "arrivals": deployment.updates.buffer.arrivals,
         "left_out": deployment.updates.buffer.shed,
     }  # fmt: skip
 
@@ -152,8 +155,8 @@ def by_minute(instants: Sequence[dict[str, Any]]) -> list[dict[str, float]]:
 
 
 def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """psnr_db, squared_error by part; the perfect field's of ``newest`` and ``mean``; lag_ms p50 and p95;
-    mean ages."""
+    """psnr_db, squared_error by part; the perfect field's of ``newest``, ``mean`` and ``frozen``; lag_ms p50
+    and p95; mean ages."""
     lags = [i["lag_ms"] for i in instants if i["lag_ms"] is not None]
     found: dict[str, Any] = {
         "instants": len(instants),
@@ -163,7 +166,7 @@ def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
             for name in instants[0]["age_ms"]
         },
     }  # fmt: skip
-    for kind in ("shown", "newest", "mean"):
+    for kind in ("shown", *PERFECT):
         errors = {part: [e for i in instants if (e := i[kind][part]) is not None] for part in PARTS}
         place = found if kind == "shown" else found.setdefault("perfect", {}).setdefault(kind, {})
         place["psnr_db"] = {

@@ -32,7 +32,7 @@ OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (15.0, 45.0, 75.0, 120.0, 240.0)
 # The thesis's two traffic states, and the optimum of threshold and the plateau of wait that it names (6.5).
 STATES = {"high": ("ch6-high", 50.0, 62.0), "low": ("ch6-low", 72.0, 105.0)}
-POLICIES = ("threshold", "wait", "wait-flush")
+POLICIES = ("threshold", "wait", "wait-arrived", "wait-flush")
 SHOWN = (30.0, 60.0, 120.0)
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "f_w")
 # A curve is on its plateau where it is this near to its best.

@@ -50,8 +50,9 @@ RUNS = {True: 1, False: 3}
 
 Runs = Sequence[PerSeed]
 """Rewards by seed of each of several trainings that differ in their random seed only."""
-Parts = Iterator[tuple[list[Verdict], list[Row]]]
-"""Verdicts and rows of the table, of one case of a study after the other."""
+Part = tuple[list[Verdict], list[Row]]
+"""Verdicts and rows of the table, of one case of a study."""
+Parts = Iterator[Part]
 
 
 class TrainingStudy:

@@ -1,11 +1,14 @@
-"""What each part of the state is worth (6.33): age; + pose; + semantics; all."""
+"""What each part of the state [Z, age, pose] is worth (6.33) for choosing views, and for choosing omega."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
+from edge_server.experiments.studies.learning.ppo_wait import THESIS_AGE
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
+    Part,
     Parts,
     StudyTrainer,
     TrainingStudy,
@@ -18,16 +21,25 @@ from edge_server.experiments.studies.learning.setup import (
     simple_policies,
 )
 from edge_server.experiments.studies.study import StudyRequest, Verdict
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
-from edge_server.experiments.training.scheduler.setting import layout_of
+from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
+from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, layout_of
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.learner_spec import Action, Spec
 
 EPISODES = {True: 100, False: 600}
+WHICH_VIEWS, CHAPTER_6 = "which views", "chapter 6"
 # name -> parts of the state
 VARIANTS = {
     "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
     "all": ("semantics", "age", "pose"),
+}  # fmt: skip
+# The chapter's schedulers, ``wait`` in both of its readings.
+KINDS: tuple[Action, ...] = ("threshold", "wait", "wait-arrived")
+WHOLE = "Z, age, pose"
+# name -> parts of the state, each left out in turn
+LEFT_OUT = {
+    WHOLE: ("semantics", "age", "pose"), "age, pose": ("age", "pose"), "Z, pose": ("semantics", "pose"),
+    "Z, age": ("semantics", "age"),
 }  # fmt: skip
 
 
@@ -36,10 +48,12 @@ class Ablation(TrainingStudy):
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
     def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
-        variants = dict(VARIANTS)
-        if missing := embeddings_missing():
-            print(f"  semantics are left out: {missing}")
-            variants = {name: parts for name, parts in variants.items() if "semantics" not in parts}
+        cases = {WHICH_VIEWS: self._which_views, CHAPTER_6: self._chapter_6}
+        for case in request.chosen(list(cases), [WHICH_VIEWS]):
+            yield cases[case](trainer, request)
+
+    def _which_views(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
+        variants = usable(VARIANTS)
         # All variants see the same decisions, drawn with all parts that any of them uses.
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
@@ -50,7 +64,62 @@ class Ablation(TrainingStudy):
             trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
             candidates |= named_runs(f"learnt {name}", trained)
         evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
-        yield judge(evaluation, list(variants)), rows(evaluation)
+        return judge(evaluation, list(variants)), rows(evaluation)
+
+    def _chapter_6(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
+        variants = usable(LEFT_OUT)
+        parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
+        setting = room("ch6", held_out=FOUR_VIEWPOINTS, parts=parts)
+        reward = dataclasses.replace(trainer.reward("corrected"), age=THESIS_AGE)
+        candidates: dict[str, Candidate] = {}
+        for kind in KINDS:
+            candidates |= simple_policies(kind)
+            for name, used in variants.items():
+                spec = Spec(kind, layout_of(setting, used), OMEGAS_MS[kind])
+                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+                folder = f"{self.name}-ch6-{kind}-{name.replace(', ', '-')}"
+                candidates |= named_runs(learnt(kind, name), trainer.train_repeats(folder, setting, config))
+        evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(16, 100)))
+        return judge_chapter_6(evaluation, list(variants)), rows(evaluation, channel="ch6")
+
+
+def usable(variants: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The variants without those that need embeddings, where nothing computes them."""
+    if missing := embeddings_missing():
+        print(f"  semantics are left out: {missing}")
+        return {name: parts for name, parts in variants.items() if "semantics" not in parts}
+    return variants
+
+
+def learnt(kind: str, variant: str) -> str:
+    """Name of the policies that choose omega by a variant of the state."""
+    return f"learnt {kind} by {variant}"
+
+
+def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
+    """Verdicts on omega as each variant of the state chooses it, and on the two readings of wait."""
+    found = []
+    for kind in KINDS:
+        best, text = evaluation.best_fixed(kind)[0], fixed_of(evaluation, kind)
+        trained = {name: runs_of(evaluation, learnt(kind, name)) for name in variants}
+        about = f"room, ch6, {kind}"
+        found += [
+            better(f"{about}, by {name}", "better than the best fixed omega.", runs, best,
+                   f"against {text}; ") for name, runs in trained.items()
+        ]  # fmt: skip
+        found += [
+            better(about, f"better by {WHOLE} than by {name}.", trained[WHOLE], runs)
+            for name, runs in trained.items() if WHOLE in trained and name != WHOLE
+        ]  # fmt: skip
+    fullest = variants[0]
+    arrived, generated = (runs_of(evaluation, learnt(k, fullest)) for k in ("wait-arrived", "wait"))
+    claim = "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5)"
+    fixed = [evaluation.best_fixed(kind)[0] for kind in ("wait-arrived", "wait")]
+    return [
+        *found,
+        better("room, ch6, both learnt", f"{claim}.", arrived, generated),
+        better("room, ch6, both at their best fixed omega", f"{claim}.", *fixed),
+    ]
 
 
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:

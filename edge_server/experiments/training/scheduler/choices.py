@@ -60,7 +60,9 @@ def named(name: str) -> Maker:
 
 
 def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:
-    generated = {c: arrival.generated_ns for c, arrival in moment.newest(at_ns).items()}
+    newest = moment.newest(at_ns)
+    generated = {c: arrival.generated_ns for c, arrival in newest.items()}
+    received = {c: arrival.received_ns for c, arrival in newest.items()}
     # Apart from ages, the state is known only at the instant of the decision, when policies read it.
     state = (lambda parts=(): moment.state) if at_ns == moment.now_ns else None
-    return Epoch(at_ns, number, generated, state)
+    return Epoch(at_ns, number, generated, state, received)

@@ -58,7 +58,8 @@ publication. Another camera, which is not trained on either, reports how well it
 
   --kind select      a set of cameras, Bernoulli each (thesis 5.4, algorithm 1)
   --kind threshold   how old a view may be (6.3)
-  --kind wait        how long to wait for younger ones (6.3, algorithm 2)
+  --kind wait        how long to wait for views generated meanwhile (6.3)
+  --kind wait-arrived   the same for views that arrive meanwhile, however old (6.16, algorithm 2)
 
   --hold MS          the scheduler decides in the running deployment, every MS milliseconds; the reward is
                      what is shown until the next decision, with computing charged (edge.compute). The field

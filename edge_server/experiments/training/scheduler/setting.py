@@ -26,9 +26,11 @@ PURPOSES = ("train", "choose", "test")
 SEEDS_A_PURPOSE = 10**6
 _SEEDS_A_RUN = 10**7
 # Values that thresholds and waits are chosen from, in milliseconds.
+_WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)
 OMEGAS_MS = {
     "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
-    "wait": (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0),
+    "wait": _WAITS_MS,
+    "wait-arrived": _WAITS_MS,
 }
 
 

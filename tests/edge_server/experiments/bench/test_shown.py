@@ -76,6 +76,27 @@ def test_a_long_run_is_told_minute_by_minute(small: Path, monkeypatch: pytest.Mo
     )
 
 
+def test_a_slower_processor_is_charged_more_and_compared_with_one_that_stands_still(
+    small: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    of = rows.Row("as", str(small), split=False)
+    slow = rows.Row("slow", str(small), split=False, charged_as="as", slower=4.0)
+    for module in (rows, output):
+        monkeypatch.setattr(module, "ROWS", (of, slow))
+    out = small.with_name("present.json")
+    assert edge_server(["bench", "shown", "--quick", "--json", str(out)]) == 0
+    found = json.loads(out.read_text())["shown"]
+    fast, run = (found[name]["shown"]["7"] for name in ("as", "slow"))
+    assert run["charged"]["ms_per_update"] == 4.0 * fast["charged"]["ms_per_update"] > 0.0
+    assert run["age_ms"]["mean"] > fast["age_ms"]["mean"] and run["updates"] < fast["updates"]
+    # What stands still is late by the whole mean age, what is carried on is not.
+    perfect = run["perfect"]
+    assert perfect["frozen"]["squared_error"]["moving"] > perfect["mean"]["squared_error"]["moving"]
+    text = out.with_suffix(".md").read_text()
+    assert f"| as | 0.25 | {run['psnr_db']['whole']:.1f} |" in text and "| slow | layers |" not in text
+    capsys.readouterr()
+
+
 def test_the_shares_add_up_to_what_is_shown() -> None:
     def run(error: float, perfect: float) -> dict[str, Any]:
         return {"7": {"squared_error": {"moving": error},

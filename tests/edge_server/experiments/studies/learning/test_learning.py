@@ -176,6 +176,19 @@ def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
     assert [v.verdict for v in verdicts if "best fixed" in v.claim] == [DOES_NOT_HOLD, HOLDS, HOLDS, HOLDS]
 
 
+@pytest.mark.parametrize(("step", "said"), [(-0.5, HOLDS), (0.5, DOES_NOT_HOLD)])
+def test_chapter_6_holds_if_and_only_if_the_whole_state_and_arrivals_are_better(step, said):
+    levels: dict[str, float] = {**FIXED, "wait-arrived:20": 0.6 - step, "wait-arrived:60": 0.1 - step}
+    for k, name in enumerate(state_ablation.LEFT_OUT):
+        for kind in state_ablation.KINDS:
+            level = 3.0 + step * k - (step if kind == "wait-arrived" else 0.0)
+            levels |= runs(state_ablation.learnt(kind, name), level)
+    verdicts = state_ablation.judge_chapter_6(evaluation_of(levels), list(state_ablation.LEFT_OUT))
+    assert len(verdicts) == 3 * 7 + 2
+    assert answers(verdicts, "best fixed omega") == {HOLDS}
+    assert answers(verdicts, "better by Z, age, pose than", "arrive while it waits") == {said}
+
+
 @pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
     found = evaluation_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
