@@ -38,11 +38,14 @@ class DetailLevel:
 
 # While the visitor moves, at rest, and at rest with nothing new to show. An image below min_rows is not worth
 # its fixed cost, the wait for a training step of the field to end.
+MOVING, NEWER = 0, 1
 LEVELS = (
     DetailLevel(0.08, 0.5, 64, 240),
     DetailLevel(0.20, 0.2, 120, 480),
     DetailLevel(1.2, 0.15, 200, 720),
 )
+# Least time for an image of what is newer: in it, at its share, the picture changes seven times a second.
+LEAST_S = 0.03
 BAND_S = 0.1
 MIN_GAP_S = 0.05
 SETTLE_S = 0.25
@@ -187,11 +190,11 @@ class RenderLoop:
     def _next_level(self, visitor: ClientState, renderer: Snapshot, now: float) -> int | None:
         """The level to render next for a visitor; None if it has the finest or must wait."""
         if visitor.level < 0:
-            level = 0
+            level = MOVING
         elif now - visitor.moved_at < SETTLE_S:
             return None
         elif visitor.renderer is not renderer:
-            level = 1
+            level = NEWER
         else:
             level = visitor.level + 1
         if level >= len(LEVELS) or now < self._not_before[level]:
@@ -226,10 +229,18 @@ class RenderLoop:
             if visitor.serial == serial:
                 visitor.level, visitor.renderer = level, renderer
 
+    def _budget_s(self, number: int) -> float:
+        """Time for an image of a level. One of what is newer may take its share of an update: where updates
+        are short, a fine picture would be old."""
+        level, newest = LEVELS[number], self._state.newest()
+        if number != NEWER or newest is None:
+            return level.budget_s
+        return float(np.clip(level.max_share * newest.update_ms / 1e3, LEAST_S, level.budget_s))
+
     def _adapt(self, number: int, spent: float) -> None:
         """Change the rows of the next image so that it takes about the time budget of its level."""
         level = LEVELS[number]
-        change = np.clip(np.sqrt(level.budget_s / max(spent, 1e-4)), 0.7, 1.3)
+        change = np.clip(np.sqrt(self._budget_s(number) / max(spent, 1e-4)), 0.7, 1.3)
         self._rows[number] = float(np.clip(self._rows[number] * change, level.min_rows, level.max_rows))
 
     def _render(

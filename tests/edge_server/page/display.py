@@ -69,7 +69,9 @@ def measure(folder: Path, seconds: float) -> dict[str, Any]:
 
     def publish() -> None:
         while not over.wait(PUBLISH_S):
-            preview.state.renderer = Stamped(0.0)
+            if last := preview.state.newest():
+                now = {"number": last.number + 1, "t_s": preview.state.now_s()}
+                preview.state.publish(replace(last, **now, published_ns=time.time_ns()), Stamped(0.0))
 
     preview.start()
     thread = threading.Thread(target=publish)

@@ -22,7 +22,7 @@ from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.preview import BallScene, Preview
-from edge_server.page.rendering import DEPTH_ROWS, FAR_M, browser_images
+from edge_server.page.rendering import DEPTH_ROWS, FAR_M, LEVELS, MOVING, NEWER, RenderLoop, browser_images
 from edge_server.page.scene import thumbnail
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.page.visitor import Visitor
@@ -241,6 +241,15 @@ def test_images_come_coarse_first_then_fine(tmp_path):
             settled = visitor.images
             time.sleep(1.5)
             assert visitor.images == settled  # nothing new: nothing sent
+
+
+@pytest.mark.parametrize(("update_ms", "newer_s"), [(25.0, 0.03), (800.0, 0.16), (5000.0, 0.2)])
+def test_a_picture_of_what_is_newer_takes_no_longer_than_its_share_of_an_update(update_ms, newer_s):
+    state = bare_state()
+    loop = RenderLoop(state, None)
+    state.publish(replace(publication(1), update_ms=update_ms), BallScene(0.0))
+    assert loop._budget_s(NEWER) == pytest.approx(newer_s)
+    assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s
 
 
 def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
