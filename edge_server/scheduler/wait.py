@@ -49,8 +49,10 @@ def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> Selectio
     that arrive in it, else those generated in it."""
     if omega_ms == 0.0:
         return SelectionWindow(omega_ms=0.0)
-    after = {"received_after_ns" if arrived else "generated_after_ns": now_ns}
-    return SelectionWindow(omega_ms, wait_until_ns=now_ns + round(omega_ms * 1e6), **after)
+    until_ns = now_ns + round(omega_ms * 1e6)
+    if arrived:
+        return SelectionWindow(omega_ms, until_ns, received_after_ns=now_ns)
+    return SelectionWindow(omega_ms, until_ns, generated_after_ns=now_ns)
 
 
 def qualified(epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:

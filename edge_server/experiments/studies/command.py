@@ -18,7 +18,7 @@ from edge_server.experiments.common.arguments import (
 )
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.study import StudyRequest, run_study
-from edge_server.experiments.studies.trial import SCENARIOS
+from edge_server.experiments.studies.trial import scenario_of
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fields.registry import field_names
@@ -139,8 +139,10 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
     if request.jobs < 1:
         raise StudyError(f"--jobs: expected at least 1, got {request.jobs}")
     for scene in request.scenes or ():
-        if scene not in SCENARIOS:
-            raise StudyError(f"--scene {scene}: expected {', '.join(SCENARIOS)}")
+        try:
+            scenario_of(scene)
+        except ScenarioError as error:
+            raise StudyError(f"--scene: {error}") from None
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
     if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
@@ -178,7 +180,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--episodes", type=int, metavar="N", help="of one training, where there is one [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
-    add("--scene", metavar="NAME,...", help=f"{', '.join(SCENARIOS)} [the study's own]")
+    add(
+        "--scene",
+        metavar="NAME,...",
+        help="scenarios with fixed cameras: room, dynerf, a file [the study's own]",
+    )
     add("--field", choices=field_names(), default="splat",
         help="representation, where the study names none [%(default)s]")  # fmt: skip
     add_folders(parser)

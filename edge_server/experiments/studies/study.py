@@ -11,7 +11,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.statistics import Interval, interval, paired
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.studies.engine import Engine, StudyError
-from edge_server.experiments.studies.trial import Row, Trial
+from edge_server.experiments.studies.trial import Row, Trial, recording
 from edge_server.report.machine import commit
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.files import write_csv, write_json, write_text
@@ -31,8 +31,6 @@ LEAST_DB = 0.1
 LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
 
 Curve = dict[float, dict[int, float | None]]
-# Recorded scenes and their file below the data folder.
-RECORDED = {"kitchen": "blender_kitchen/transforms.json"}
 
 
 @dataclass(frozen=True)
@@ -218,7 +216,7 @@ def scenes_of(request: StudyRequest, default: Sequence[str]) -> list[str]:
     wanted, data = list(request.scenes or default), request.folders.data
     found = []
     for scene in wanted:
-        file = RECORDED.get(scene)
+        file = recording(scene)
         if file is None or (data is not None and (data / file).exists()):
             found.append(scene)
         else:
@@ -231,7 +229,7 @@ def scenes_of(request: StudyRequest, default: Sequence[str]) -> list[str]:
 def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
     """The usual trial of a scene, with the image size and the steps of the request. more: of ``Trial``."""
     sized: Row = {"size": 64, "steps": 150} if request.quick else {"size": 128, "steps": 400}
-    if scene in RECORDED:
+    if recording(scene) is not None:
         scale = 2.0 if request.quick else 1.0
         sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
     return Trial(scene=scene, **{"field": request.field, **sized, **more})

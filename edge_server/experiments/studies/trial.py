@@ -31,7 +31,8 @@ from freshfield.scenario import Scenario, ScenarioError, load, parse
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
 WORLD_FPS = 100 / 3
-SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kitchen"}
+# Scenes that are not called as the scenario is that they come from.
+SCENARIOS = {"room": "room19"}
 # Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096
@@ -42,11 +43,11 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Trial:
-    """scene: key of ``SCENARIOS``. size: image width and height of a world; recordings: divided by ``scale``.
-    channel: scenario section. steps: optimizer steps per update. scratch: restart the field at each update
-    (thesis); otherwise it stays warm, and the first update has ``first_steps``. compute: charged ms_per_step
-    and ms_per_update; empty in the thesis. decisions: number scored, every ``every_ms``; a warm field skips
-    the first ``settle``."""
+    """scene: a scenario, shipped or a file, or a key of ``SCENARIOS``. size: image width and height of a
+    world; recordings: divided by ``scale``. channel: scenario section. steps: optimizer steps per update.
+    scratch: restart the field at each update (thesis); otherwise it stays warm, and the first update has
+    ``first_steps``. compute: charged ms_per_step and ms_per_update; empty in the thesis. decisions: number
+    scored, every ``every_ms``; a warm field skips the first ``settle``."""
 
     scene: str
     seed: int
@@ -83,7 +84,7 @@ class Trial:
 
     def scenario(self) -> Scenario:
         """The deployment as a scenario. Raises ScenarioError."""
-        shipped = load(SCENARIOS.get(self.scene, self.scene), self.seed)
+        shipped = scenario_of(self.scene, self.seed)
         source, edge = dict(shipped.source), dict(shipped.edge)
         cameras: Row = {"ids": list(shipped.cameras), "held_out": list(shipped.held_out)}
         if source.get("kind") == "world":
@@ -115,6 +116,19 @@ class Trial:
             scratch=self.scratch,
             shown_every_ms=self.every_ms / 2.0,
         )
+
+
+def scenario_of(scene: str, seed: int = 0) -> Scenario:
+    """The scenario that a scene comes from. Raises ScenarioError."""
+    return load(SCENARIOS.get(scene, scene), seed)
+
+
+@lru_cache
+def recording(scene: str) -> str | None:
+    """The data that a scene plays, relative to the data folder; None for a world of our own. Raises
+    ScenarioError."""
+    source = scenario_of(scene).source
+    return None if source.get("kind") == "world" else str(source.get("data", ""))
 
 
 @dataclass

@@ -24,7 +24,7 @@ from edge_server.experiments.studies.study import (
     by_bool,
     scenes_of,
 )
-from edge_server.experiments.studies.trial import SCENARIOS, Row
+from edge_server.experiments.studies.trial import Row, scenario_of
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -79,7 +79,7 @@ class Viewpoints:
         verdicts: list[Verdict] = []
         parts = ["# " + self.title, ""]
         for scene in scenes_of(request, ("tile",) if request.quick else ("tile", "kitchen")):
-            stage = open_stage(SCENARIOS[scene], work.candidates, work.size, request.folders.data)
+            stage = open_stage(str(scenario_of(scene).path), work.candidates, work.size, request.folders.data)
             scorer = Scorer(lpips, background=stage.background)
             counts = tuple(c for c in work.counts if c <= int(stage.candidates.reachable.sum()))
             seeds = request.repeats(4, 8)

@@ -9,7 +9,6 @@ from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    RECORDED,
     Point,
     StudyRequest,
     Table,
@@ -20,6 +19,7 @@ from edge_server.experiments.studies.study import (
     sweep,
     trial_of,
 )
+from edge_server.experiments.studies.trial import recording
 
 GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)
 QUICK_GAMMAS = (15.0, 30.0, 51.0, 80.0, 120.0, 200.0, 400.0)
@@ -36,7 +36,7 @@ class Mat:
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
         for scene in scenes_of(request, ("room", "kitchen")):
-            ours = scene not in RECORDED
+            ours = recording(scene) is None
             disciplines = DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]
             channels = [({"discipline": d}, {"channel": {"preset": "ch5", "discipline": d}})
                         for d in disciplines]  # fmt: skip

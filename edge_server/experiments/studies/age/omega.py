@@ -16,7 +16,6 @@ from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
 from edge_server.experiments.studies.study import (
     LEAST,
     METRICS,
-    RECORDED,
     Point,
     StudyRequest,
     Table,
@@ -27,6 +26,7 @@ from edge_server.experiments.studies.study import (
     sweep,
     trial_of,
 )
+from edge_server.experiments.studies.trial import recording
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (15.0, 45.0, 75.0, 120.0, 240.0)
@@ -46,7 +46,7 @@ class Omega:
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
         for scene in scenes_of(request, ("room", "kitchen")):
-            ours = scene not in RECORDED
+            ours = recording(scene) is None
             states = [
                 ({"state": state}, {"channel": {"preset": preset}, "every_ms": 2400.0})
                 for state, (preset, _, _) in STATES.items() if ours or not request.quick or state != "low"

@@ -25,7 +25,6 @@ from edge_server.experiments.common.statistics import (
 )
 from edge_server.experiments.studies.study import (
     LEAST_DB,
-    RECORDED,
     Point,
     StudyRequest,
     Table,
@@ -35,6 +34,7 @@ from edge_server.experiments.studies.study import (
     scenes_of,
     trial_of,
 )
+from edge_server.experiments.studies.trial import recording
 from edge_server.report.style import figure
 
 # Cost of a step and of an update of 18 new views: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
@@ -77,7 +77,7 @@ class Phase:
     def points(self, request: StudyRequest) -> list[Point]:
         found = []
         for cell in self._cells(request):
-            ours = cell.scene not in RECORDED
+            ours = recording(cell.scene) is None
             for seed in request.repeats(4 if ours else 3, 12):
                 base = self._trial(request, cell, seed)
                 for policy, value in self._policies(request, cell.delay_ms):
@@ -94,7 +94,7 @@ class Phase:
     def _cells(self, request: StudyRequest) -> Iterator[Cell]:
         quick = request.quick
         for scene in scenes_of(request, ("room", "kitchen")):
-            ours = scene not in RECORDED
+            ours = recording(scene) is None
             speeds: tuple[float | None, ...] = (None,)
             if ours:
                 speeds = (0.5, 2.0) if quick else (0.3, 1.0, 2.0, 4.0)
@@ -114,7 +114,7 @@ class Phase:
     def _trial(self, request: StudyRequest, cell: Cell, seed: int) -> Any:
         channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": cell.delay_ms}}
         more: dict[str, Any] = {"every_ms": 1500.0}
-        if cell.scene not in RECORDED:
+        if recording(cell.scene) is None:
             more["speed_m_per_s"] = cell.speed_m_per_s
         base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":

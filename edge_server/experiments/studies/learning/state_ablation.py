@@ -114,11 +114,11 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
     fullest = variants[0]
     arrived, generated = (runs_of(evaluation, learnt(k, fullest)) for k in ("wait-arrived", "wait"))
     claim = "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5)"
-    fixed = [evaluation.best_fixed(kind)[0] for kind in ("wait-arrived", "wait")]
+    best_arrived, best_generated = (evaluation.best_fixed(kind)[0] for kind in ("wait-arrived", "wait"))
     return [
         *found,
         better("room, ch6, both learnt", f"{claim}.", arrived, generated),
-        better("room, ch6, both at their best fixed omega", f"{claim}.", *fixed),
+        better("room, ch6, both at their best fixed omega", f"{claim}.", best_arrived, best_generated),
     ]
 
 
