@@ -9,6 +9,7 @@ losses in bursts are not independent.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -103,27 +104,17 @@ class Fit:
         }
 
 
-def fit(
-    path: Path,
-    states: str = "auto",
-    *,
-    discipline: str | None = None,
-    scope: str = "shared",
-    use_states: bool = False,
-) -> Fit:
+def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared") -> Fit:
     """Fit the recording in ``path``.
 
     states: "1", "2" or "auto" (BIC decides).
     discipline: of the link, for rows (default drop-new).
     scope: the cameras have one chain (shared) or one each (per-camera), with equal parameters.
-    use_states: use the recorded states instead of inferring them.
     Raises RecordingError, TraceError (both ValueError) if there is nothing to fit.
     """
     if states not in ("1", "2", "auto"):
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
-    if use_states and states == "1":
-        raise RecordingError("--use-states and --states 1 exclude each other")
-    recording = read_recording(path, discipline, use_states)
+    recording = read_recording(path, discipline)
     delays_ms = _usable_delays_ms(recording)
     kind, period_ms = _arrivals(recording)
     constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
@@ -134,15 +125,12 @@ def fit(
     warnings = _data_warnings(recording, constant, poisson, states)
     estimate = None
     if states != "1" and (poisson or not constant):
-        _require_numba(path)
+        _require_libraries(path)
         estimate = hmm.fit(lines, not constant, poisson)
-        if not use_states:  # else the likelihood includes the states and cannot be compared
-            bic[2] = (
-                len(estimate.model.log_parameters()) * math.log(_observation_count(lines))
-                - 2 * estimate.log_likelihood
-            )
+        parameter_count = len(estimate.model.log_parameters())
+        bic[2] = parameter_count * math.log(_observation_count(lines)) - 2 * estimate.log_likelihood
         why_not = _reject_two_states(estimate, lines)
-        if states == "auto" and not use_states and (why_not or bic[2] >= bic[1]):
+        if states == "auto" and (why_not or bic[2] >= bic[1]):
             if bic[2] < bic[1]:
                 warnings.append(f"two states were preferred by BIC and set aside: {why_not}")
             estimate = None
@@ -157,12 +145,11 @@ def fit(
     parameters = one_state if estimate is None else _two_state_parameters(estimate, delays_ms, constant)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
-    names = recording.states or ["low", "high"]
     if not constant:
         warnings += _misfit_warnings(delays_ms, parameters, estimate, lines)
-    chosen_by = "recorded states" if use_states else "BIC" if states == "auto" else "asked"
+    chosen_by = "BIC" if states == "auto" else "asked"
     bursts = _loss_statistics(recording.cameras)
-    channel = _channel_section(recording, parameters, kind, period_ms, scope, names, bursts)
+    channel = _channel_section(recording, parameters, kind, period_ms, scope, bursts)
     channel_from_mapping(channel, "the fitted channel")
     return Fit(recording, 1 if estimate is None else 2, chosen_by, kind, parameters, bic, bursts, channel,
                warnings, estimate, lines)  # fmt: skip
@@ -184,13 +171,12 @@ def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     return delays_ms
 
 
-def _require_numba(path: Path) -> None:
-    try:
-        import numba  # noqa: F401
-    except ImportError:
+def _require_libraries(path: Path) -> None:
+    if any(importlib.util.find_spec(name) is None for name in ("numba", "scipy")):
         raise RecordingError(
-            f"{path}: two states are fitted with numba (pip install 'freshfield[emu]'); --states 1 needs none"
-        ) from None
+            f"{path}: two states are fitted with numba and scipy (pip install 'freshfield[emu]'); --states 1 "
+            "needs neither"
+        )
 
 
 def _arrivals(recording: Recording) -> tuple[str, float]:
@@ -236,19 +222,19 @@ def _refit_one_state(
 def _refit_two_states(
     recording: Recording, lines: list[Timeline], estimate: Estimate, delays: bool, scope: str
 ) -> tuple[Estimate, list[Timeline]]:
-    model, expected = estimate.model, estimate.expectation
+    model, probabilities = estimate.model, estimate.states
     for _ in range(_REFINEMENTS):
         at_ms = [line.at_ms() for line in lines]
         by_state = np.exp(model.log_parameters()[-2:])
-        rates = [states @ by_state for states in expected.states]
+        rates = [states @ by_state for states in probabilities]
 
         def rate(place: int, when: NDArray[np.float64], at_ms=at_ms, rates=rates) -> NDArray[np.float64]:
             which = 0 if len(at_ms) == 1 else place
             return np.interp(when, at_ms[which], rates[which])
 
         lines = timelines(refine_arrivals(recording, rate), scope == "shared", True)
-        model, _ = hmm.run_em(model, lines, _REFINING_STEPS)
-        expected = hmm.e_step(model, lines)
+        model = hmm.maximize(model, lines, _REFINING_STEPS)
+        probabilities = hmm.state_probabilities(model, lines)
     return hmm.fit(lines, delays, True, model), lines
 
 
@@ -273,12 +259,15 @@ def _observation_count(lines: list[Timeline]) -> int:
 def _reject_two_states(estimate: Estimate, lines: list[Timeline]) -> str | None:
     """Why two states are rejected whatever their likelihood, or None."""
     frames = np.zeros(2)
-    for line, states in zip(lines, estimate.expectation.states):
+    time_ms = np.zeros(2)
+    for line, states in zip(lines, estimate.states):
         frames += states[~np.isnan(line.delay_ms) | line.arrived].sum(0)
+        time_ms += line.span_ms @ states
     if frames.min() < _MIN_FRAMES:
         return f"one of them rests on {frames.min():.0f} frames"
-    if estimate.expectation.jumps.min() < _MIN_VISITS:
-        return f"the chain changed state {estimate.expectation.jumps.sum():.0f} times only: record longer"
+    jumps = estimate.model.leave_per_ms * time_ms
+    if jumps.min() < _MIN_VISITS:
+        return f"the chain changed state {jumps.sum():.0f} times only: record longer"
     return None
 
 
@@ -306,7 +295,7 @@ def _misfit_warnings(
         means, shares = np.array([parameters["mean_ms"].value]), np.ones(1)
     else:
         has_delay = [~np.isnan(line.delay_ms) for line in lines]
-        weight = sum(s[t].sum(0) for s, t in zip(estimate.expectation.states, has_delay))
+        weight = sum(s[t].sum(0) for s, t in zip(estimate.states, has_delay))
         means, shares = estimate.model.mean_ms, weight / np.sum(weight)
     ordered = np.sort(delays_ms)
     below = (shares * -np.expm1(-ordered[:, None] / means)).sum(1)
@@ -391,7 +380,6 @@ def _channel_section(
     arrivals: str,
     period_ms: float,
     scope: str,
-    names: list[str],
     bursts: dict[str, IntervalEstimate],
 ) -> dict[str, Any]:
     """The ``channel:`` section, rounded to six digits."""
@@ -408,8 +396,8 @@ def _channel_section(
     elif arrivals == "poisson":
         section["arrivals"]["rate_per_ms"] = by_state("rate_per_ms", "rate_{}_per_ms")
     if "mu1_per_ms" in parameters:
-        chain = {"mu1_per_ms": number("mu1_per_ms"), "mu2_per_ms": number("mu2_per_ms"), "states": names}
-        section["chain"] = {**chain, "scope": scope}
+        rates = {name: number(name) for name in ("mu1_per_ms", "mu2_per_ms")}
+        section["chain"] = {**rates, "states": ["low", "high"], "scope": scope}
     mean = by_state("mean_ms", "mean_{}_ms")
     if mean == 0.0:
         section["service"] = {"law": "none"}

@@ -1,7 +1,7 @@
 """Reads a recording of a channel: frames, delays, arrivals and losses.
 
-A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored unless asked for, or
-rows of any other link, one frame a line::
+A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored, or rows of any
+other link, one frame a line::
 
     # offered_ms, delivered_ms (blank: it never came), camera (optional)
     0.0, 41.5, cam00
@@ -49,7 +49,6 @@ class Camera:
     started_ms: NDArray[np.float64]
     delay_ms: NDArray[np.float64]
     outcome: NDArray[np.str_]
-    state: NDArray[np.int64]
     window_start_ms: NDArray[np.float64] | None = None
     window_ms: NDArray[np.float64] | None = None
     """Where arrivals sample frames: a frame was sampled within ``window_ms`` from ``window_start_ms`` on, and
@@ -61,13 +60,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Recording:
-    """discipline: of the link. states: names, if the recording knows them. sampled: an arrival process
-    sampled frames later than they were offered, or not at all (``skipped``)."""
+    """discipline: of the link. sampled: an arrival process sampled frames later than they were offered, or
+    not at all (``skipped``)."""
 
     path: Path
     cameras: list[Camera]
     discipline: str
-    states: list[str]
     sampled: bool
     too_long: int = 0
     """Delays left out because they exceed MAX_DELAY_MS."""
@@ -82,7 +80,7 @@ class Recording:
         return values[~np.isnan(values)]
 
 
-def read_recording(path: Path, discipline: str | None = None, use_states: bool = False) -> Recording:
+def read_recording(path: Path, discipline: str | None = None) -> Recording:
     """Read a trace or rows. ``discipline``: how the link of the rows treats a frame while it is busy (default
     drop-new); a trace knows its own. Raises RecordingError, TraceError."""
     try:
@@ -90,17 +88,12 @@ def read_recording(path: Path, discipline: str | None = None, use_states: bool =
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from None
     if begin == "{":
-        return from_trace(path, trace.read(path), use_states)
-    if use_states:
-        raise RecordingError(f"{path}: rows of instants hold no states: leave out --use-states")
+        return from_trace(path, trace.read(path))
     return _from_rows(path, discipline or "drop-new")
 
 
-def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Recording:
+def from_trace(path: Path, found: trace.Trace) -> Recording:
     """The emulator's own trace, with the delay of every frame that started."""
-    names = found.config.state_names
-    if use_states and len(names) != 2:
-        raise RecordingError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
     if not found.records:
         raise RecordingError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
@@ -114,12 +107,11 @@ def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Reco
         delay[~(delay <= MAX_DELAY_MS)] = math.nan
         offered = _ms([r.offered_ns for r in records], first_ns)
         outcome = np.array([r.outcome or "" for r in records])
-        state = np.array([r.state if use_states and r.started_ns is not None else -1 for r in records])
-        camera = Camera(name, offered, offered, started, delay, outcome, state)
+        camera = Camera(name, offered, offered, started, delay, outcome)
         cameras.append(
             _infer_arrivals(camera, records, first_ns, found.config.discipline) if sampled else camera
         )
-    return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, too_long)
+    return Recording(path, cameras, found.config.discipline, sampled, too_long)
 
 
 def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
@@ -221,7 +213,7 @@ def _from_rows(path: Path, discipline: str) -> Recording:
     # On a parallel link, frames offered after this may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
     cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
-    return Recording(path, cameras, discipline, [], False, too_long)
+    return Recording(path, cameras, discipline, False, too_long)
 
 
 def _camera_of_rows(
@@ -251,7 +243,7 @@ def _camera_of_rows(
         if discipline == "parallel":
             unknown |= offered >= sure_ms
         outcome[unknown & (outcome == EventKind.LOST)] = ""
-    return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
+    return Camera(name, offered, offered, started, delivered - started, outcome)
 
 
 def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
@@ -269,20 +261,19 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     change: list[NDArray[np.int64]] = []
     arrived: list[NDArray[np.bool_]] = []
     delay: list[NDArray[np.float64]] = []
-    state: list[NDArray[np.int64]] = []
 
-    def add(at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None,
-            states: NDArray[np.int64] | None = None) -> None:  # fmt: skip
+    def add(
+        at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None
+    ) -> None:
         n = len(at_ms)
         at.append(at_ms)
         change.append(np.full(n, by))
         arrived.append(np.full(n, is_arrival))
         delay.append(np.full(n, math.nan) if delays is None else delays)
-        state.append(np.full(n, -1) if states is None else states)
 
     for camera in cameras:
         went = ~np.isnan(camera.delay_ms)
-        add(camera.started_ms[went], 0, False, camera.delay_ms[went], camera.state[went])
+        add(camera.started_ms[went], 0, False, camera.delay_ms[went])
         if not arrivals or not len(camera.offered_ms):
             continue
         if sampled:
@@ -302,5 +293,5 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order
     return Timeline(
         np.diff(when, prepend=when[:1]), waiting.astype(np.int64), np.concatenate(arrived)[order],
-        np.concatenate(delay)[order], np.concatenate(state)[order], float(when[0]) if len(when) else 0.0,
+        np.concatenate(delay)[order], float(when[0]) if len(when) else 0.0,
     )  # fmt: skip
