@@ -194,8 +194,6 @@ class ChannelConfig:
     queue_limit: int = 1024
     """Most frames waiting (fcfs) or in service (parallel), so that memory is bounded; for all cameras
     together if the server is shared."""
-    hard_limit_ms: float | None = None
-    """Live only: stop the emulator if a frame leaves this much later than it was due."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Parameters of the listed faults, by name."""
 
@@ -206,8 +204,6 @@ class ChannelConfig:
             raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
         if self.server.order != "fcfs" and self.discipline not in ("newest-waits", "fcfs"):
             raise ValueError(f"server.order: nothing waits its turn under discipline {self.discipline}")
-        if self.hard_limit_ms is not None and self.hard_limit_ms <= 0:
-            raise ValueError(f"hard_limit_ms: expected more than 0, got {self.hard_limit_ms:g}")
         states = 1 if self.chain is None else len(self.chain.names())
         chances = {f"faults.{name}.probability": getattr(p, "probability", None)
                    for name, p in self.faults.items()}  # fmt: skip
