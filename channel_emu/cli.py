@@ -16,7 +16,6 @@ from channel_emu.model import ages, spelling
 from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
-from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
 from freshfield.files import format_table
 
@@ -176,8 +175,9 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
                      "scope=per-camera, initial=low, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
     sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
-    sub.add_argument("--shared-server", metavar="ORDER", choices=ORDERS, help="one line for all cameras; "
-                     f"whose waiting frame is next: {', '.join(ORDERS)}")  # fmt: skip
+    sub.add_argument(
+        "--shared-server", action="store_true", help="one line for all cameras, not one for each"
+    )
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -228,7 +228,7 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         for text in args.fault:
             section["faults"] |= spelling.fault(text)
     if args.shared_server:
-        section["server"] = {"shared": True, "order": args.shared_server}
+        section["server"] = {"shared": True}
     if vars(args).get("spread"):  # of simulate alone
         section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
     return channel_from_mapping(section, "channel", folder)

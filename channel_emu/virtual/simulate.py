@@ -154,8 +154,7 @@ def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> floa
 
 def _kernel_unsupported(config: ChannelConfig) -> str | None:
     """Why the kernel cannot run this channel, or None."""
-    other = [name for name in config.faults if name != "loss"]
-    if other or (config.faults and config.server.order == "oldest-age"):  # whose turn depends on losses
+    if any(name != "loss" for name in config.faults):
         return f"faults ({', '.join(config.faults)}) are simulated by the python engine only"
     try:
         import numba  # noqa: F401

@@ -50,10 +50,8 @@ SECTIONS = {
     "ch5": {"preset": "ch5", **QUICK},
     "fcfs": {**QUICK, "discipline": "fcfs"},
     "ch6, one line": {**FAST, "service": {"mean_ms": [2.0, 4.0]}, "server": {"shared": True}},
-    "newest waits, round-robin": {
-        **SHARED, "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"},
-    },
-    "fcfs, oldest age": {**SHARED, "discipline": "fcfs", "server": {"shared": True, "order": "oldest-age"}},
+    "newest waits, one line": {**SHARED, "discipline": "newest-waits", "server": {"shared": True}},
+    "fcfs, one line": {**SHARED, "discipline": "fcfs", "server": {"shared": True}},
     "preempt, one line": {**SHARED, "discipline": "lcfs-preempt", "server": {"shared": True}},
 }  # fmt: skip
 
