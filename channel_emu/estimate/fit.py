@@ -26,7 +26,6 @@ from channel_emu.estimate.recording import (
     Recording,
     RecordingError,
     read_recording,
-    refine_arrivals,
     timelines,
 )
 from channel_emu.model.config import channel_from_mapping
@@ -41,8 +40,6 @@ _CONSTANT_CV = 0.01
 # Kolmogorov-Smirnov distance times sqrt(n), for parameters fitted to the same data: above the 1 % level of
 # Lilliefors' test for the exponential (1.25), with a margin for two states and dependent delays.
 _MISFIT = 1.6
-# Rounds of refining when waiting frames were sampled; each removes most of the remaining error.
-_REFINEMENTS, _REFINING_STEPS = 4, 5
 _BATCHES, _T_95 = 20, 2.093
 _LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
 _DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
@@ -136,12 +133,6 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scop
             estimate = None
         elif why_not:
             warnings.append(f"two states as asked, though {why_not}")
-    if recording.sampled:
-        # The comparison used the same guesses of arrivals for one and two states; now refine them.
-        if estimate is None:
-            one_state = _refit_one_state(recording, lines, delays_ms, constant, scope)
-        else:
-            estimate, lines = _refit_two_states(recording, lines, estimate, not constant, scope)
     parameters = one_state if estimate is None else _two_state_parameters(estimate, delays_ms, constant)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
@@ -207,35 +198,6 @@ def _fit_one_state(
         found["rate_per_ms"] = IntervalEstimate(rate, (rate / reach, rate * reach))
         log_likelihood += arrivals * (math.log(rate) - 1)
     return found, ((not constant) + poisson) * math.log(_observation_count(lines)) - 2 * log_likelihood
-
-
-def _refit_one_state(
-    recording: Recording, lines: list[Timeline], delays_ms: NDArray[np.float64], constant: bool, scope: str
-) -> dict[str, IntervalEstimate]:
-    found, _ = _fit_one_state(lines, delays_ms, constant, True)
-    for _ in range(_REFINEMENTS):
-        improved = refine_arrivals(recording, found["rate_per_ms"].value)
-        found, _ = _fit_one_state(timelines(improved, scope == "shared", True), delays_ms, constant, True)
-    return found
-
-
-def _refit_two_states(
-    recording: Recording, lines: list[Timeline], estimate: Estimate, delays: bool, scope: str
-) -> tuple[Estimate, list[Timeline]]:
-    model, probabilities = estimate.model, estimate.states
-    for _ in range(_REFINEMENTS):
-        at_ms = [line.at_ms() for line in lines]
-        by_state = np.exp(model.log_parameters()[-2:])
-        rates = [states @ by_state for states in probabilities]
-
-        def rate(place: int, when: NDArray[np.float64], at_ms=at_ms, rates=rates) -> NDArray[np.float64]:
-            which = 0 if len(at_ms) == 1 else place
-            return np.interp(when, at_ms[which], rates[which])
-
-        lines = timelines(refine_arrivals(recording, rate), scope == "shared", True)
-        model = hmm.maximize(model, lines, _REFINING_STEPS)
-        probabilities = hmm.state_probabilities(model, lines)
-    return hmm.fit(lines, delays, True, model), lines
 
 
 def _two_state_parameters(

@@ -223,18 +223,15 @@ def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> l
     return out
 
 
-def fit(
-    lines: Sequence[Timeline], delays: bool, arrivals: bool, initial: TwoStateModel | None = None
-) -> Estimate:
+def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> Estimate:
     """Maximum likelihood. delays, arrivals: what the states may differ in; at least one of them.
 
     Deterministic: a few steps from several models on the first part of the data, then from the best of them
-    (or from ``initial``) to the maximum.
+    to the maximum.
     """
-    if initial is None:
-        first = [line.head(_START_EVENTS) for line in lines]
-        candidates = [maximize(each, first, _START_STEPS) for each in initial_models(lines, delays, arrivals)]
-        initial = max(candidates, key=lambda each: log_likelihood(each, first))
+    first = [line.head(_START_EVENTS) for line in lines]
+    candidates = [maximize(each, first, _START_STEPS) for each in initial_models(lines, delays, arrivals)]
+    initial = max(candidates, key=lambda each: log_likelihood(each, first))
     model = maximize(initial, lines, MOST_STEPS).ordered()
     best = log_likelihood(model, lines)
     return Estimate(model, best, _deviations(model, lines, best), state_probabilities(model, lines))

@@ -45,6 +45,8 @@ class Transit:
     item: Any
     size_bytes: int
     offered_ns: int
+    arrived_ns: int | None = None
+    """When it entered the link: at its offer, or when the arrival process sampled it."""
     started_ns: int | None = None
     due_ns: int | None = None
     state: int = 0
@@ -237,6 +239,7 @@ class Link:
 
     def _arrive(self, transit: Transit, at_ns: int) -> None:
         server = self.server
+        transit.arrived_ns = at_ns
         transit.ticket = server.issue_ticket()
         if not server.busy:
             self._start(transit, at_ns)
