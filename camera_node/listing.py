@@ -31,8 +31,7 @@ def effects() -> str:
     lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are spared unless in_truth: true"]
     for name in NAMES:
         effect = effect_class(name)
-        lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", _doc(effect.Parameters), ""]
-        lines += _keys(effect.Parameters)
+        lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", *_keys(effect)]
     return "\n".join(lines)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import dataclasses
 import json
 import logging
 import signal
@@ -17,7 +16,6 @@ from channel_emu.model import ages, spelling
 from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
-from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
 from freshfield.files import format_table
 
@@ -39,12 +37,11 @@ Emulates a bad network between cameras and the edge, seeded and per frame.
   channel-emu bench --simulate
   channel-emu accuracy --out runs/accuracy
 """
-_HARD_LIMIT_STATUS = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. Exit status 0; 1: a replay or a bench that did not agree, or the live emulator
-    broke; 2: bad input; 3: the hard limit was exceeded."""
+    broke; 2: bad input."""
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -102,7 +99,6 @@ def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
     sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--trace", type=Path, metavar="FILE", help=f"record what happens to every {what}")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
-    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help=f"stop if a {what} leaves this late")
     sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
     transport.add_arguments(sub)
 
@@ -111,13 +107,10 @@ def _serve(
     args: argparse.Namespace, config: ChannelConfig, seed: int, hook: Hook | None = None, **options: Any
 ) -> tuple[int, Report | None]:
     """Run a proxy until told to stop: the exit status, and the report if nothing broke."""
-    from channel_emu.live.live_link import HardLimit
     from channel_emu.live.priority import SWITCH_INTERVAL_S, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
     from channel_emu.model import trace
 
-    if args.hard_limit_ms is not None:
-        config = dataclasses.replace(config, hard_limit_ms=args.hard_limit_ms)
     chosen = ProxyOptions(
         args.listen, args.to, transport.from_arguments(args), trace=args.trace,
         replay=trace.read(args.replay) if args.replay else None, **options,
@@ -133,9 +126,9 @@ def _serve(
 
     try:
         return 0, asyncio.run(live())
-    except (HardLimit, EmulatorFailed) as error:
+    except EmulatorFailed as error:
         print(f"channel-emu: {error}", file=sys.stderr)
-        return _HARD_LIMIT_STATUS if isinstance(error, HardLimit) else 1, None
+        return 1, None
 
 
 def _add_simulate(commands: Any) -> None:
@@ -182,8 +175,9 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
                      "scope=per-camera, initial=low, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
     sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
-    sub.add_argument("--shared-server", metavar="ORDER", choices=ORDERS, help="one line for all cameras; "
-                     f"whose waiting frame is next: {', '.join(ORDERS)}")  # fmt: skip
+    sub.add_argument(
+        "--shared-server", action="store_true", help="one line for all cameras, not one for each"
+    )
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -234,7 +228,7 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         for text in args.fault:
             section["faults"] |= spelling.fault(text)
     if args.shared_server:
-        section["server"] = {"shared": True, "order": args.shared_server}
+        section["server"] = {"shared": True}
     if vars(args).get("spread"):  # of simulate alone
         section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
     return channel_from_mapping(section, "channel", folder)
@@ -331,7 +325,6 @@ def _add_fit(commands: Any) -> None:
     )  # fmt: skip
     sub.add_argument("trace", type=Path)
     sub.add_argument("--states", choices=["1", "2", "auto"], default="auto", help="auto: by BIC")
-    sub.add_argument("--use-states", action="store_true", help="take the states that the trace recorded")
     sub.add_argument("--scope", choices=SCOPES, default="shared", help="one chain for all cameras "
                      "(%(default)s), or one for each")  # fmt: skip
     sub.add_argument("--discipline", choices=FITTED_DISCIPLINES, help="what the link of the rows does with a "
@@ -346,8 +339,7 @@ def _fit(args: argparse.Namespace) -> int:
     from channel_emu.estimate import report
     from channel_emu.estimate.fit import fit
 
-    result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope,
-                 use_states=args.use_states)  # fmt: skip
+    result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope)
     if args.out:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(report.scenario_text(result))
@@ -403,9 +395,9 @@ def _bench(args: argparse.Namespace) -> int:
 
 def _add_accuracy(commands: Any) -> None:
     sub = commands.add_parser(
-        "accuracy", help="what accuracy costs in time: the simulation's error against seconds, slots, seeds",
-        description="Measures the mean age against its exact value: by seconds simulated and computed, by "
-        "slot length (bias and speed), by number of seeds (width of the interval).",
+        "accuracy", help="what accuracy costs in time: the simulation's error against seconds and slots",
+        description="Measures the mean age against its exact value: by seconds simulated and computed, and "
+        "by slot length (bias and speed).",
     )  # fmt: skip
     sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="the first one (default: %(default)s)")

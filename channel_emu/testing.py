@@ -77,7 +77,7 @@ class EmulatedLink:
 
     def report(self) -> Report:
         """Ages, losses and delays so far, in total and by method; after ``close`` the last report. Raises
-        HardLimit if the channel sets a limit and it was exceeded, EmulatorFailed if the proxy broke."""
+        EmulatorFailed if the proxy broke."""
         return self._last or self._await(self._report(checked=True))
 
     def settle(self, timeout_s: float = 10.0) -> Report:

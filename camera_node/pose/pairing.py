@@ -1,9 +1,8 @@
 """Pairing frames with what an arm reports (thesis 4.3.3), while both still arrive, each at its own rate.
 
 The thesis takes the sample nearest to the frame. The two samples around it can also be interpolated: linearly
-with slerp, along the screw from one to the other (constant twist), or linearly in joint space. ``camera-node
-calibrate accuracy`` measures the error of each. The time to the nearest sample goes with the frame, and a
-frame without a sample within a bound gets no pose.
+with slerp, or linearly in joint space. ``camera-node calibrate accuracy`` measures what that gains. The time
+to the nearest sample goes with the frame, and a frame without a sample within a bound gets no pose.
 """
 
 from __future__ import annotations
@@ -18,37 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import sample_at
-from freshfield.geometry import Pose, cross_matrix, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
 Interpolate = Callable[[T, T, float], T]
 Joints = NDArray[np.float64]
-
-_SMALL_ANGLE = 1e-4
-
-
-def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
-    """The SE(3) geodesic a exp(f log(a^-1 b)): a body that turns and moves at constant rates about its own
-    axes, so that the origin of anything mounted on it runs along the same screw."""
-    start = a.matrix()
-    step = se3_inverse(start) @ b.matrix()
-    omega = so3_log(step[:3, :3])
-    out = np.eye(4)
-    out[:3, :3] = so3_exp(fraction * omega)
-    velocity = np.linalg.solve(left_jacobian(omega), step[:3, 3])
-    out[:3, 3] = fraction * left_jacobian(fraction * omega) @ velocity
-    return Pose.from_matrix(start @ out)
-
-
-def left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3): translation of exp((omega, v)) over v; Barfoot, State Estimation for Robotics, (7.37)."""
-    angle = float(np.linalg.norm(omega))
-    if angle < _SMALL_ANGLE:
-        a, b = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
-    else:
-        a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    k = cross_matrix(omega)
-    return np.eye(3) + a * k + b * (k @ k)
 
 
 def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:

@@ -9,6 +9,7 @@ losses in bursts are not independent.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,6 @@ from channel_emu.estimate.recording import (
     Recording,
     RecordingError,
     read_recording,
-    refine_arrivals,
     timelines,
 )
 from channel_emu.model.config import channel_from_mapping
@@ -40,8 +40,6 @@ _CONSTANT_CV = 0.01
 # Kolmogorov-Smirnov distance times sqrt(n), for parameters fitted to the same data: above the 1 % level of
 # Lilliefors' test for the exponential (1.25), with a margin for two states and dependent delays.
 _MISFIT = 1.6
-# Rounds of refining when waiting frames were sampled; each removes most of the remaining error.
-_REFINEMENTS, _REFINING_STEPS = 4, 5
 _BATCHES, _T_95 = 20, 2.093
 _LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
 _DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
@@ -103,27 +101,17 @@ class Fit:
         }
 
 
-def fit(
-    path: Path,
-    states: str = "auto",
-    *,
-    discipline: str | None = None,
-    scope: str = "shared",
-    use_states: bool = False,
-) -> Fit:
+def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared") -> Fit:
     """Fit the recording in ``path``.
 
     states: "1", "2" or "auto" (BIC decides).
     discipline: of the link, for rows (default drop-new).
     scope: the cameras have one chain (shared) or one each (per-camera), with equal parameters.
-    use_states: use the recorded states instead of inferring them.
     Raises RecordingError, TraceError (both ValueError) if there is nothing to fit.
     """
     if states not in ("1", "2", "auto"):
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
-    if use_states and states == "1":
-        raise RecordingError("--use-states and --states 1 exclude each other")
-    recording = read_recording(path, discipline, use_states)
+    recording = read_recording(path, discipline)
     delays_ms = _usable_delays_ms(recording)
     kind, period_ms = _arrivals(recording)
     constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
@@ -134,35 +122,25 @@ def fit(
     warnings = _data_warnings(recording, constant, poisson, states)
     estimate = None
     if states != "1" and (poisson or not constant):
-        _require_numba(path)
+        _require_libraries(path)
         estimate = hmm.fit(lines, not constant, poisson)
-        if not use_states:  # else the likelihood includes the states and cannot be compared
-            bic[2] = (
-                len(estimate.model.log_parameters()) * math.log(_observation_count(lines))
-                - 2 * estimate.log_likelihood
-            )
+        parameter_count = len(estimate.model.log_parameters())
+        bic[2] = parameter_count * math.log(_observation_count(lines)) - 2 * estimate.log_likelihood
         why_not = _reject_two_states(estimate, lines)
-        if states == "auto" and not use_states and (why_not or bic[2] >= bic[1]):
+        if states == "auto" and (why_not or bic[2] >= bic[1]):
             if bic[2] < bic[1]:
                 warnings.append(f"two states were preferred by BIC and set aside: {why_not}")
             estimate = None
         elif why_not:
             warnings.append(f"two states as asked, though {why_not}")
-    if recording.sampled:
-        # The comparison used the same guesses of arrivals for one and two states; now refine them.
-        if estimate is None:
-            one_state = _refit_one_state(recording, lines, delays_ms, constant, scope)
-        else:
-            estimate, lines = _refit_two_states(recording, lines, estimate, not constant, scope)
     parameters = one_state if estimate is None else _two_state_parameters(estimate, delays_ms, constant)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
-    names = recording.states or ["low", "high"]
     if not constant:
         warnings += _misfit_warnings(delays_ms, parameters, estimate, lines)
-    chosen_by = "recorded states" if use_states else "BIC" if states == "auto" else "asked"
+    chosen_by = "BIC" if states == "auto" else "asked"
     bursts = _loss_statistics(recording.cameras)
-    channel = _channel_section(recording, parameters, kind, period_ms, scope, names, bursts)
+    channel = _channel_section(recording, parameters, kind, period_ms, scope, bursts)
     channel_from_mapping(channel, "the fitted channel")
     return Fit(recording, 1 if estimate is None else 2, chosen_by, kind, parameters, bic, bursts, channel,
                warnings, estimate, lines)  # fmt: skip
@@ -184,13 +162,12 @@ def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     return delays_ms
 
 
-def _require_numba(path: Path) -> None:
-    try:
-        import numba  # noqa: F401
-    except ImportError:
+def _require_libraries(path: Path) -> None:
+    if any(importlib.util.find_spec(name) is None for name in ("numba", "scipy")):
         raise RecordingError(
-            f"{path}: two states are fitted with numba (pip install 'freshfield[emu]'); --states 1 needs none"
-        ) from None
+            f"{path}: two states are fitted with numba and scipy (pip install 'freshfield[emu]'); --states 1 "
+            "needs neither"
+        )
 
 
 def _arrivals(recording: Recording) -> tuple[str, float]:
@@ -223,35 +200,6 @@ def _fit_one_state(
     return found, ((not constant) + poisson) * math.log(_observation_count(lines)) - 2 * log_likelihood
 
 
-def _refit_one_state(
-    recording: Recording, lines: list[Timeline], delays_ms: NDArray[np.float64], constant: bool, scope: str
-) -> dict[str, IntervalEstimate]:
-    found, _ = _fit_one_state(lines, delays_ms, constant, True)
-    for _ in range(_REFINEMENTS):
-        improved = refine_arrivals(recording, found["rate_per_ms"].value)
-        found, _ = _fit_one_state(timelines(improved, scope == "shared", True), delays_ms, constant, True)
-    return found
-
-
-def _refit_two_states(
-    recording: Recording, lines: list[Timeline], estimate: Estimate, delays: bool, scope: str
-) -> tuple[Estimate, list[Timeline]]:
-    model, expected = estimate.model, estimate.expectation
-    for _ in range(_REFINEMENTS):
-        at_ms = [line.at_ms() for line in lines]
-        by_state = np.exp(model.log_parameters()[-2:])
-        rates = [states @ by_state for states in expected.states]
-
-        def rate(place: int, when: NDArray[np.float64], at_ms=at_ms, rates=rates) -> NDArray[np.float64]:
-            which = 0 if len(at_ms) == 1 else place
-            return np.interp(when, at_ms[which], rates[which])
-
-        lines = timelines(refine_arrivals(recording, rate), scope == "shared", True)
-        model, _ = hmm.run_em(model, lines, _REFINING_STEPS)
-        expected = hmm.e_step(model, lines)
-    return hmm.fit(lines, delays, True, model), lines
-
-
 def _two_state_parameters(
     estimate: Estimate, delays_ms: NDArray[np.float64], constant: bool
 ) -> dict[str, IntervalEstimate]:
@@ -273,12 +221,15 @@ def _observation_count(lines: list[Timeline]) -> int:
 def _reject_two_states(estimate: Estimate, lines: list[Timeline]) -> str | None:
     """Why two states are rejected whatever their likelihood, or None."""
     frames = np.zeros(2)
-    for line, states in zip(lines, estimate.expectation.states):
+    time_ms = np.zeros(2)
+    for line, states in zip(lines, estimate.states):
         frames += states[~np.isnan(line.delay_ms) | line.arrived].sum(0)
+        time_ms += line.span_ms @ states
     if frames.min() < _MIN_FRAMES:
         return f"one of them rests on {frames.min():.0f} frames"
-    if estimate.expectation.jumps.min() < _MIN_VISITS:
-        return f"the chain changed state {estimate.expectation.jumps.sum():.0f} times only: record longer"
+    jumps = estimate.model.leave_per_ms * time_ms
+    if jumps.min() < _MIN_VISITS:
+        return f"the chain changed state {jumps.sum():.0f} times only: record longer"
     return None
 
 
@@ -306,7 +257,7 @@ def _misfit_warnings(
         means, shares = np.array([parameters["mean_ms"].value]), np.ones(1)
     else:
         has_delay = [~np.isnan(line.delay_ms) for line in lines]
-        weight = sum(s[t].sum(0) for s, t in zip(estimate.expectation.states, has_delay))
+        weight = sum(s[t].sum(0) for s, t in zip(estimate.states, has_delay))
         means, shares = estimate.model.mean_ms, weight / np.sum(weight)
     ordered = np.sort(delays_ms)
     below = (shares * -np.expm1(-ordered[:, None] / means)).sum(1)
@@ -391,7 +342,6 @@ def _channel_section(
     arrivals: str,
     period_ms: float,
     scope: str,
-    names: list[str],
     bursts: dict[str, IntervalEstimate],
 ) -> dict[str, Any]:
     """The ``channel:`` section, rounded to six digits."""
@@ -408,8 +358,8 @@ def _channel_section(
     elif arrivals == "poisson":
         section["arrivals"]["rate_per_ms"] = by_state("rate_per_ms", "rate_{}_per_ms")
     if "mu1_per_ms" in parameters:
-        chain = {"mu1_per_ms": number("mu1_per_ms"), "mu2_per_ms": number("mu2_per_ms"), "states": names}
-        section["chain"] = {**chain, "scope": scope}
+        rates = {name: number(name) for name in ("mu1_per_ms", "mu2_per_ms")}
+        section["chain"] = {**rates, "states": ["low", "high"], "scope": scope}
     mean = by_state("mean_ms", "mean_{}_ms")
     if mean == 0.0:
         section["service"] = {"law": "none"}

@@ -1,13 +1,12 @@
-"""Two-state hidden Markov model in continuous time: likelihood, EM and intervals (thesis 6.24 to 6.27).
+"""Two-state hidden Markov model in continuous time: likelihood, maximum, intervals (thesis 6.24 to 6.27).
 
 The state is a hidden continuous-time chain Q (6.26). Two kinds of observations depend on it: the delay of a
 frame, exponential with the mean of the state in which it started, and the arrivals, Poisson with the rate of
 the state (MMPP). While ``c`` cameras wait for arrivals, the state and the absence of arrivals evolve by
 exp((Q - c L) u), L the diagonal of rates; an arrival multiplies by its rate. There is no grid of slots.
 
-EM: Baum and others 1970 for the observations, Ryden, "An EM algorithm for estimation in Markov-modulated
-Poisson processes", CSDA 21, 1996, for the time between them. Newton's method on the logarithms of the
-parameters then converges; the observed information at the maximum gives the intervals.
+scipy maximizes the likelihood over the logarithms of the parameters; the observed information at the maximum
+gives the intervals.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_EM_STEPS, _START_STEPS = 300, 25
+MOST_STEPS, _START_STEPS = 300, 15
 _START_EVENTS = 20_000
-# EM ends once a step gains less than this in log likelihood; Newton's method takes over.
-_EM_TOLERANCE = 1e-3
-_NEWTON_STEPS = 12
-# Step in a logarithm for second differences, which keep four digits of a log likelihood of 1e5.
+# Step in a logarithm for differences: second ones keep four digits of a log likelihood of 1e5.
 _STEP = 1e-3
+# Gain in log likelihood of one more step at which the maximum counts as reached.
+_TOLERANCE = 1e-6
+_IMPOSSIBLE = 1e15
 # Bound of the parameters' logarithms (1e-15 to 1e15): no product over- or underflows.
 _MAX_LOG = 34.5
 # With a larger standard deviation (an interval of about e^10 each way) a parameter has no interval.
@@ -41,14 +40,13 @@ class Timeline:
 
     span_ms (N,): since the event before. waiting (N,): cameras waiting for an arrival during that span.
     arrived (N,) bool: the event is an arrival. delay_ms (N,): of the frame that starts here, NaN if none.
-    state (N,): known state, -1 if hidden. origin_ms: instant of the first event.
+    origin_ms: instant of the first event.
     """
 
     span_ms: Array
     waiting: NDArray[np.int64]
     arrived: NDArray[np.bool_]
     delay_ms: Array
-    state: NDArray[np.int64]
     origin_ms: float = 0.0
 
     def at_ms(self) -> Array:
@@ -57,7 +55,7 @@ class Timeline:
 
     def head(self, events: int) -> Timeline:
         return Timeline(self.span_ms[:events], self.waiting[:events], self.arrived[:events],
-                        self.delay_ms[:events], self.state[:events], self.origin_ms)  # fmt: skip
+                        self.delay_ms[:events], self.origin_ms)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,27 +93,14 @@ class TwoStateModel:
 
 
 @dataclass(frozen=True)
-class Expectation:
-    """Expectations given all observations: log likelihood; time in each state, and that time
-    multiplied by the waiting cameras (both ms, (2,)); jumps out of each state (2,); the state's distribution
-    at each event, one array (N, 2) a timeline."""
-
-    log_likelihood: float
-    time_ms: Array
-    waiting_ms: Array
-    jumps: Array
-    states: list[Array]
-
-
-@dataclass(frozen=True)
 class Estimate:
     """The maximum likelihood model. log_sd: standard deviations of ``model.log_parameters()``; None if the
-    data do not determine them all."""
+    data do not determine them all. states: see ``state_probabilities``."""
 
     model: TwoStateModel
     log_likelihood: float
     log_sd: Array | None
-    expectation: Expectation
+    states: list[Array]
 
     def interval(self, place: int) -> tuple[float, float] | None:
         """95 % interval of the parameter at ``place`` in ``log_parameters``."""
@@ -152,18 +137,6 @@ class _Propagator:
             out[:, i, 1 - i] = slow * apart * self.p_slow[i, 1 - i]
         return out
 
-    def moments(self, span_ms: Array, weights: Array) -> Array:
-        """M (2, 2): M[i, j] = sum over spans and ends (a, b) of
-        weights[a, b] * integral of exp(G s)[a, i] exp(G (u - s))[j, b] ds from 0 to u."""
-        slow, fast = np.exp(self.slow * span_ms), np.exp(self.fast * span_ms)
-        mixed = slow * -np.expm1(-2 * self.root * span_ms) / (2 * self.root)
-        parts = ((self.p_slow, self.p_slow, span_ms * slow), (self.p_fast, self.p_fast, span_ms * fast),
-                 (self.p_slow, self.p_fast, mixed), (self.p_fast, self.p_slow, mixed))  # fmt: skip
-        total = np.zeros((2, 2))
-        for left, right, integral in parts:
-            total += left.T @ np.tensordot(integral, weights, 1) @ right.T
-        return total
-
 
 def _propagators(model: TwoStateModel, line: Timeline) -> Array:
     steps = np.empty((len(line.span_ms), 2, 2))
@@ -182,8 +155,6 @@ def _emissions(model: TwoStateModel, line: Timeline) -> tuple[Array, float]:
         logs[has_delay] -= np.log(model.mean_ms) + line.delay_ms[has_delay, None] / model.mean_ms
     if model.rate_per_ms is not None:
         logs[line.arrived] += np.log(model.rate_per_ms)
-    known = np.flatnonzero(line.state >= 0)
-    logs[known, 1 - line.state[known]] = -np.inf
     scale = logs.max(1)
     return np.exp(logs - scale[:, None]), float(scale.sum())
 
@@ -202,59 +173,40 @@ def log_likelihood(model: TwoStateModel, lines: Sequence[Timeline]) -> float:
     return float(total)
 
 
-def e_step(model: TwoStateModel, lines: Sequence[Timeline]) -> Expectation:
-    """The E step."""
+def state_probabilities(model: TwoStateModel, lines: Sequence[Timeline]) -> list[Array]:
+    """The state's distribution at each event given all observations, one array (N, 2) a timeline."""
     from channel_emu.estimate import hmm_kernels
 
-    total, time_ms, waiting_ms, jumps = 0.0, np.zeros(2), np.zeros(2), np.zeros(2)
-    states = []
+    found = []
     for line in lines:
-        emissions, scale = _emissions(model, line)
         steps = _propagators(model, line)
-        found, weights = hmm_kernels.smooth(_UNIFORM, steps, emissions)
-        total += found + scale
-        states.append((weights * steps).sum(1))
-        for waiting in np.unique(line.waiting):
-            chosen = line.waiting == waiting
-            moments = _Propagator(model, int(waiting)).moments(line.span_ms[chosen], weights[chosen])
-            time_ms += moments.diagonal()
-            waiting_ms += waiting * moments.diagonal()
-            jumps += model.leave_per_ms * np.array([moments[0, 1], moments[1, 0]])
-    return Expectation(float(total), time_ms, waiting_ms, jumps, states)
+        _, weights = hmm_kernels.smooth(_UNIFORM, steps, _emissions(model, line)[0])
+        found.append((weights * steps).sum(1))
+    return found
 
 
-def _m_step(model: TwoStateModel, lines: Sequence[Timeline], found: Expectation) -> TwoStateModel:
-    """The M step: counts over exposures."""
-    tiny = 1e-300
-    leave = found.jumps / np.maximum(found.time_ms, tiny)
-    mean = rate = None
-    if model.mean_ms is not None:
-        weight, work = np.zeros(2), np.zeros(2)
-        for line, states in zip(lines, found.states):
-            has_delay = ~np.isnan(line.delay_ms)
-            weight += states[has_delay].sum(0)
-            work += line.delay_ms[has_delay] @ states[has_delay]
-        mean = np.maximum(work / np.maximum(weight, tiny), 1e-9)
-    if model.rate_per_ms is not None:
-        arrivals = sum((s[line.arrived].sum(0) for line, s in zip(lines, found.states)), np.zeros(2))
-        rate = np.maximum(arrivals / np.maximum(found.waiting_ms, tiny), 1e-15)
-    return TwoStateModel(np.maximum(leave, 1e-15), mean, rate)
+def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> TwoStateModel:
+    """The model of the highest likelihood near ``model``, after at most so many steps."""
+    from scipy.optimize import minimize
 
+    moves = _STEP * np.eye(len(model.log_parameters()))
 
-def run_em(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> tuple[TwoStateModel, float]:
-    """At most ``steps`` steps of EM; returns the model and a log likelihood that it reaches."""
-    before = -math.inf
-    for _ in range(steps):
-        found = e_step(model, lines)
-        if found.log_likelihood - before <= _EM_TOLERANCE:
-            return model, found.log_likelihood
-        before = found.log_likelihood
-        model = _m_step(model, lines, found)
-    return model, before
+    def lost(at: Array) -> tuple[float, Array]:
+        tried = [log_likelihood(model.with_logs(at + move), lines) for move in (0.0 * at, *moves, *-moves)]
+        # Impossible parameters, which a long step may try, have a finite loss, so that it comes back.
+        value, *beside = -np.maximum(tried, -_IMPOSSIBLE)
+        up, down = np.reshape(beside, (2, -1))
+        return value, (up - down) / (2 * _STEP)
+
+    begin = model.log_parameters()
+    tolerance = _TOLERANCE / max(abs(log_likelihood(model, lines)), 1.0)
+    found = minimize(lost, begin, jac=True, method="L-BFGS-B", bounds=[(-_MAX_LOG, _MAX_LOG)] * len(begin),
+                     options={"maxiter": steps, "ftol": tolerance, "gtol": 0.0})  # fmt: skip
+    return model.with_logs(found.x)
 
 
 def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> list[TwoStateModel]:
-    """Models to start EM from: sojourns of 5, 50 and 500 frames, arrivals faster in either state."""
+    """Models to start from: sojourns of 5, 50 and 500 frames, arrivals faster in either state."""
     has_delay = np.concatenate([line.delay_ms[~np.isnan(line.delay_ms)] for line in lines])
     mean = float(has_delay.mean()) if len(has_delay) else 1.0
     arrived = sum(int(line.arrived.sum()) for line in lines)
@@ -271,53 +223,24 @@ def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> l
     return out
 
 
-def fit(
-    lines: Sequence[Timeline], delays: bool, arrivals: bool, initial: TwoStateModel | None = None
-) -> Estimate:
+def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> Estimate:
     """Maximum likelihood. delays, arrivals: what the states may differ in; at least one of them.
 
-    Deterministic: a few EM steps from several models on the first part of the data, EM from the best of them
-    (or from ``initial``), then Newton.
+    Deterministic: a few steps from several models on the first part of the data, then from the best of them
+    to the maximum.
     """
-    if initial is None:
-        first = [line.head(_START_EVENTS) for line in lines]
-        candidates = [run_em(model, first, _START_STEPS) for model in initial_models(lines, delays, arrivals)]
-        initial = max(candidates, key=lambda pair: pair[1])[0]
-    model, _ = run_em(initial, lines, _EM_STEPS)
-    model, best, log_sd = _newton(model.ordered(), lines)
-    return Estimate(model, best, log_sd, e_step(model, lines))
-
-
-def _newton(model: TwoStateModel, lines: Sequence[Timeline]) -> tuple[TwoStateModel, float, Array | None]:
-    """Newton's method from near the maximum, where EM would take hundreds of steps; log_sd at its end."""
-    at = model.log_parameters()
+    first = [line.head(_START_EVENTS) for line in lines]
+    candidates = [maximize(each, first, _START_STEPS) for each in initial_models(lines, delays, arrivals)]
+    initial = max(candidates, key=lambda each: log_likelihood(each, first))
+    model = maximize(initial, lines, MOST_STEPS).ordered()
     best = log_likelihood(model, lines)
-    for _ in range(_NEWTON_STEPS):
-        gradient, hessian = _gradient_and_hessian(model, lines, at, best)
-        try:
-            np.linalg.cholesky(-hessian)
-            step = np.linalg.solve(-hessian, gradient)
-        except np.linalg.LinAlgError:
-            return model.with_logs(at), best, None
-        # A parameter changes at most by a factor of e, in case the quadratic model is poor.
-        step /= max(1.0, float(np.abs(step).max()))
-        if float(gradient @ step) < 1e-6:  # twice what is left to gain
-            return model.with_logs(at), best, np.sqrt(np.linalg.inv(-hessian).diagonal())
-        for _ in range(20):
-            value = log_likelihood(model.with_logs(at + step), lines)
-            if value > best:
-                break
-            step /= 2
-        else:
-            return model.with_logs(at), best, np.sqrt(np.linalg.inv(-hessian).diagonal())
-        at, best = at + step, value
-    return model.with_logs(at), best, None
+    return Estimate(model, best, _deviations(model, lines, best), state_probabilities(model, lines))
 
 
-def _gradient_and_hessian(
-    model: TwoStateModel, lines: Sequence[Timeline], at: Array, best: float
-) -> tuple[Array, Array]:
-    """Gradient (P,) and Hessian (P, P) of the log likelihood by central differences of the logarithms."""
+def _deviations(model: TwoStateModel, lines: Sequence[Timeline], best: float) -> Array | None:
+    """Standard deviations (P,) of the parameters' logarithms by the observed information, None where it
+    leaves one open."""
+    at = model.log_parameters()
     count = len(at)
     moves = _STEP * np.eye(count)
 
@@ -325,10 +248,14 @@ def _gradient_and_hessian(
         return log_likelihood(model.with_logs(at + shift), lines)
 
     up, down = np.array([value(m) for m in moves]), np.array([value(-m) for m in moves])
-    gradient = (up - down) / (2 * _STEP)
     hessian = np.diag(up + down - 2 * best)
     for i in range(count):
         for j in range(i):
             both = value(moves[i] + moves[j]) + value(-moves[i] - moves[j])
             hessian[i, j] = hessian[j, i] = (both - up[i] - down[i] - up[j] - down[j] + 2 * best) / 2
-    return gradient, hessian / _STEP**2
+    information = -hessian / _STEP**2
+    try:
+        np.linalg.cholesky(information)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(np.sqrt(np.linalg.inv(information).diagonal()))

@@ -1,7 +1,7 @@
 """Reads a recording of a channel: frames, delays, arrivals and losses.
 
-A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored unless asked for, or
-rows of any other link, one frame a line::
+A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored, or rows of any
+other link, one frame a line::
 
     # offered_ms, delivered_ms (blank: it never came), camera (optional)
     0.0, 41.5, cam00
@@ -13,8 +13,8 @@ separated by commas, semicolons or tabs. Lines that start with # and a first lin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +49,6 @@ class Camera:
     started_ms: NDArray[np.float64]
     delay_ms: NDArray[np.float64]
     outcome: NDArray[np.str_]
-    state: NDArray[np.int64]
-    window_start_ms: NDArray[np.float64] | None = None
-    window_ms: NDArray[np.float64] | None = None
-    """Where arrivals sample frames: a frame was sampled within ``window_ms`` from ``window_start_ms`` on, and
-    ``arrived_ms`` is a guess; NaN where the instant is known or there is none."""
 
     def delivered(self) -> NDArray[np.bool_]:
         return self.outcome == EventKind.DELIVERED
@@ -61,13 +56,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Recording:
-    """discipline: of the link. states: names, if the recording knows them. sampled: an arrival process
-    sampled frames later than they were offered, or not at all (``skipped``)."""
+    """discipline: of the link. sampled: an arrival process sampled frames later than they were offered, or
+    not at all (``skipped``)."""
 
     path: Path
     cameras: list[Camera]
     discipline: str
-    states: list[str]
     sampled: bool
     too_long: int = 0
     """Delays left out because they exceed MAX_DELAY_MS."""
@@ -82,7 +76,7 @@ class Recording:
         return values[~np.isnan(values)]
 
 
-def read_recording(path: Path, discipline: str | None = None, use_states: bool = False) -> Recording:
+def read_recording(path: Path, discipline: str | None = None) -> Recording:
     """Read a trace or rows. ``discipline``: how the link of the rows treats a frame while it is busy (default
     drop-new); a trace knows its own. Raises RecordingError, TraceError."""
     try:
@@ -90,20 +84,19 @@ def read_recording(path: Path, discipline: str | None = None, use_states: bool =
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from None
     if begin == "{":
-        return from_trace(path, trace.read(path), use_states)
-    if use_states:
-        raise RecordingError(f"{path}: rows of instants hold no states: leave out --use-states")
+        return from_trace(path, trace.read(path))
     return _from_rows(path, discipline or "drop-new")
 
 
-def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Recording:
+def from_trace(path: Path, found: trace.Trace) -> Recording:
     """The emulator's own trace, with the delay of every frame that started."""
-    names = found.config.state_names
-    if use_states and len(names) != 2:
-        raise RecordingError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
     if not found.records:
         raise RecordingError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
+    if sampled and all(r.arrived_ns is None for r in found.records):
+        raise RecordingError(
+            f"{path}: it does not say when frames arrived at the link (an older version): record it again"
+        )
     first_ns = min(r.offered_ns for r in found.records)
     cameras, too_long = [], 0
     for name, records in found.by_camera().items():
@@ -114,77 +107,13 @@ def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Reco
         delay[~(delay <= MAX_DELAY_MS)] = math.nan
         offered = _ms([r.offered_ns for r in records], first_ns)
         outcome = np.array([r.outcome or "" for r in records])
-        state = np.array([r.state if use_states and r.started_ns is not None else -1 for r in records])
-        camera = Camera(name, offered, offered, started, delay, outcome, state)
-        cameras.append(
-            _infer_arrivals(camera, records, first_ns, found.config.discipline) if sampled else camera
-        )
-    return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, too_long)
+        arrived = _ms([r.arrived_ns for r in records], first_ns) if sampled else offered
+        cameras.append(Camera(name, offered, arrived, started, delay, outcome))
+    return Recording(path, cameras, found.config.discipline, sampled, too_long)
 
 
 def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
     return np.array([math.nan if v is None else (v - first_ns) / 1e6 for v in instants], float)
-
-
-def _infer_arrivals(camera: Camera, records: list[trace.Record], first_ns: int, discipline: str) -> Camera:
-    """The camera with when its frames were sampled by the arrival process, as far as their outcomes tell.
-
-    A frame that found the link idle started at that instant; a dropped frame ended at that instant. A frame
-    that waited was sampled between its offer and the next offer or its start. Under newest-waits, the frame
-    that it replaced was superseded at that instant, and it was sampled after any other start in between.
-    """
-    offered, started, outcome = camera.offered_ms, camera.started_ms, camera.outcome
-    ended = _ms([r.ended_ns for r in records], first_ns)
-    following = np.append(offered[1:], math.nan)
-    latest = np.fmin(following, np.where(np.isnan(started), ended, started))
-    exact = np.where((started < following) & ~_waited(started, records), started, math.nan)
-    exact = np.where(outcome == EventKind.DROPPED_BUSY, ended, exact)
-    since = offered.copy()
-    if discipline == "newest-waits":
-        pushed = np.sort(ended[outcome == EventKind.SUPERSEDED])
-        place = np.searchsorted(pushed, offered, side="right")
-        after = np.append(pushed, math.inf)[place]
-        exact = np.where(np.isnan(exact) & (after <= latest), after, exact)
-        begun = np.sort(started[~np.isnan(started)])
-        # The last start before the window's end; a frame's own start is that end or later.
-        before = np.append(-math.inf, begun)[np.searchsorted(begun, latest, side="left")]
-        since = np.where(before > offered, before, offered)
-    never = (outcome == EventKind.SKIPPED) | (outcome == "")
-    window = np.where(never | ~np.isnan(exact) | np.isnan(latest), math.nan, latest - since)
-    guess = np.where(np.isnan(window), offered, since + window / 2)
-    arrived = np.where(never, math.nan, np.where(np.isnan(exact), guess, exact))
-    return replace(camera, arrived_ms=arrived, window_start_ms=since, window_ms=window)
-
-
-def refine_arrivals(
-    recording: Recording, rates: float | Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
-) -> Recording:
-    """Better guesses of arrivals known to a window only: the mean of an exponential truncated to the window.
-
-    rates: in 1/ms, one for all, or a function of (camera's index, instants in ms) with one for each instant.
-    """
-    cameras = []
-    for place, camera in enumerate(recording.cameras):
-        if (
-            camera.window_ms is not None
-            and camera.window_start_ms is not None
-            and (uncertain := camera.window_ms > 0).any()
-        ):
-            window, arrived = camera.window_ms[uncertain], camera.arrived_ms.copy()
-            rate = rates(place, arrived[uncertain]) if callable(rates) else rates
-            load = np.maximum(rate * window, 1e-6)
-            # 1/x - 1/(e^x - 1): 1/2 for a window that is short against the gaps between arrivals.
-            share = np.where(load < 1e-3, 0.5 - load / 12, 1 / load - 1 / np.expm1(np.minimum(load, 700.0)))
-            arrived[uncertain] = camera.window_start_ms[uncertain] + share * window
-            camera = replace(camera, arrived_ms=arrived)
-        cameras.append(camera)
-    return replace(recording, cameras=cameras)
-
-
-def _waited(started: NDArray[np.float64], records: list[trace.Record]) -> NDArray[np.bool_]:
-    """Whether each frame started as another ended (and did not preempt it): then it had been waiting."""
-    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != EventKind.SUPERSEDED}
-    return np.array([r.started_ns in ends for r in records])
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
@@ -221,7 +150,7 @@ def _from_rows(path: Path, discipline: str) -> Recording:
     # On a parallel link, frames offered after this may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
     cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
-    return Recording(path, cameras, discipline, [], False, too_long)
+    return Recording(path, cameras, discipline, False, too_long)
 
 
 def _camera_of_rows(
@@ -251,7 +180,7 @@ def _camera_of_rows(
         if discipline == "parallel":
             unknown |= offered >= sure_ms
         outcome[unknown & (outcome == EventKind.LOST)] = ""
-    return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
+    return Camera(name, offered, offered, started, delivered - started, outcome)
 
 
 def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
@@ -269,20 +198,19 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     change: list[NDArray[np.int64]] = []
     arrived: list[NDArray[np.bool_]] = []
     delay: list[NDArray[np.float64]] = []
-    state: list[NDArray[np.int64]] = []
 
-    def add(at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None,
-            states: NDArray[np.int64] | None = None) -> None:  # fmt: skip
+    def add(
+        at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None
+    ) -> None:
         n = len(at_ms)
         at.append(at_ms)
         change.append(np.full(n, by))
         arrived.append(np.full(n, is_arrival))
         delay.append(np.full(n, math.nan) if delays is None else delays)
-        state.append(np.full(n, -1) if states is None else states)
 
     for camera in cameras:
         went = ~np.isnan(camera.delay_ms)
-        add(camera.started_ms[went], 0, False, camera.delay_ms[went], camera.state[went])
+        add(camera.started_ms[went], 0, False, camera.delay_ms[went])
         if not arrivals or not len(camera.offered_ms):
             continue
         if sampled:
@@ -302,5 +230,5 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order
     return Timeline(
         np.diff(when, prepend=when[:1]), waiting.astype(np.int64), np.concatenate(arrived)[order],
-        np.concatenate(delay)[order], np.concatenate(state)[order], float(when[0]) if len(when) else 0.0,
+        np.concatenate(delay)[order], float(when[0]) if len(when) else 0.0,
     )  # fmt: skip

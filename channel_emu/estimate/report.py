@@ -94,7 +94,7 @@ def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray)
         if f"mean_{i}_ms" in fit.parameters:
             mean = fit.parameters[f"mean_{i}_ms"].value
             top.axhline(mean, color=color, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
-    for line, states in zip(fit.lines, fit.estimate.expectation.states):
+    for line, states in zip(fit.lines, fit.estimate.states):
         at_s = line.at_ms() / 1e3
         bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1], 1], lw=0.8, color=_COLORS[1])
         if len(fit.lines) == 1:

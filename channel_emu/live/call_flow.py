@@ -80,10 +80,6 @@ class CallFlow:
             self._cancel(message)
         self._wake.set()
 
-    def describe(self, message: Message) -> str:
-        name = "" if self._link is None else self._link.name
-        return f"message {message.sequence} of call {self._number} on {name!r}"
-
     def close(self) -> None:
         """The call is over: what the link still delivers is counted as cancelled."""
         self._closed = True

@@ -64,9 +64,6 @@ class CameraFlow:
         for transit in self.link.model.pending():
             self._write(transit.item, "in_flight", self._clock.now_ns())
 
-    def describe(self, message: Message) -> str:
-        return f"frame {message.sequence} of {self.camera}"
-
     def _on_forwarded(self, message: Message) -> None:
         """The frame is being handed to gRPC."""
         now_ns = self._clock.now_ns()

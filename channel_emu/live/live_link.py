@@ -29,18 +29,11 @@ Flips = tuple[tuple[float, int], ...]
 """Damage: (place as a fraction of the message, byte to exclusive-or with)."""
 
 
-class HardLimit(RuntimeError):
-    """A message was handed on later after it was due than the channel allows (``hard_limit_ms``)."""
-
-
 class Receiver(Protocol):
     """Passes messages on when the link has decided: one direction of a call, or a camera's frames."""
 
     def settle(self, message: Message, kind: EventKind) -> None:
         """DELIVERED: pass the message on. DUPLICATED: pass it on once more. Any other kind: it is dropped."""
-
-    def describe(self, message: Message) -> str:
-        """The message in words, for an error."""
 
 
 @dataclass(slots=True)
@@ -82,8 +75,7 @@ class LiveLink:
     """``offer`` messages; the event queue calls ``advance`` when something is due.
 
     name: decides the link's draws, together with the channel's seed. stats: its messages are counted there.
-    failed: told of a HardLimit. damage: how the bytes of a message are flipped. room: for the bytes inside,
-        shared with other links.
+    damage: how the bytes of a message are flipped. room: for the bytes inside, shared with other links.
     """
 
     def __init__(
@@ -92,10 +84,8 @@ class LiveLink:
         model: Link | ReplayLink,
         events: EventQueue,
         stats: DelayStats,
-        failed: Callable[[BaseException], None],
         damage: Callable[[bytes, Flips], bytes],
         trace: TraceWriter | None = None,
-        hard_limit_ms: float | None = None,
         room: Room | None = None,
     ) -> None:
         self.name = name
@@ -115,10 +105,8 @@ class LiveLink:
         """Messages dropped before the link, because there was no room for their bytes."""
         self._room = Room() if room is None else room
         self._events = events
-        self._failed = failed
         self._damage = damage
         self._trace = trace
-        self._hard_limit_ms = hard_limit_ms
         self._resets = 0
 
     @property
@@ -149,16 +137,10 @@ class LiveLink:
         assert transit is not None and transit.ended_ns is not None
         self.last_ns = at_ns
         self.forwarded += 1
-        error_ms = (at_ns - transit.ended_ns) / 1e6
         self.stats.latency.add((at_ns - transit.offered_ns) / 1e6)
-        self.stats.error.add(error_ms)
+        self.stats.error.add((at_ns - transit.ended_ns) / 1e6)
         self.age.add(at_ns, transit.offered_ns)
         self.record(message, at_ns)
-        if self._hard_limit_ms is not None and error_ms > self._hard_limit_ms:
-            self._failed(HardLimit(
-                f"{message.receiver.describe(message)} left {error_ms:.2f} ms after it was due; "
-                f"hard_limit_ms is {self._hard_limit_ms:g}"
-            ))  # fmt: skip
 
     def record(self, message: Message, actual_ns: int | None = None) -> None:
         """Write the message's trace record: one for each message, however many copies of it left."""

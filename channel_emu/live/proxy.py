@@ -8,7 +8,7 @@ is dropped there would be nothing to pass on, so the call ends UNAVAILABLE: that
 request or answer looks like (and a stream that consists of one message: on the wire they are the same).
 
 With a hook, the hook answers the methods it names, and no others are served. ``frame_stream`` is the hook for
-our frame stream. Links, event queue, delay figures, trace, replay, hard limit and shutdown are the same.
+our frame stream. Links, event queue, delay figures, trace, replay and shutdown are the same.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import grpc.aio
 
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.event_queue import EventQueue
-from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, HardLimit, LiveLink, Room
+from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, LiveLink, Room
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.report import Report, figures_of
 from channel_emu.model.channel import Channel
@@ -142,7 +142,7 @@ class Proxy(grpc.GenericRpcHandler):
         return self.port
 
     async def run(self, stop: asyncio.Event) -> Report:
-        """From start to ``stop``; the report. Raises HardLimit where the channel sets one, EmulatorFailed."""
+        """From start to ``stop``; the report. Raises EmulatorFailed."""
         await self.start()
         log.info("listening on port %d, sending to %s", self.port, self.options.to)
         stopping = asyncio.ensure_future(stop.wait())
@@ -182,19 +182,17 @@ class Proxy(grpc.GenericRpcHandler):
         """End ``run`` with this error; the first one counts."""
         if self._failure.done():
             return
-        if not isinstance(error, HardLimit | OSError):
+        if not isinstance(error, OSError):
             log.error("a part of the emulator broke", exc_info=error)
         self._failure.set_exception(error)
         # Whoever runs the proxy asks; where nobody does, asyncio need not complain at exit.
         self._failure.exception()
 
     def check(self) -> None:
-        """Raise HardLimit or EmulatorFailed if anything broke."""
+        """Raise EmulatorFailed if anything broke."""
         failure = self._failure.exception() if self._failure.done() else None
         if failure is None:
             return
-        if isinstance(failure, HardLimit):
-            raise failure
         kind = "" if isinstance(failure, OSError) else f"{type(failure).__name__}: "
         hint = "; is there room on the disk?" if isinstance(failure, OSError) else ""
         raise EmulatorFailed(f"stopped, it could not go on: {kind}{failure}{hint}") from failure
@@ -228,8 +226,8 @@ class Proxy(grpc.GenericRpcHandler):
         elif self.options.replay is not None:
             log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
-            name, model, self.events, DelayStats(self.stats), self.fail, damage or _damage_any_byte,
-            self._trace, self.channel.config.hard_limit_ms, self._room,
+            name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace,
+            self._room,
         )  # fmt: skip
         # A fault may act before the first message.
         self.events.schedule(link)

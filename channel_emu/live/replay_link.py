@@ -50,6 +50,8 @@ class ReplayLink:
         transit = Transit(self.offered, item, size_bytes, at_ns, state=record.state, flips=record.flips)
         self.offered += 1
         self._inside.add(transit.number)
+        if record.arrived_ns is not None:
+            transit.arrived_ns = record.arrived_ns + shift
         if record.started_ns is not None and record.due_ns is not None:
             transit.due_ns = min(record.due_ns + shift, NEVER_NS)
             self._schedule(record.started_ns + shift, EventKind.STARTED, transit)

@@ -18,9 +18,6 @@ from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_r
 
 # The emulator visits every jump. A chain with more jumps a millisecond than this is refused.
 MAX_JUMPS_PER_MS = 1_000.0
-# From this relaxation rate on, states one nanosecond apart are independent to 2^-53: nothing is lost by
-# drawing each instant's state directly.
-WHITE_RATE_PER_MS = 4e7
 _CHECK_EVERY = 100_000
 
 
@@ -140,7 +137,6 @@ class Chain:
         q = check_generator(generator_per_ms)
         self.generator_per_ms = q
         self.states = len(q)
-        self.shares = np.zeros(len(q))  # long-run shares, needed for white noise only
         self._rng = rng
         self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
         if slot_ms is not None:
@@ -159,7 +155,8 @@ class Chain:
         self.jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps)
         self._jump_lists = self.jumps.tolist()
         self._sojourn_rates = [float(r) for r in self.sojourn_rate]
-        self.white = not self.slot_ns and self._is_white()
+        if not self.slot_ns:
+            self._refuse_too_fast()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
@@ -170,8 +167,6 @@ class Chain:
 
     def segment(self, at_ns: int) -> tuple[int, int]:
         """State at ``at_ns`` and the end of its sojourn (NEVER_NS if it has none)."""
-        if self.white:
-            return int(self._rng.uniform(at_ns) >= self.shares[0]), at_ns + 1
         if self._until <= at_ns:
             self._extend(at_ns)
         starts = self._starts
@@ -187,8 +182,6 @@ class Chain:
 
     def recent(self, since_ns: int, until_ns: int) -> list[tuple[int, int]]:
         """(start, state) of the sojourns that touch [since, until], as far as the path is still known."""
-        if self.white:
-            return []
         self.segment(until_ns)
         first = max(0, bisect_right(self._starts, since_ns) - 1)
         last = bisect_right(self._starts, until_ns)
@@ -196,8 +189,6 @@ class Chain:
 
     def occupancy(self, until_ns: int) -> list[float]:
         """Share of [0, until) spent in each state."""
-        if self.white:
-            return [float(p) for p in self.shares]
         if until_ns <= 0:
             return [float(i == self.initial) for i in range(self.states)]
         self.segment(until_ns)
@@ -252,22 +243,17 @@ class Chain:
         shares = np.cumsum(stationary(self.generator_per_ms))
         return min(int(np.searchsorted(shares, self._rng.uniform(0, 1), side="right")), self.states - 1)
 
-    def _is_white(self) -> bool:
-        """Whether a two-state chain is so fast that it is white noise. ChainError if too fast to follow."""
+    def _refuse_too_fast(self) -> None:
+        """ChainError if it would switch more often than can be followed."""
         rates_per_ms = -self.generator_per_ms.diagonal()
         if not rates_per_ms.all():
-            return False  # it has an absorbing state
+            return  # it has an absorbing state
         try:
-            self.shares = stationary(self.generator_per_ms)
+            jumps_per_ms = float(stationary(self.generator_per_ms) @ rates_per_ms)
         except ChainError:
-            return False
-        jumps_per_ms = float(self.shares @ rates_per_ms)
-        if jumps_per_ms <= MAX_JUMPS_PER_MS:
-            return False
-        if self.states == 2 and rates_per_ms.sum() >= WHITE_RATE_PER_MS:
-            return True
-        raise ChainError(
-            f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
-            f"followed (two-state chains faster than {WHITE_RATE_PER_MS:g} a ms are treated as noise); or "
-            "sample it at slot boundaries (sampled: slots)"
-        )
+            return
+        if jumps_per_ms > MAX_JUMPS_PER_MS:
+            raise ChainError(
+                f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
+                "followed: slow it down, or sample it at slot boundaries (sampled: slots)"
+            )

@@ -27,7 +27,7 @@ class Channel:
         self.config = config
         self.seed = seed
         self.chain = self._chain("") if config.chain is not None and config.chain.scope == "shared" else None
-        self._server = QueueServer(config.server.order, config.queue_limit) if config.server.shared else None
+        self._server = QueueServer(config.queue_limit) if config.server.shared else None
 
     def chain_of(self, camera: str) -> Chain | None:
         """A new chain if each camera has its own, else the shared chain (None: one state)."""
@@ -47,7 +47,7 @@ class Channel:
             self.service(camera, chain),
             arrivals,
             faults.make(self.config.faults, self.seed, camera) if self.config.faults else (),
-            self._server or QueueServer(queue_limit=self.config.queue_limit),
+            self._server or QueueServer(self.config.queue_limit),
         )
 
     def forget(self, before_ns: int) -> None:

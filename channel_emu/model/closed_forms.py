@@ -56,14 +56,6 @@ def drop_new_age_ms(
     return float((period_ms * mean_k2 / 2 + alpha @ r @ r @ finished @ mean_ms) / mean_k)
 
 
-def slotted_drop_new_age_ms(mean_ms: float, period_ms: float, slot_ms: float) -> float:
-    """The same where a transmission ends at the slot boundary after its drawn end, as in a loop over slots:
-    the first 1/mu becomes d/(1 - e^(-mu d)), the second term stays. Time average, not an average over slots.
-    """
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([mean_ms]), period_ms)
-    return exact - mean_ms - slot_ms / float(np.expm1(-slot_ms / mean_ms))
-
-
 def _unfinished(q: NDArray[np.float64], rates: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
     """Transition probabilities (M, M) within ``span_ms`` with the service unfinished; a finished service is
     an additional, absorbing state."""

@@ -28,7 +28,6 @@ from channel_emu.model.chain import (
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.presets import preset
-from channel_emu.model.queue_server import ORDERS
 from channel_emu.model.spelling import section
 from freshfield.scenario import ScenarioError, read_section
 
@@ -165,17 +164,10 @@ class ServiceConfig:
 @dataclass(frozen=True)
 class ServerConfig:
     """By default every camera has a server of its own. ``shared``: all cameras compete for one server;
-    ``queue_server`` explains the disciplines and orders. Cameras that capture at one instant arrive in the
-    order of their names: under drop-new the first of them is served."""
+    ``queue_server`` explains the disciplines. Cameras that capture at one instant arrive in the order of
+    their names: under drop-new the first of them is served."""
 
     shared: bool = False
-    order: str = "fcfs"
-    """Whose waiting frame is next when the server becomes free (newest-waits and fcfs)."""
-
-    def __post_init__(self) -> None:
-        _one_of("order", self.order, ORDERS)
-        if self.order != "fcfs" and not self.shared:
-            raise ValueError("order: belongs to a shared server only")
 
 
 @dataclass(frozen=True)
@@ -194,8 +186,6 @@ class ChannelConfig:
     queue_limit: int = 1024
     """Most frames waiting (fcfs) or in service (parallel), so that memory is bounded; for all cameras
     together if the server is shared."""
-    hard_limit_ms: float | None = None
-    """Live only: stop the emulator if a frame leaves this much later than it was due."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Parameters of the listed faults, by name."""
 
@@ -204,10 +194,6 @@ class ChannelConfig:
         _one_of("discipline", self.discipline, DISCIPLINES)
         if not 1 <= self.queue_limit <= 10**6:
             raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
-        if self.server.order != "fcfs" and self.discipline not in ("newest-waits", "fcfs"):
-            raise ValueError(f"server.order: nothing waits its turn under discipline {self.discipline}")
-        if self.hard_limit_ms is not None and self.hard_limit_ms <= 0:
-            raise ValueError(f"hard_limit_ms: expected more than 0, got {self.hard_limit_ms:g}")
         states = 1 if self.chain is None else len(self.chain.names())
         chances = {f"faults.{name}.probability": getattr(p, "probability", None)
                    for name, p in self.faults.items()}  # fmt: skip

@@ -45,6 +45,8 @@ class Transit:
     item: Any
     size_bytes: int
     offered_ns: int
+    arrived_ns: int | None = None
+    """When it entered the link: at its offer, or when the arrival process sampled it."""
     started_ns: int | None = None
     due_ns: int | None = None
     state: int = 0
@@ -52,7 +54,7 @@ class Transit:
     outcome: EventKind | None = None
     ended_ns: int | None = None
     ticket: int = 0
-    """The server numbers its arrivals; a frame that replaces a waiting one may inherit its ticket."""
+    """The server numbers its arrivals; a frame that replaces a waiting one inherits its ticket."""
     flips: tuple[tuple[float, int], ...] = ()
     """Damaged bytes: (position as a fraction of the payload, non-zero byte to XOR with)."""
 
@@ -123,8 +125,6 @@ class Link:
         """How often a fault reset the camera's stream."""
         self.chain = service.chain
         self.waiting: deque[Transit] = deque()
-        self.newest_delivered_ns = -1
-        """When the newest delivered frame was offered."""
         self.server = server or QueueServer()
         self._service = service
         self._arrivals = arrivals
@@ -239,6 +239,7 @@ class Link:
 
     def _arrive(self, transit: Transit, at_ns: int) -> None:
         server = self.server
+        transit.arrived_ns = at_ns
         transit.ticket = server.issue_ticket()
         if not server.busy:
             self._start(transit, at_ns)
@@ -248,8 +249,7 @@ class Link:
             if self.waiting:
                 server.waiting -= 1
                 older = self.waiting.popleft()
-                if server.order == "fcfs":
-                    transit.ticket = older.ticket
+                transit.ticket = older.ticket
                 self._end(older, EventKind.SUPERSEDED, at_ns)
             self._wait(transit)
         elif self.discipline == "fcfs":
@@ -297,7 +297,6 @@ class Link:
         else:
             for fault in self._faults:
                 transit.flips += fault.flips(transit)
-            self.newest_delivered_ns = max(self.newest_delivered_ns, transit.offered_ns)
             self._end(transit, EventKind.DELIVERED, at_ns)
             if self._faults and any(fault.duplicates(transit) for fault in self._faults):
                 self.counts[EventKind.DUPLICATED] += 1

@@ -9,15 +9,9 @@ disciplines mean:
 - lcfs-preempt: a new frame of any camera ends the frame in service, whichever camera's it is.
 - parallel: nobody waits; ``queue_limit`` bounds the frames in service of all cameras together.
 
-When the server becomes free, ``order`` chooses the camera; within a camera frames keep their order:
-
-- fcfs: the camera that has waited longest. Under newest-waits a replacing frame inherits the ticket of the
-  frame it replaces; otherwise a fast camera would lose its place with every frame.
-- newest-first: the camera whose next frame arrived last.
-- round-robin: the next camera by name, after the one served last.
-- oldest-age: the camera whose newest delivered frame is oldest, never-delivered ones first (maximum age
-  first: Sun, Uysal-Biyikoglu and Kompella, "Age-optimal updates of multiple information flows", INFOCOM
-  workshops 2018).
+When the server becomes free, the camera is next that has waited longest; within a camera frames keep their
+order. Under newest-waits a replacing frame inherits the ticket of the frame it replaces; otherwise a fast
+camera would lose its place with every frame.
 
 Events of one instant happen in this order: frames complete, streams reset, frames arrive (earlier offers
 first, then by name).
@@ -30,15 +24,12 @@ from typing import Any, Protocol
 
 from channel_emu.model.nanoseconds import NEVER_NS
 
-ORDERS = ("fcfs", "newest-first", "round-robin", "oldest-age")
-
 
 class QueuedLink(Protocol):
     """What the server uses of a ``link.Link``."""
 
     camera: str
     own_event_ns: int
-    newest_delivered_ns: int
 
     @property
     def waiting(self) -> deque[Any]: ...
@@ -52,11 +43,8 @@ class QueuedLink(Protocol):
 class QueueServer:
     """Chooses among its links; each link decides the outcome of its own frames."""
 
-    def __init__(self, order: str = "fcfs", queue_limit: int = 1024) -> None:
+    def __init__(self, queue_limit: int = 1024) -> None:
         """queue_limit: most frames waiting (fcfs) or in service (parallel); more are dropped_busy."""
-        if order not in ORDERS:
-            raise ValueError(f"order {order!r} is not one of {', '.join(ORDERS)}")
-        self.order = order
         self.queue_limit = queue_limit
         self.busy = 0
         """Frames in service."""
@@ -94,17 +82,5 @@ class QueueServer:
     def start_next(self, at_ns: int) -> None:
         """Start the next waiting frame if the server is free."""
         if self.waiting and not self.busy:
-            self._next_link().start_waiting(at_ns)
-
-    def _next_link(self) -> QueuedLink:
-        ready = [link for link in self.links if link.waiting]
-        if len(ready) == 1:
-            return ready[0]
-        if self.order == "fcfs":
-            return min(ready, key=lambda link: link.waiting[0].ticket)
-        if self.order == "newest-first":
-            return max(ready, key=lambda link: link.waiting[0].ticket)
-        if self.order == "oldest-age":
-            return min(ready, key=lambda link: link.newest_delivered_ns)
-        last = self.last_started.camera if self.last_started is not None else ""
-        return next((link for link in ready if link.camera > last), ready[0])
+            ready = (link for link in self.links if link.waiting)
+            min(ready, key=lambda link: link.waiting[0].ticket).start_waiting(at_ns)

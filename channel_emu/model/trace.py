@@ -4,10 +4,12 @@ First line: ``{"freshfield_trace": 1, "seed": ..., "channel": {...}}``. Then one
 is known::
 
     {"camera": "cam03", "session": "f3a1", "sequence": 17, "number": 16, "bytes": 20481, "offered_ns": ...,
-     "outcome": "delivered", "state": 0, "started_ns": ..., "drawn_ns": ..., "due_ns": ..., "ended_ns": ...,
-     "actual_ns": ..., "duplicated": false, "flips": []}
+     "arrived_ns": ..., "outcome": "delivered", "state": 0, "started_ns": ..., "drawn_ns": ..., "due_ns": ...,
+     "ended_ns": ..., "actual_ns": ..., "duplicated": false, "flips": []}
 
-Instants are nanoseconds since the emulator started. ``due_ns`` is when the link releases the message,
+Instants are nanoseconds since the emulator started. ``arrived_ns`` is when the message entered the link,
+later than its offer where an arrival process samples messages (null if it never did, and in traces of older
+versions). ``due_ns`` is when the link releases the message,
 ``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a message that was still inside the link
 when the recording ended. For services other than the frame stream, ``camera`` is the link's name
 (``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the message's place in it.
@@ -25,7 +27,7 @@ from channel_emu.model.link import EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
 
 VERSION = 1
-_INSTANTS = ("offered_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
+_INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
 
 
 class TraceError(ValueError):
@@ -51,6 +53,7 @@ class Record:
     actual_ns: int | None = None
     duplicated: bool = False
     flips: tuple[tuple[float, int], ...] = ()
+    arrived_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class TraceWriter:
     ) -> None:
         self._line({
             "camera": camera, "session": session, "sequence": sequence, "number": transit.number,
-            "bytes": transit.size_bytes, "offered_ns": transit.offered_ns,
+            "bytes": transit.size_bytes, "offered_ns": transit.offered_ns, "arrived_ns": transit.arrived_ns,
             "outcome": None if transit.outcome is None else str(transit.outcome), "state": transit.state,
             "started_ns": transit.started_ns, "drawn_ns": transit.drawn_ns, "due_ns": transit.due_ns,
             "ended_ns": transit.ended_ns, "actual_ns": actual_ns, "duplicated": duplicated,

@@ -21,9 +21,6 @@ def completion_ns(work: float, rates_per_ns: Sequence[float], chain: Chain | Non
     """
     if chain is None or len(rates_per_ns) == 1 or rates_per_ns.count(rates_per_ns[0]) == len(rates_per_ns):
         return _at_rate(work, rates_per_ns[0], start_ns)
-    if chain.white:
-        # White noise acts through its average over any span longer than a nanosecond.
-        return _at_rate(work, sum(r * float(p) for r, p in zip(rates_per_ns, chain.shares)), start_ns)
     at_ns = start_ns
     while at_ns < NEVER_NS:
         state, until_ns = chain.segment(at_ns)

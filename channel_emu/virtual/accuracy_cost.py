@@ -1,10 +1,8 @@
-"""The simulation's accuracy against its cost: three trade-offs, measured against exact ages.
+"""The simulation's accuracy against its cost: two trade-offs, measured against exact ages.
 
 - ``duration``: error of the mean age against seconds simulated and seconds of computing (the thesis's chapter
   5 channel, exact age by ``closed_forms``).
-- ``slots``: bias and speed of a slot grid against its length: of the chain's sampling (exact and measured)
-  and of stepping time itself (``benchmark.periodic_loop``).
-- ``seeds``: width of a 95 % interval of the mean age against the number of seeds.
+- ``slots``: bias and speed of sampling the chain at slot boundaries against their length, exact and measured.
 """
 
 from __future__ import annotations
@@ -16,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from channel_emu.model.chain import two_state_generator
-from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age_ms
+from channel_emu.model.closed_forms import drop_new_age_ms
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS, periodic_loop
+from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS
 from channel_emu.virtual.simulate import SimulationError, simulate
 from freshfield.files import format_table, picture, write_csv
 
@@ -31,18 +29,15 @@ CHAINS = (
     ("fast", 5.0, 5.0, (0.2, 2.0), 2.0, (0.01, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
     ("thesis", 1 / 30, 1 / 30, (30.0, 60.0), 30.0, (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)),
 )
-LOOP_SLOTS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 
 
 def measure(quick: bool = False, seed: int = 0) -> dict[str, Rows]:
-    """The three tables; seeds count from ``seed`` on. quick: fewer seeds and shorter runs, for seconds
+    """The two tables; seeds count from ``seed`` on. quick: fewer seeds and shorter runs, for seconds
     instead of a minute. Raises SimulationError where numba is missing."""
     return {
         "duration": duration(8 if quick else 24, 1000.0 if quick else 10_000.0, seed),
-        "slots": [*chain_slots(6 if quick else 20, 100_000 if quick else 400_000, seed),
-                  *loop_slots(3 if quick else 8, 40.0 if quick else 100.0, seed)],
-        "seeds": seeds(32 if quick else 256, 60.0, seed),
-    }  # fmt: skip
+        "slots": chain_slots(6 if quick else 20, 100_000 if quick else 400_000, seed),
+    }
 
 
 def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
@@ -92,59 +87,9 @@ def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
     return rows
 
 
-def loop_slots(repeats: int, seconds: float, seed: int = 0) -> Rows:
-    """The same for a loop over slots. Its ages are sampled just after deliveries, so half a slot is added to
-    compare them with the time average."""
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
-    rows = []
-    for slot_ms in LOOP_SLOTS_MS:
-        begun = time.perf_counter()
-        found = np.array([periodic_loop(CAMERAS, seconds, seed + k, slot_ms) for k in range(repeats)])
-        found += slot_ms / 2
-        rows.append({
-            "what": "loop over slots", "slot_ms": slot_ms, "period_ms": PERIOD_MS,
-            "bias_exact_pct": 100 * (slotted_drop_new_age_ms(MEAN_MS, PERIOD_MS, slot_ms) / exact - 1),
-            "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
-            "half_width_pct": 100 * _half_width(found) / exact,
-            "camera_s_per_wall_s": repeats * seconds * CAMERAS / (time.perf_counter() - begun),
-        })  # fmt: skip
-    return rows
-
-
-def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
-    """Half width of the 95 % interval of the mean age from 2, 4, 8, ... seeds, and the share of groups of
-    that many whose interval holds the exact age.
-
-    A run of this length is biased, because it starts with a delivery, when the age is least. Longer runs
-    remove the bias; more seeds only make it visible.
-    """
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
-    config = channel_from_mapping({"preset": "ch5"})
-    begun = time.perf_counter()
-    found = np.array([_age(config, CAMERAS, seconds, seed + k) for k in range(most)])
-    each_ms = (time.perf_counter() - begun) / most * 1e3
-    bias_width = _half_width(found)
-    rows = []
-    count = 2
-    while count <= most // 4:  # enough groups to estimate how often the interval holds the exact age
-        groups = found[: most // count * count].reshape(-1, count)
-        widths = np.array([_half_width(group) for group in groups])
-        inside = np.abs(groups.mean(1) - exact) <= widths
-        rows.append({
-            "seeds": count, "seconds": seconds, "groups": len(groups),
-            "half_width_pct": 100 * float(widths.mean()) / exact, "holds_exact": float(inside.mean()),
-            "bias_pct": 100 * (float(found.mean()) / exact - 1),
-            "bias_half_width_pct": 100 * bias_width / exact,
-            "wall_ms": each_ms * count,
-        })  # fmt: skip
-        count *= 2
-    return rows
-
-
 _TITLES = {
     "duration": "rms error of the mean age against seconds simulated (chapter 5)",
     "slots": "bias of a slot grid against its length (slot 0: continuous time)",
-    "seeds": "half width of the 95 % interval of the mean age against seeds, bias of a run (chapter 5)",
 }
 
 
@@ -158,12 +103,12 @@ def write(tables: dict[str, Rows], out: Path) -> list[Path]:
     files = {out / f"accuracy-{name}.csv": rows for name, rows in tables.items()}
     for path, rows in files.items():
         write_csv(path, rows)
-    with picture(out / "accuracy.png", 1, 3, size=(13, 4)) as axes:
+    with picture(out / "accuracy.png", 1, 2, size=(9, 4)) as axes:
         _draw(tables, *axes[0])
     return [*files, out / "accuracy.png"]
 
 
-def _draw(tables: dict[str, Rows], left: Any, middle: Any, right: Any) -> None:
+def _draw(tables: dict[str, Rows], left: Any, right: Any) -> None:
     error = [r["rms_error_pct"] for r in tables["duration"]]
     left.loglog([r["seconds"] for r in tables["duration"]], error, "o-", label="seconds simulated")
     left.loglog([r["wall_ms"] / 1e3 for r in tables["duration"]], error, "s--", label="seconds of computing")
@@ -172,19 +117,14 @@ def _draw(tables: dict[str, Rows], left: Any, middle: Any, right: Any) -> None:
     for what in dict.fromkeys(r["what"] for r in tables["slots"]):
         rows = [r for r in tables["slots"] if r["what"] == what and r["slot_ms"]]
         slots = [r["slot_ms"] / r["period_ms"] for r in rows]
-        (line,) = middle.plot(slots, [r["bias_exact_pct"] for r in rows], "-", label=f"{what}, exact")
-        middle.errorbar(
+        (line,) = right.plot(slots, [r["bias_exact_pct"] for r in rows], "-", label=f"{what}, exact")
+        right.errorbar(
             slots, [r["bias_measured_pct"] for r in rows], [r["half_width_pct"] for r in rows], fmt="o",
             color=line.get_color(), label=f"{what}, measured",
         )  # fmt: skip
-    middle.set(xscale="log", xlabel="slot / period", ylabel="bias of the mean age (%)", title="Slot grids")
-    middle.set_yscale("symlog", linthresh=0.1)
-    middle.legend(fontsize="small")
-    right.loglog([r["seeds"] for r in tables["seeds"]], [r["half_width_pct"] for r in tables["seeds"]], "o-")
-    right.set(xlabel="seeds", ylabel="half width of the 95 % interval (%)", title="60 s a seed")
-    counts = [r["seeds"] for r in tables["seeds"]]
-    right.set_xticks(counts, [str(count) for count in counts])
-    right.minorticks_off()
+    right.set(xscale="log", xlabel="slot / period", ylabel="bias of the mean age (%)", title="Slot grids")
+    right.set_yscale("symlog", linthresh=0.1)
+    right.legend(fontsize="small")
 
 
 def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> float:

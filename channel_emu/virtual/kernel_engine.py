@@ -21,7 +21,6 @@ from channel_emu.model.counter_rng import stream_key
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.nanoseconds import NEVER_NS
-from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.kernels import chain_path, philox, service, work
 from channel_emu.virtual.link_run import OUTCOME_CODES, LinkRun, camera_period_ms, name_ranks
 from freshfield.machine_load import usable_cores
@@ -98,8 +97,8 @@ def _serve_alone(
 ) -> LinkRun:
     path, (offered, arrive) = prepare()
     outcome, started, due = _serve(
-        arrive, offered, np.zeros(len(arrive), np.int64), DISCIPLINES.index(config.discipline), 0,
-        config.queue_limit, _work(config, channel, name, len(arrive)), *_service_means(config), *path,
+        arrive, np.zeros(len(arrive), np.int64), DISCIPLINES.index(config.discipline), config.queue_limit,
+        _work(config, channel, name, len(arrive)), *_service_means(config), *path,
         np.zeros(1, np.int64), np.array([len(path[0])]), end_ns,
     )  # fmt: skip
     return _run_of(config, channel, name, path, (offered, outcome, started, due), end_ns)
@@ -126,10 +125,9 @@ def _serve_together(
     outcome = np.full(len(arrive), service.SKIPPED, np.int8)
     started, due = np.full(len(arrive), -1, np.int64), np.full(len(arrive), -1, np.int64)
     outcome[order], started[order], due[order] = _serve(
-        arrive[order], offered[order], camera[order], DISCIPLINES.index(config.discipline),
-        ORDERS.index(config.server.order), config.queue_limit, drawn[order], *_service_means(config),
-        np.concatenate([p[0] for p in kept]), np.concatenate([np.append(p[1], 0) for p in kept]),
-        (ends - lengths)[pick], ends[pick], end_ns,
+        arrive[order], camera[order], DISCIPLINES.index(config.discipline), config.queue_limit, drawn[order],
+        *_service_means(config), np.concatenate([p[0] for p in kept]),
+        np.concatenate([np.append(p[1], 0) for p in kept]), (ends - lengths)[pick], ends[pick], end_ns,
     )  # fmt: skip
     runs: dict[int, LinkRun] = {}
     for rank, i in enumerate(by_rank):

@@ -1,7 +1,7 @@
 """Simulates the links in virtual time: thousands of camera-seconds in a moment, from one seed.
 
 Two engines decide the same for every frame: ``python`` runs ``link.Link`` in an event loop, ``kernel``
-(numba) computes whole arrays. Faults other than loss, and a chain that is white noise, need the Python one.
+(numba) computes whole arrays. Faults other than loss need the Python one.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def simulate(
         raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)
     channel = Channel(config, seed)
-    why_not = _kernel_unsupported(config, channel)
+    why_not = _kernel_unsupported(config)
     if engine == "kernel" and why_not:
         raise SimulationError(f"engine kernel: {why_not}")
     if engine == "auto":
@@ -152,15 +152,10 @@ def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> floa
     return max(rates) if isinstance(rates, list) else rates
 
 
-def _kernel_unsupported(config: ChannelConfig, channel: Channel) -> str | None:
+def _kernel_unsupported(config: ChannelConfig) -> str | None:
     """Why the kernel cannot run this channel, or None."""
-    other = [name for name in config.faults if name != "loss"]
-    if other or (config.faults and config.server.order == "oldest-age"):  # whose turn depends on losses
+    if any(name != "loss" for name in config.faults):
         return f"faults ({', '.join(config.faults)}) are simulated by the python engine only"
-    if config.chain is not None:
-        probe = channel.chain or channel.chain_of("")
-        if probe is not None and probe.white:
-            return "a chain this fast is simulated by the python engine only"
     try:
         import numba  # noqa: F401
     except ImportError:

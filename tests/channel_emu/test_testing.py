@@ -278,13 +278,6 @@ def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
     assert set(link.report().by_method) == {"up"}
 
 
-def test_the_hard_limit_is_told_to_the_test(channel, greeter, client) -> None:
-    link = channel({**WAIT, "hard_limit_ms": 1e-6}, to=greeter.address)
-    client(link).unary_unary(HELLO)(b"you", timeout=5)
-    with pytest.raises(RuntimeError, match=r"message 0 of call 1 on 'up /greet.*Hello' left"):
-        link.report()
-
-
 @pytest.mark.parametrize(
     ("channel_", "options", "why"),
     [

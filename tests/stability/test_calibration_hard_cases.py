@@ -116,7 +116,6 @@ def test_nothing_overflows_or_divides_by_zero_on_exact_data():
         warnings.simplefilter("error")
         found = calibrate(noisy_samples(12, np.random.default_rng(4), 0.0, 0.0))
     assert distance_mm(found.transform, X) < 1e-6
-    assert found.left_out_mm < 1e-3
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])

@@ -73,20 +73,11 @@ def test_a_chain_that_always_switches(engine: str) -> None:
     assert found["delay_ms"]["mean"] == pytest.approx(40, abs=expected)
 
 
-def test_a_chain_faster_than_a_nanosecond_is_noise() -> None:
-    section = {"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 3e9}, "discipline": "parallel"}
-    found = run({**section, "service_state": "modulated"}, seconds=60)
-    assert found["engine"] == "python"
-    assert found["state_share"] == {"low": 0.75, "high": 0.25}
-    speed = 0.75 / 30 + 0.25 / 60
-    assert found["delay_ms"]["mean"] == pytest.approx(1 / speed, rel=0.15)
-    found = run(section, seconds=60)
-    assert found["delay_ms"]["mean"] == pytest.approx(0.75 * 30 + 0.25 * 60, rel=0.15)
-
-
 def test_chains_too_fast_to_follow_are_refused_with_a_reason() -> None:
     with pytest.raises(ChainError, match="at most 1000 are"):
         run({"preset": "ch6", "chain": {"mu1_per_ms": 1e6, "mu2_per_ms": 1e6}})
+    with pytest.raises(ChainError, match="at most 1000 are"):
+        run({"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 3e9}})
     fast = np.array([[-1e9, 1e9, 0.0], [0.0, -1e9, 1e9], [1e9, 0.0, -1e9]])
     with pytest.raises(ChainError, match="at most 1000 are"):
         Chain(fast, CounterRng(0, "", "c"))

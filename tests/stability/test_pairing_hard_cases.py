@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.pose.pairing import SampleBuffer, interpolate_screw, sort_samples
+from camera_node.pose.pairing import SampleBuffer, sort_samples
 from camera_node.pose.providers import PoseGapError, Trajectory
 from freshfield.geometry import (
     Pose,
@@ -52,7 +52,7 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
 
 
 def test_a_hole_is_refused_and_counted_frame_by_frame():
-    buffer = SampleBuffer(interpolate_screw, max_gap_ns=20 * MS)
+    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS)
     for t_ms in [*range(0, 500, 8), *range(900, 1400, 8)]:
         buffer.add(t_ms * MS, at(t_ms))
     refused = 0
@@ -68,7 +68,7 @@ def test_a_hole_is_refused_and_counted_frame_by_frame():
 
 
 def test_the_same_stamp_with_another_pose_keeps_the_first_and_says_so():
-    buffer = SampleBuffer(interpolate_screw)
+    buffer = SampleBuffer(Pose.interpolate)
     assert buffer.add(5 * MS, at(5)) and not buffer.add(5 * MS, at(6))
     assert buffer.at(5 * MS)[0] == at(5)
     assert buffer.counts.duplicates == 1
@@ -77,7 +77,7 @@ def test_the_same_stamp_with_another_pose_keeps_the_first_and_says_so():
 @pytest.mark.parametrize("jump_ms", [-3_600_000, 3_600_000, -(10**12), 10**12])
 def test_a_clock_that_is_set_is_followed(jump_ms):
     """A controller that restarts counts from its start again; one that is synchronised leaps."""
-    buffer = SampleBuffer(interpolate_screw, max_gap_ns=20 * MS)
+    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS)
     for t_ms in range(0, 1000, 8):
         buffer.add(t_ms * MS, at(t_ms))
     for k, t_ms in enumerate(range(1000, 2000, 8)):
@@ -88,7 +88,7 @@ def test_a_clock_that_is_set_is_followed(jump_ms):
 
 
 def test_one_wild_stamp_costs_a_few_samples_and_no_more():
-    buffer = SampleBuffer(interpolate_screw, max_gap_ns=20 * MS)
+    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS)
     lost = 0
     for t_ms in range(0, 4000, 8):
         buffer.add((10**15 if t_ms == 2000 else t_ms) * MS, at(t_ms))
@@ -115,18 +115,17 @@ def test_memory_is_bounded_however_long_it_runs():
     assert len(buffer._times) <= 600
 
 
-@pytest.mark.parametrize("mix", [Pose.interpolate, interpolate_screw])
 @pytest.mark.parametrize(
     "angle", [0.0, 1e-12, 1e-7, 1.0, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi - 1e-9]
 )
-def test_between_two_poses_however_far_apart(mix, angle):
+def test_between_two_poses_however_far_apart(angle):
     """Up to and past half a turn, where the shorter way changes sides: always a rigid motion between them."""
     a, b = at(10), Pose.from_matrix(at(10).matrix() @ turn(angle))
     for fraction in (0.0, 1e-15, 0.3, 0.5, 1.0):
-        middle = mix(a, b, fraction).matrix()
+        middle = a.interpolate(b, fraction).matrix()
         assert np.isfinite(middle).all()
         np.testing.assert_allclose(middle[:3, :3] @ middle[:3, :3].T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(mix(a, b, 1.0).matrix(), b.matrix(), atol=1e-7)
+    np.testing.assert_allclose(a.interpolate(b, 1.0).matrix(), b.matrix(), atol=1e-7)
 
 
 def turn(angle: float) -> np.ndarray:

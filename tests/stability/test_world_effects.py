@@ -95,7 +95,7 @@ def numbers() -> list[tuple[str, str]]:
     """Every number among the parameters of every effect."""
     found = []
     for name in fx.NAMES:
-        model = fx.effect_class(name).Parameters
+        model = fx.effect_class(name)
         hints = typing.get_type_hints(model)
         found += [(name, f.name) for f in dataclasses.fields(model) if hints[f.name] in (int, float)]
     return found

@@ -1,8 +1,7 @@
 """Calibration accuracy against time and number of poses: three tables from a simulated hand with known truth.
 
 - ``pairing``: error of the camera's pose (4.7) against the arm's reporting period and speed, for the nearest
-  sample (thesis 4.3.3), linear interpolation with slerp, and screw interpolation; and the processor time of
-  one pairing.
+  sample (thesis 4.3.3) and linear interpolation with slerp; and the processor time of one pairing.
 - ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
   bound; arm noise .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard deviations of the
   errors over the trials, within which an error may lie below its bound by chance. ``planned``: the
@@ -21,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.pose.pairing import Interpolate, SampleBuffer, interpolate_screw
-from camera_node.robot import figures
+from camera_node.pose.pairing import Interpolate, SampleBuffer
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
@@ -33,6 +31,7 @@ from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_b
 from camera_node.robot.calibration.hand_eye.next_pose import propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse
 from camera_node.robot.calibration.hand_eye.time_offset import calibrate_streams
+from freshfield.files import picture
 from freshfield.geometry import Pose
 
 Rows = list[dict[str, Any]]
@@ -40,7 +39,6 @@ Rows = list[dict[str, Any]]
 INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {
     "nearest": None,
     "line": Pose.interpolate,
-    "screw": interpolate_screw,
 }
 PERIODS_MS = (2.0, 8.0, 20.0, 50.0, 100.0, 200.0)
 SPEEDS_M_PER_S = (0.05, 0.1, 0.25, 0.5, 1.0)
@@ -211,46 +209,32 @@ def streams(
     return Track(hand_ns, hands), Track(seen_ns, targets)
 
 
-def format_table(name: str, rows: Rows) -> str:
-    """Format a table as text."""
-    keys = list(rows[0])
-    width = {k: max(len(k), *(len(_cell(row[k])) for row in rows)) for k in keys}
-    lines = ["  ".join(f"{k:>{width[k]}}" for k in keys)]
-    lines += ["  ".join(f"{_cell(row[k]):>{width[k]}}" for k in keys) for row in rows]
-    return "\n".join([name, *lines, ""])
-
-
 def plot(pairing_rows: Rows, poses_rows: Rows, path: Path) -> None:
-    """Plot the pairing and poses tables, if matplotlib is installed. Raises OSError."""
-    plt = figures.pyplot()
-    if plt is None:
-        return
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    """Plot the pairing and poses tables. Raises PlotError."""
     speeds = sorted({r["speed_m_per_s"] for r in pairing_rows})
     speed = speeds[len(speeds) // 2]
-    for name in INTERPOLATIONS:
-        chosen = [r for r in pairing_rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
-        left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
-    left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
-    left.legend()
-    for name in (*ALL_METHODS, PLANNED):
-        chosen = [r for r in poses_rows if r["method"] == name]
-        right.loglog([r["poses"] for r in chosen], [r["rms_mm"] for r in chosen], "o-", label=name)
-        if name in (REFINED, PLANNED):
-            right.loglog([r["poses"] for r in chosen], [r["bound_mm"] for r in chosen], "k--", linewidth=0.8)
-    right.set_xticks([4, 6, 10, 20, 50], ["4", "6", "10", "20", "50"], minor=False)
-    right.set_xticks([], minor=True)
-    right.set(
-        xlabel="poses", ylabel="camera in hand, rms (mm)", title="arm noise .5 mm, .002 rad (dashed: bounds)"
-    )
-    right.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with picture(path, 1, 2, size=(11, 4)) as ((left, right),):
+        for name in INTERPOLATIONS:
+            chosen = [r for r in pairing_rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
+            left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
+        left.set(
+            xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s"
+        )
+        left.legend()
+        for name in (*ALL_METHODS, PLANNED):
+            chosen = [r for r in poses_rows if r["method"] == name]
+            counts = [r["poses"] for r in chosen]
+            right.loglog(counts, [r["rms_mm"] for r in chosen], "o-", label=name)
+            if name in (REFINED, PLANNED):
+                right.loglog(counts, [r["bound_mm"] for r in chosen], "k--", linewidth=0.8)
+        right.set_xticks([4, 6, 10, 20, 50], ["4", "6", "10", "20", "50"], minor=False)
+        right.set_xticks([], minor=True)
+        right.set(
+            xlabel="poses", ylabel="camera in hand, rms (mm)",
+            title="arm noise .5 mm, .002 rad (dashed: bounds)",
+        )  # fmt: skip
+        right.legend()
 
 
 def _rms_ms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) * 1e3 if values else float("nan")
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -284,7 +284,7 @@ def _target(args: argparse.Namespace) -> int:
 
 def _accuracy(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration import accuracy_study
-    from freshfield.files import write_csv
+    from freshfield.files import format_table, write_csv
 
     if args.seed < 0:
         raise CalibrationError("--seed: expected a whole number from 0")
@@ -293,7 +293,7 @@ def _accuracy(args: argparse.Namespace) -> int:
         for name, rows in accuracy_study.run_tables(args.quick, args.seed):
             tables[name] = rows
             if not args.json:
-                print(accuracy_study.format_table(name, rows), flush=True)
+                print(f"{name}\n{format_table(rows)}\n", flush=True)
             if args.out is not None:
                 write_csv(args.out / f"{name}.csv", rows)
         if args.out is not None:

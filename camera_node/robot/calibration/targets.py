@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.pairing import left_jacobian
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.square_corners import square_corners
 from freshfield.geometry import Pinhole
@@ -113,9 +112,10 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> TargetPose:
     off = again.reshape(-1, 2) - pixels
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    # OpenCV differentiates by the rotation vector; convert to rotations about the target's own axes.
-    right_jacobian = left_jacobian(-np.ravel(turn).astype(np.float64))
-    slopes = np.concatenate([slopes[:, :3] @ np.linalg.inv(right_jacobian), slopes[:, 3:6]], axis=1)
+    # By a shift, and by a rotation about the target's own axes instead of OpenCV's rotation vector.
+    by_shift = slopes[:, 3:6].reshape(-1, 2, 3)
+    by_turn = np.cross(corners.points[:, None], by_shift @ pose[:3, :3])
+    slopes = np.concatenate([by_turn, by_shift], axis=2).reshape(-1, 6)
     error_px = float(np.sqrt(np.mean((off**2).sum(axis=1))))
     return TargetPose(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
 

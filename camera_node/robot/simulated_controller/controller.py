@@ -29,9 +29,8 @@ _HISTORY_STEPS = 10_000  # 20 s
 _MAX_CATCH_UP_STEPS = 5_000
 
 MOVE_J, SERVO_J, SERVO_STOP, STOP_SCRIPT, NO_COMMAND = 1, 11, 16, 255, 0
-SPEED_J, SPEED_STOP, STOP_J = 9, 15, 34
-SET_WATCHDOG = 35
-SIMULATED = "moveJ, servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog, stopScript"
+STOP_J, SET_WATCHDOG = 34, 35
+SIMULATED = "moveJ, servoJ, servoStop, stopJ, setWatchdog, kickWatchdog, stopScript"
 READY, DONE = 1, 2
 PLAYING, STOPPED = 2, 1
 
@@ -58,7 +57,6 @@ class Controller:
         self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
         self.answer = 0
-        self.digital_out = 0
         self.runtime_state = STOPPED
         self.steps = 0
         self._start_ns = start_ns
@@ -119,7 +117,6 @@ class Controller:
             "runtime_state": self.runtime_state,
             "speed_scaling": 1.0, "target_speed_fraction": 1.0,
             "actual_main_voltage": 48.0, "actual_robot_voltage": 48.0, "actual_joint_voltage": (48.0,) * 6,
-            "actual_digital_output_bits": self.digital_out,
             "output_int_register_0": self.answer,
         }  # fmt: skip
 
@@ -138,7 +135,6 @@ class Controller:
     def write_inputs(self, given: dict[str, Any]) -> None:
         """Take a client's input registers, and execute their command."""
         self.inputs.update(given)
-        self._set_outputs(given)
         if "input_int_register_0" not in given or self.runtime_state != PLAYING:
             return
         command = int(given["input_int_register_0"])
@@ -150,9 +146,6 @@ class Controller:
         elif command == SERVO_J:
             if not self.motion.servo(self._joints()):  # without an answer: the next target follows at once
                 self.fault("servoJ to where the joints cannot go")
-        elif command == SPEED_J:
-            if not self.motion.speed(self._joints(), self._double(6)):
-                self.fault("speedJ without a speed or an acceleration")
         else:
             self._command(command)
 
@@ -164,7 +157,7 @@ class Controller:
                 return
             asynchronous = self.inputs.get("input_int_register_1", 0) == 1
             self._busy = self.motion.moving and not asynchronous
-        elif command in (SERVO_STOP, SPEED_STOP, STOP_J):
+        elif command in (SERVO_STOP, STOP_J):
             self.motion.stop(self._double(0))
             self._busy = self.motion.moving
         elif command == SET_WATCHDOG and self._double(0) > 0:
@@ -184,13 +177,6 @@ class Controller:
         """Stop the program, as a controller does after a command that it cannot execute."""
         log.warning("simulated arm: %s: the program is stopped", why)
         self.stop_program()
-
-    def _set_outputs(self, given: dict[str, Any]) -> None:
-        for name, shift in (("standard", 0), ("configurable", 8), ("tool", 16)):
-            mask = given.get(f"{name}_digital_output_mask")
-            if mask is not None:
-                value = given.get(f"{name}_digital_output", 0)
-                self.digital_out = (self.digital_out & ~(mask << shift)) | ((value & mask) << shift)
 
     def _double(self, register: int) -> float:
         return float(self.inputs.get(f"input_double_register_{register}", 0.0))

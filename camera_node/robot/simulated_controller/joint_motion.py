@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm.kinematics import ArmModel
 
 Array = NDArray[np.float64]
-Mode = Literal["idle", "move", "servo", "speed", "stop"]
+Mode = Literal["idle", "move", "servo", "stop"]
 
 STEP_S = 0.002
 MAX_ACCELERATION_RAD_S2 = 40.0
@@ -40,7 +40,6 @@ class JointMotion:
         self._start = self.q.copy()
         self._ramp: _Ramp | None = None
         self._elapsed_s = 0.0
-        self._velocity = np.zeros(6)
         self._deceleration = STOP_RAD_S2
         self._next: tuple[Array, float, float] | None = None
 
@@ -82,17 +81,6 @@ class JointMotion:
         self.target, self.mode, self._elapsed_s, self._next = goal, "servo", 0.0, None
         return True
 
-    def speed(self, velocity: Sequence[float], acceleration_rad_s2: float) -> bool:
-        """speedJ: move at these joint speeds (6,) until another command, or until a limit is near. Returns
-        False for speeds that are not finite."""
-        wanted = np.array(velocity, dtype=np.float64)
-        if not np.isfinite(wanted).all() or not acceleration_rad_s2 > 0:
-            return False
-        self._velocity = np.clip(wanted, -self._speed, self._speed)
-        self._deceleration = min(acceleration_rad_s2, MAX_ACCELERATION_RAD_S2)
-        self.mode, self._next = "speed", None
-        return True
-
     def stop(self, deceleration_rad_s2: float = STOP_RAD_S2) -> None:
         """Come to rest at this deceleration."""
         rate = deceleration_rad_s2 if deceleration_rad_s2 > 0 else STOP_RAD_S2
@@ -132,10 +120,6 @@ class JointMotion:
         """Joint speeds to reach, and the acceleration allowed."""
         if self.mode == "stop":
             return np.zeros(6), self._deceleration
-        if self.mode == "speed":
-            room = np.where(self._velocity > 0, self._high - self.q, self.q - self._low)
-            most = _max_stoppable_speed(np.maximum(room, 0.0), self._deceleration)
-            return np.clip(self._velocity, -most, most), self._deceleration
         self._elapsed_s += STEP_S
         if self._elapsed_s > _SERVO_WITHOUT_COMMAND_S:
             self.stop()

@@ -10,8 +10,8 @@ The kinds, by where they act:
 * ``clock``    changes the node's clock and so its time stamps;
 * ``pose``     changes the pose that frames report, not the image.
 
-To add one, write a file here with a class of the same name (attributes ``kind`` and ``Parameters``,
-constructor of parameters and a random stream) and add it to ``NAMES``.
+To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
+it to ``NAMES``. An effect that draws from a camera's random stream does so in ``start``.
 
 The held-out camera measures: it shows the sharp, noise-free, unobstructed scene at the true time. Effects
 apply to it only if they are listed with ``in_truth: true``.
@@ -22,7 +22,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,14 @@ class EffectParameters(Bounded):
 
     in_truth: bool = field(default=False, kw_only=True)
 
+    kind: ClassVar[str]
 
-def effect_class(name: str) -> Any:
+    def start(self, rng: np.random.Generator) -> Any:
+        """The effect on one camera, by the protocol of its kind below; ``rng`` is that camera's stream."""
+        return self
+
+
+def effect_class(name: str) -> type[EffectParameters]:
     """The class of an effect, now imported. Raises EffectError for an unknown name."""
     if name not in NAMES:
         raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
@@ -205,16 +211,15 @@ def load_effects(
     found: dict[str, list[Any]] = {}
     rendered: list[tuple[str, Any]] = []
     for name, given in listed.items():
-        cls = effect_class(name)
         try:
-            parameters = read_section(cls.Parameters, dict(given or {}), f"effect {name}")
+            effect = read_section(effect_class(name), dict(given or {}), f"effect {name}")
         except ScenarioError as error:
             raise EffectError(str(error)) from None
-        if held_out and not parameters.in_truth:
+        if held_out and not effect.in_truth:
             continue
-        found.setdefault(cls.kind, []).append(cls(parameters, rng_for(name)))
-        if cls.kind in ("world", "exposure"):
-            rendered.append((name, parameters))
+        found.setdefault(effect.kind, []).append(effect.start(rng_for(name)))
+        if effect.kind in ("world", "exposure"):
+            rendered.append((name, effect))
     if not found:
         return NO_EFFECTS
     return Effects(rendered=tuple(rendered), **{kind: tuple(made) for kind, made in found.items()})

@@ -11,8 +11,10 @@ from camera_node.synthetic.effects import EffectParameters
 
 
 @dataclass(frozen=True)
-class ClockDriftParameters(EffectParameters):
-    """offset_ms, drift_ppm: of every camera's clock. offset_spread_ms, drift_spread_ppm: standard deviations
+class ClockDrift(EffectParameters):
+    """node = true + offset + drift * (true - start), where start is the time of the first call.
+
+    offset_ms, drift_ppm: of every camera's clock. offset_spread_ms, drift_spread_ppm: standard deviations
     of what each camera adds to them, so that cameras disagree."""
 
     offset_ms: float = bounded(0.0, -1e10, 1e10)  # four months
@@ -20,18 +22,17 @@ class ClockDriftParameters(EffectParameters):
     offset_spread_ms: float = bounded(0.0, 0.0, 1e9)
     drift_spread_ppm: float = bounded(0.0, 0.0, 1e4)
 
-
-class ClockDrift:
-    """node = true + offset + drift * (true - start), where start is the time of the first call.
-
-    Times are whole nanoseconds: a float64 holds today's time only to 256 ns. A call takes well under a
-    microsecond. offset_ns, drift_ppb: of this camera.
-    """
-
     kind = "clock"
-    Parameters = ClockDriftParameters
 
-    def __init__(self, parameters: ClockDriftParameters, rng: np.random.Generator) -> None:
+    def start(self, rng: np.random.Generator) -> DriftingClock:
+        return DriftingClock(self, rng)
+
+
+class DriftingClock:
+    """Times are whole nanoseconds: a float64 holds today's time only to 256 ns. A call takes well under a
+    microsecond. offset_ns, drift_ppb: of this camera."""
+
+    def __init__(self, parameters: ClockDrift, rng: np.random.Generator) -> None:
         offset, drift = rng.standard_normal(2)
         self.offset_ns = round((parameters.offset_ms + parameters.offset_spread_ms * float(offset)) * 1e6)
         ppm = parameters.drift_ppm + parameters.drift_spread_ppm * float(drift)

@@ -15,8 +15,11 @@ from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class ExposureDriftParameters(EffectParameters):
-    """amplitude_stops: amplitude of the exposure's sine; one stop doubles the exposure. period_s: of the
+class ExposureDrift(EffectParameters):
+    """Values become value * 2^stops, clipped at white, with stops = offset + amplitude * sin(2 pi (t / period
+    + phase)). Displayed values are scaled, as everywhere in this world.
+
+    amplitude_stops: amplitude of the exposure's sine; one stop doubles the exposure. period_s: of the
     sine; each camera has a random phase. offset_spread_stops: standard deviation of each camera's constant
     offset."""
 
@@ -24,16 +27,16 @@ class ExposureDriftParameters(EffectParameters):
     period_s: float = bounded(20.0, 0.01, 1e6)
     offset_spread_stops: float = bounded(0.1, 0.0, 8.0)
 
-
-class ExposureDrift:
-    """Values become value * 2^stops, clipped at white, with stops = offset + amplitude * sin(2 pi (t / period
-    + phase)). Displayed values are scaled, as everywhere in this world. phase, offset_stops: of this
-    camera."""
-
     kind = "image"
-    Parameters = ExposureDriftParameters
 
-    def __init__(self, parameters: ExposureDriftParameters, rng: np.random.Generator) -> None:
+    def start(self, rng: np.random.Generator) -> DriftingExposure:
+        return DriftingExposure(self, rng)
+
+
+class DriftingExposure:
+    """phase, offset_stops: of this camera."""
+
+    def __init__(self, parameters: ExposureDrift, rng: np.random.Generator) -> None:
         self._p = parameters
         self.phase = float(rng.random())
         self.offset_stops = parameters.offset_spread_stops * float(rng.standard_normal())

@@ -21,25 +21,22 @@ from freshfield.geometry import Array
 
 
 @dataclass(frozen=True)
-class FogParameters(EffectParameters):
-    """visibility_m: distance at which contrast falls to contrast_threshold (.02 is Koschmieder's, .05 the
+class Fog(EffectParameters):
+    """Rendered ahead; free while streaming. A scene's background is all fog.
+
+    visibility_m: distance at which contrast falls to contrast_threshold (.02 is Koschmieder's, .05 the
     WMO's). airlight: color of the fog, RGB in [0, 1]."""
 
     visibility_m: float = bounded(20.0, 0.01, 1e6)
     contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
     airlight: tuple[float, float, float] = bounded((0.76, 0.78, 0.80), 0.0, 1.0)
 
-
-class Fog:
-    """Rendered ahead; free while streaming. A scene's background is all fog."""
-
     kind = "world"
-    Parameters = FogParameters
 
-    def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:
-        self.airlight = parameters.airlight
-        # Koschmieder's extinction coefficient beta.
-        self.extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
+    @property
+    def extinction_per_m(self) -> float:
+        """Koschmieder's extinction coefficient beta."""
+        return -math.log(self.contrast_threshold) / self.visibility_m
 
     def extend(self, scene: Scene) -> Scene:
         return scene.with_world(dataclasses.replace(scene.world, medium=self))

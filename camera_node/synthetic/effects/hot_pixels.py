@@ -17,8 +17,10 @@ from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class HotPixelsParameters(EffectParameters):
-    """hot_ppm: damaged pixels in a million at the start. growth_ppm_per_h: newly damaged ones in an hour.
+class HotPixels(EffectParameters):
+    """Added values are exponentially distributed and clipped at white; hits are a Poisson process.
+
+    hot_ppm: damaged pixels in a million at the start. growth_ppm_per_h: newly damaged ones in an hour.
     hot_counts: mean value that one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
     hit_counts: mean value that one adds."""
 
@@ -28,16 +30,17 @@ class HotPixelsParameters(EffectParameters):
     hits_per_megapixel: float = bounded(50.0, 0.0, 1e6)
     hit_counts: float = bounded(150.0, 0.0, 1e6)
 
-
-class HotPixels:
-    """Added values are exponentially distributed and clipped at white; hits are a Poisson process. The
-    camera's random stream decides which pixels are damaged; a frame's hits follow from that stream and its
-    number."""
-
     kind = "image"
-    Parameters = HotPixelsParameters
 
-    def __init__(self, parameters: HotPixelsParameters, rng: np.random.Generator) -> None:
+    def start(self, rng: np.random.Generator) -> DamagedSensor:
+        return DamagedSensor(self, rng)
+
+
+class DamagedSensor:
+    """The camera's random stream decides which pixels are damaged; a frame's hits follow from that stream and
+    its number."""
+
+    def __init__(self, parameters: HotPixels, rng: np.random.Generator) -> None:
         self._p = parameters
         self._key, self._frame_key = rng.integers(0, 2**64, size=(2, 2), dtype=np.uint64)
         self._damage: dict[tuple[int, ...], tuple[NDArray, NDArray, NDArray]] = {}

@@ -19,8 +19,10 @@ from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
-class LightSwitchParameters(EffectParameters):
-    """period_s: from one time the lamps go on to the next, rounded to a multiple of the scene's period; they
+class LightSwitch(EffectParameters):
+    """Rendered ahead, static parts twice; free while streaming.
+
+    period_s: from one time the lamps go on to the next, rounded to a multiple of the scene's period; they
     go out halfway. share: of the light's points, those farthest to one side; one always stays on.
     azimuth_deg: of that side, from the x axis."""
 
@@ -28,33 +30,32 @@ class LightSwitchParameters(EffectParameters):
     share: float = bounded(0.5, 0.0, 1.0)
     azimuth_deg: float = bounded(0.0, -360.0, 360.0)
 
-
-class LightSwitch:
-    """Rendered ahead, static parts twice; free while streaming."""
-
     kind = "world"
-    Parameters = LightSwitchParameters
-
-    def __init__(self, parameters: LightSwitchParameters, rng: np.random.Generator) -> None:
-        self._p = parameters
-        self._period_s = parameters.period_s
 
     def extend(self, scene: Scene) -> Scene:
         base = scene.period_s if scene.moving else PERIOD_UNIT_S
-        self._period_s = max(1, round(self._p.period_s / base)) * base
-        world = dataclasses.replace(scene.world, switch=self)
-        return scene.with_world(world, self._period_s, moving=True)
+        period = max(1, round(self.period_s / base)) * base
+        world = dataclasses.replace(scene.world, switch=_Lamps(self, period))
+        return scene.with_world(world, period, moving=True)
+
+
+@dataclass(frozen=True)
+class _Lamps:
+    """Implements lighting.Switch. period_s: as rounded for the scene."""
+
+    effect: LightSwitch
+    period_s: float
 
     def on(self, t_s: float) -> bool:
         """Whether all lamps are on at an instant."""
-        return phase_of(t_s, self._period_s) < 0.5
+        return phase_of(t_s, self.period_s) < 0.5
 
     def without(self, light: Light) -> Light:
         """What is left of a light when the lamps are out."""
-        azimuth = math.radians(self._p.azimuth_deg)
+        azimuth = math.radians(self.effect.azimuth_deg)
         aside = light.points[:, :2] @ (math.cos(azimuth), math.sin(azimuth))
         count = len(light.points)
-        left = np.sort(np.argsort(aside, kind="stable")[: max(1, count - round(self._p.share * count))])
+        left = np.sort(np.argsort(aside, kind="stable")[: max(1, count - round(self.effect.share * count))])
         return dataclasses.replace(
             light, points=light.points[left], strength=light.strength * len(left) / count
         )

@@ -26,8 +26,11 @@ _JOINTS = 9  # of the arch
 
 
 @dataclass(frozen=True)
-class OccluderParameters(EffectParameters):
-    """period_s: one sweep there and back, rounded to a multiple of the scene's period. sweep_deg: angle to
+class Occluder(EffectParameters):
+    """An arch over the target from the horizon to the zenith, which passes cameras at any height. Rendered
+    ahead (1 to 3 ms a frame); free while streaming.
+
+    period_s: one sweep there and back, rounded to a multiple of the scene's period. sweep_deg: angle to
     either side. distance_share: distance from the target as a share of the cameras' (1 = at the cameras); as
     far beyond the cameras if they look outward. thickness_share: diameter as a share of the cameras'
     distance."""
@@ -37,38 +40,27 @@ class OccluderParameters(EffectParameters):
     distance_share: float = bounded(0.7, 0.05, 0.95)
     thickness_share: float = bounded(0.06, 0.005, 0.3)
 
-
-class Occluder:
-    """An arch over the target from the horizon to the zenith, which passes cameras at any height. Rendered
-    ahead (1 to 3 ms a frame); free while streaming."""
-
     kind = "world"
-    Parameters = OccluderParameters
-
-    def __init__(self, parameters: OccluderParameters, rng: np.random.Generator) -> None:
-        # The body is the same for every camera, so it uses none of a camera's random stream.
-        self._p = parameters
 
     def extend(self, scene: Scene) -> Scene:
-        p = self._p
         target = np.asarray(scene.target, dtype=np.float64)
         poses = np.stack([pose for _, pose in scene.cameras.values()])
         away = poses[:, :3, 3] - target
         reach = float(np.linalg.norm(away, axis=1).mean())
         outward = float((away * poses[:, :3, 2]).sum()) > 0.0
-        share = 2.0 - p.distance_share if outward else p.distance_share
+        share = 2.0 - self.distance_share if outward else self.distance_share
         base = scene.period_s if scene.moving else PERIOD_UNIT_S
-        period = max(1, round(p.period_s / base)) * base
+        period = max(1, round(self.period_s / base)) * base
         elevation = np.linspace(0.0, 0.5 * math.pi, _JOINTS)
         joints = share * reach * np.stack(
             [np.zeros(_JOINTS), -np.cos(elevation), np.sin(elevation)], axis=1
         )  # fmt: skip
-        radius = 0.5 * p.thickness_share * reach
+        radius = 0.5 * self.thickness_share * reach
         length = float(np.linalg.norm(joints[1] - joints[0]))
         arm = Part(capsule(radius, length), Stripes((0.95, 0.72, 0.10), (0.14, 0.14, 0.15), length, axis=1))
 
         def matrices(t_s: float) -> Array:
-            a = math.radians(p.sweep_deg) * math.sin(2 * math.pi * phase_of(t_s, period))
+            a = math.radians(self.sweep_deg) * math.sin(2 * math.pi * phase_of(t_s, period))
             rotation = np.array([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
             at = target + joints @ rotation
             side = np.broadcast_to(rotation[0], (_JOINTS - 1, 3))

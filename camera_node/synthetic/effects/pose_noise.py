@@ -15,8 +15,10 @@ from freshfield.geometry import Array, Pose, so3_exp
 
 
 @dataclass(frozen=True)
-class PoseNoiseParameters(EffectParameters):
-    """Standard deviations on each axis. translation_mm, rotation_deg: of the error of each frame, as of a
+class PoseNoise(EffectParameters):
+    """Rotations by a normal rotation vector in camera axes, translations in world axes. About .1 ms a frame.
+
+    Standard deviations on each axis. translation_mm, rotation_deg: of the error of each frame, as of a
     tracker or an arm. translation_bias_mm, rotation_bias_deg: of each camera's constant error, as of a
     calibration."""
 
@@ -25,15 +27,16 @@ class PoseNoiseParameters(EffectParameters):
     translation_bias_mm: float = bounded(0.0, 0.0, 1e5)
     rotation_bias_deg: float = bounded(0.0, 0.0, 180.0)
 
-
-class PoseNoise:
-    """Rotations by a normal rotation vector in camera axes, translations in world axes. A frame's error
-    follows from the camera's random stream and the frame's number alone. About .1 ms a frame."""
-
     kind = "pose"
-    Parameters = PoseNoiseParameters
 
-    def __init__(self, parameters: PoseNoiseParameters, rng: np.random.Generator) -> None:
+    def start(self, rng: np.random.Generator) -> NoisyPose:
+        return NoisyPose(self, rng)
+
+
+class NoisyPose:
+    """A frame's error follows from the camera's random stream and the frame's number alone."""
+
+    def __init__(self, parameters: PoseNoise, rng: np.random.Generator) -> None:
         p = parameters
         self._key = rng.integers(0, 2**64, size=2, dtype=np.uint64)
         self._sigma = np.array([np.deg2rad(p.rotation_deg)] * 3 + [1e-3 * p.translation_mm] * 3)

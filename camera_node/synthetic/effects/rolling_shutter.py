@@ -12,8 +12,12 @@ from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
-class RollingShutterParameters(EffectParameters):
-    """readout_ms: from the top row to the bottom one. stamped_share: row that the time stamp belongs to, from
+class RollingShutter(EffectParameters):
+    """Row i of n is read ``(i / (n - 1) - stamped_share) * readout_ms`` after the time stamp. Costs a good
+    part of a rendering for every row, ahead; free while streaming. To use it with motion_blur, list it after
+    motion_blur: each row is then blurred around its own instant.
+
+    readout_ms: from the top row to the bottom one. stamped_share: row that the time stamp belongs to, from
     0 at the top to 1 at the bottom. rows_at_once: rows rendered at one instant, that of their middle; more is
     faster, with errors up to readout_ms * rows_at_once / (2 * height)."""
 
@@ -21,25 +25,15 @@ class RollingShutterParameters(EffectParameters):
     stamped_share: float = bounded(0.5, 0.0, 1.0)
     rows_at_once: int = bounded(1, 1, 4096)
 
-
-class RollingShutter:
-    """Row i of n is read ``(i / (n - 1) - stamped_share) * readout_ms`` after the time stamp. Costs a good
-    part of a rendering for every row, ahead; free while streaming. To use it with motion_blur, list it after
-    motion_blur: each row is then blurred around its own instant."""
-
     kind = "exposure"
-    Parameters = RollingShutterParameters
-
-    def __init__(self, parameters: RollingShutterParameters, rng: np.random.Generator) -> None:
-        self._p = parameters
 
     def row_offset_s(self, row: float, height: int) -> float:
         """Time from the time stamp to the reading of a row."""
         share = row / (height - 1) if height > 1 else 0.5
-        return (share - self._p.stamped_share) * self._p.readout_ms * 1e-3
+        return (share - self.stamped_share) * self.readout_ms * 1e-3
 
     def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
-        height, step = renderer.camera.height, self._p.rows_at_once
+        height, step = renderer.camera.height, self.rows_at_once
         first, stop = (0, height) if rows is None else rows
         strips = []
         # Bands count from the top row, so that a row looks the same whichever rows are asked for.

@@ -12,23 +12,26 @@ from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class SensorNoiseParameters(EffectParameters):
-    """read_noise_counts: standard deviation in black, of 255 counts. full_well_electrons: charge at 255
+class SensorNoise(EffectParameters):
+    """sigma^2 = read^2 + signal * 255 / full_well, in counts: the Gaussian limit of photon counting, good
+    above about ten electrons. About .6 ms for 128 x 128.
+
+    read_noise_counts: standard deviation in black, of 255 counts. full_well_electrons: charge at 255
     counts, where the shot noise is 255 / sqrt(full_well_electrons); 0: no shot noise."""
 
     read_noise_counts: float = bounded(1.5, 0.0, 1e4)
     full_well_electrons: float = bounded(4000.0, 0.0, 1e12)
 
-
-class SensorNoise:
-    """sigma^2 = read^2 + signal * 255 / full_well, in counts: the Gaussian limit of photon counting, good
-    above about ten electrons. A frame's noise follows from the camera's random stream and the frame's number
-    alone. About .6 ms for 128 x 128."""
-
     kind = "image"
-    Parameters = SensorNoiseParameters
 
-    def __init__(self, parameters: SensorNoiseParameters, rng: np.random.Generator) -> None:
+    def start(self, rng: np.random.Generator) -> NoisySensor:
+        return NoisySensor(self, rng)
+
+
+class NoisySensor:
+    """A frame's noise follows from the camera's random stream and the frame's number alone."""
+
+    def __init__(self, parameters: SensorNoise, rng: np.random.Generator) -> None:
         self._key = rng.integers(0, 2**64, size=2, dtype=np.uint64)
         signal = np.arange(256, dtype=np.float64)
         gain = 255.0 / parameters.full_well_electrons if parameters.full_well_electrons else 0.0

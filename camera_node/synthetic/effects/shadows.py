@@ -23,24 +23,18 @@ from freshfield.geometry import Array
 
 
 @dataclass(frozen=True)
-class ShadowsParameters(EffectParameters):
-    """opacity: share of the light that a moving part holds back; 1 is solid. light_points: points of the
+class Shadows(EffectParameters):
+    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
+    shadows.
+
+    opacity: share of the light that a moving part holds back; 1 is solid. light_points: points of the
     scene's light that are traced, each standing for an equal share of all; 0 traces all. Fewer are faster and
     make penumbrae coarser."""
 
     opacity: float = bounded(1.0, 0.0, 1.0)
     light_points: int = bounded(0, 0, 1000)
 
-
-class Shadows:
-    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
-    shadows."""
-
     kind = "world"
-    Parameters = ShadowsParameters
-
-    def __init__(self, parameters: ShadowsParameters, rng: np.random.Generator) -> None:
-        self._p = parameters
 
     def extend(self, scene: Scene) -> Scene:
         return scene.with_world(dataclasses.replace(scene.world, shadows=self))
@@ -57,7 +51,7 @@ class Shadows:
         lost = np.zeros_like(surface.albedo)
         casters = [_casters(placed) for placed in moving]
         count = len(light.points)
-        traced = min(self._p.light_points or count, count)
+        traced = min(self.light_points or count, count)
         for k in np.linspace(0, count - 1, traced).round().astype(int):
             source = light.points[k]
             ray = surface.points - source[:, None]
@@ -70,7 +64,7 @@ class Shadows:
             at = np.flatnonzero(hidden)
             if at.size:
                 lost[:, at] += direct_light(surface.select(at), light, source, specular)
-        return self._p.opacity * count / traced * lost
+        return self.opacity * count / traced * lost
 
 
 def _casters(placed: PlacedParts) -> PlacedParts:

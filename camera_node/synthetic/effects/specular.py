@@ -21,24 +21,24 @@ from freshfield.geometry import Array
 
 
 @dataclass(frozen=True)
-class SpecularParameters(EffectParameters):
-    """refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: width of the
+class Specular(EffectParameters):
+    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
+    highlights.
+
+    refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: width of the
     GGX distribution, from .02 (polished) to 1 (matte)."""
 
     refractive_index: float = bounded(1.5, 1.0, 50.0)
     roughness: float = bounded(0.2, 0.02, 1.0)
 
+    kind = "world"
 
-@dataclass(frozen=True)
-class ClearCoat:
-    """Implements lighting.SpecularReflection."""
-
-    refractive_index: float
-    roughness: float
+    def extend(self, scene: Scene) -> Scene:
+        return scene.with_world(dataclasses.replace(scene.world, specular=self))
 
     def reflectance(self, to_light: Array, normals: Array, rays: Array) -> Array:
         """pi times the BRDF (1/sr) times the cosine at the surface, so that a white Lambert surface has the
-        cosine alone."""
+        cosine alone; see ``lighting.SpecularReflection``."""
         half = normalize(to_light - rays)
         light = np.maximum((normals * to_light).sum(axis=0), 0.0)
         view = np.maximum(-(normals * rays).sum(axis=0), 0.0)
@@ -58,17 +58,3 @@ class ClearCoat:
         across = (g - c) / np.maximum(g + c, 1e-12)
         along = (c * (g + c) - 1.0) / (c * (g - c) + 1.0)
         return 0.5 * across**2 * (1.0 + along**2)
-
-
-class Specular:
-    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
-    highlights."""
-
-    kind = "world"
-    Parameters = SpecularParameters
-
-    def __init__(self, parameters: SpecularParameters, rng: np.random.Generator) -> None:
-        self._coat = ClearCoat(parameters.refractive_index, parameters.roughness)
-
-    def extend(self, scene: Scene) -> Scene:
-        return scene.with_world(dataclasses.replace(scene.world, specular=self._coat))

@@ -13,31 +13,15 @@ from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add
 # Outcomes, as in link_run.OUTCOMES.
 IN_FLIGHT, DELIVERED, DROPPED_BUSY, SUPERSEDED, SKIPPED = 0, 1, 2, 3, 4
 DROP_NEW, NEWEST_WAITS, FCFS, PARALLEL = 0, 1, 2, 4
-# Orders, as in queue_server.ORDERS.
-FIRST_COME, NEWEST_FIRST, ROUND_ROBIN, OLDEST_AGE = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True)
-def _choose(order, head, ticket, last, newest_delivered_ns):
+def _longest_waiting(head, ticket):
     """The camera whose waiting frame is next; at least one waits."""
-    cameras = len(head)
     best = -1
-    for k in range(cameras):
-        c = (last + 1 + k) % cameras if order == ROUND_ROBIN else k
-        if head[c] < 0:
-            continue
-        if best < 0:
+    for c in range(len(head)):
+        if head[c] >= 0 and (best < 0 or ticket[head[c]] < ticket[head[best]]):
             best = c
-        elif order == FIRST_COME:
-            if ticket[head[c]] < ticket[head[best]]:
-                best = c
-        elif order == NEWEST_FIRST:
-            if ticket[head[c]] > ticket[head[best]]:
-                best = c
-        elif order == OLDEST_AGE and newest_delivered_ns[c] < newest_delivered_ns[best]:
-            best = c
-        if order == ROUND_ROBIN:
-            break
     return best
 
 
@@ -74,15 +58,14 @@ def _drop_new(
 
 @njit(cache=True, nogil=True)
 def serve(
-    arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, speeds, modulated,
-    starts, states, path_from, path_to, horizon_ns,
+    arrive_ns, camera, discipline, queue_limit, work, means_ms, speeds, modulated, starts, states,
+    path_from, path_to, horizon_ns,
 ):  # fmt: skip
     """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
 
-    arrive_ns, offered_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive
+    arrive_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive
         (-1: never sampled).
     discipline: index into ``link.DISCIPLINES``.
-    order: index into ``queue_server.ORDERS``: whose waiting frame is next.
     queue_limit: most frames waiting (fcfs) or in service (parallel).
     work: of ``work.draw``.
     means_ms: mean delay, (1,) or one a state. speeds: its inverse in 1/ns, inf where it is 0.
@@ -106,8 +89,7 @@ def serve(
     head = np.full(cameras, -1, np.int64)  # of each camera's waiting frames, which ``follower`` links
     tail = np.full(cameras, -1, np.int64)
     follower = np.full(count if discipline == FCFS else 1, -1, np.int64)
-    newest_delivered_ns = np.full(cameras, -1, np.int64)
-    waiting, serving, last = 0, -1, cameras - 1
+    waiting, serving = 0, -1
     free_ns = np.int64(0)
     busy = [np.int64(0)]  # parallel: heap of due instants
     busy.pop()
@@ -122,9 +104,6 @@ def serve(
             at_ns, frame = arrive_ns[n], n
         if at_ns > horizon_ns or at_ns == NEVER_NS:
             break
-        if serving >= 0 and due[serving] <= at_ns:
-            c = camera[serving]
-            newest_delivered_ns[c] = max(newest_delivered_ns[c], offered_ns[serving])
         if frame >= 0:
             n += 1
             c = camera[frame]
@@ -141,8 +120,7 @@ def serve(
                 if discipline == NEWEST_WAITS:
                     if head[c] >= 0:
                         outcome[head[c]] = SUPERSEDED
-                        if order == FIRST_COME:
-                            ticket[frame] = ticket[head[c]]
+                        ticket[frame] = ticket[head[c]]
                     else:
                         waiting += 1
                     head[c] = frame
@@ -160,7 +138,7 @@ def serve(
                     continue
                 outcome[serving] = SUPERSEDED
         else:
-            c = _choose(order, head, ticket, last, newest_delivered_ns)
+            c = _longest_waiting(head, ticket)
             frame = head[c]
             head[c] = follower[frame] if discipline == FCFS else -1
             waiting -= 1
@@ -175,7 +153,7 @@ def serve(
             mean_ms = means_ms[states[hints[c]]] if len(means_ms) > 1 else means_ms[0]
             due[frame] = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))
         started[frame] = at_ns
-        serving, free_ns, last = frame, due[frame], c
+        serving, free_ns = frame, due[frame]
         if discipline == PARALLEL:
             heappush(busy, due[frame])
     for i in range(count):

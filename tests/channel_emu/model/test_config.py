@@ -89,7 +89,6 @@ def test_keys_beside_a_preset_override_it() -> None:
         ("{service_state: sometimes}", "service_state: expected one of at-start, modulated"),
         ("{queue_limit: 0}", "queue_limit: expected 1"),
         ("{queue_limit: 1.5}", "queue_limit: expected a whole number"),
-        ("{hard_limit_ms: 0}", "hard_limit_ms: expected more than 0"),
         ("{faults: {rain: {}}}", "channel.faults.rain: unknown fault; expected one of loss"),
         (
             "{faults: {loss: [0.1, 0.2]}}",

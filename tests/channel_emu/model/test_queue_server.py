@@ -12,17 +12,15 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
-from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 from tests.channel_emu.virtual.test_simulate import same
 
 MS = 10**6
-WAITING = ("newest-waits", "fcfs")
 
 
-def shared(discipline: str, delays_ms: list[float], order: str = "fcfs", **more: object) -> dict[str, Link]:
+def shared(discipline: str, delays_ms: list[float], **more: object) -> dict[str, Link]:
     section = {"service": {"law": "trace", "delays_ms": delays_ms}, "discipline": discipline,
-               "server": {"shared": True, "order": order}, **more}  # fmt: skip
+               "server": {"shared": True}, **more}  # fmt: skip
     channel = Channel(channel_from_mapping(section), 0)
     return {camera: channel.link(camera) for camera in "cab"}  # joined in any order
 
@@ -70,23 +68,15 @@ OFFERS = [("a", 0), ("a", 1), ("c", 2), ("b", 3), ("c", 4), ("a", 5)]
 
 
 @pytest.mark.parametrize(
-    ("discipline", "order", "served"),
+    ("discipline", "served"),
     [
         # c waits since 2 (c1 replaces c0 and keeps its turn), a since 1.
-        ("newest-waits", "fcfs", ["a0", "a2", "c1", "b0"]),
-        ("newest-waits", "newest-first", ["a0", "a2", "c1", "b0"]),
-        ("newest-waits", "round-robin", ["a0", "b0", "c1", "a2"]),
-        # b and c were never served and go first, by name; then a.
-        ("newest-waits", "oldest-age", ["a0", "b0", "c1", "a2"]),
-        ("fcfs", "fcfs", ["a0", "a1", "c0", "b0", "c1", "a2"]),
-        ("fcfs", "newest-first", ["a0", "b0", "c0", "c1", "a1", "a2"]),
-        ("fcfs", "round-robin", ["a0", "b0", "c0", "a1", "c1", "a2"]),
-        # After b0 (offered at 3) and c0 (at 2) a is oldest (0), then still a (1), then c.
-        ("fcfs", "oldest-age", ["a0", "b0", "c0", "a1", "a2", "c1"]),
+        ("newest-waits", ["a0", "a2", "c1", "b0"]),
+        ("fcfs", ["a0", "a1", "c0", "b0", "c1", "a2"]),
     ],
 )
-def test_order_of_service(discipline: str, order: str, served: list[str]) -> None:
-    assert started(play(shared(discipline, [10], order), OFFERS)) == served
+def test_order_of_service(discipline: str, served: list[str]) -> None:
+    assert started(play(shared(discipline, [10]), OFFERS)) == served
 
 
 def test_a_limit_on_waiting_frames_counts_all_cameras() -> None:
@@ -123,10 +113,7 @@ def test_a_camera_has_one_link() -> None:
         channel.link("a")
 
 
-SECTIONS = [
-    {"discipline": discipline, "server": {"shared": True, "order": order}}
-    for discipline in DISCIPLINES for order in (ORDERS if discipline in WAITING else ("fcfs",))
-]  # fmt: skip
+SECTIONS = [{"discipline": discipline, "server": {"shared": True}} for discipline in DISCIPLINES]
 
 
 def kernel_and_link(section: dict, cameras: list[str], seconds: float, period_ms: float | None) -> None:
@@ -140,7 +127,7 @@ def kernel_and_link(section: dict, cameras: list[str], seconds: float, period_ms
     assert counts["offered"] == sum(counts[name] for name in OUTCOMES)
 
 
-@pytest.mark.parametrize("section", SECTIONS, ids=lambda s: f"{s['discipline']} {s['server']['order']}")
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s["discipline"])
 def test_kernel_and_link_decide_alike(section: dict) -> None:
     """Names out of order, few waiting places, cameras that fire at one instant and Poisson ones; service by
     the shared chain, by chains of the cameras' own, at the start and modulated."""
@@ -216,12 +203,7 @@ def test_every_frame_ends_once_and_looking_changes_nothing(
 @pytest.mark.parametrize(
     ("section", "why"),
     [
-        ({"server": {"order": "round-robin"}}, "order: belongs to a shared server only"),
-        ({"server": {"shared": True, "order": "lifo"}}, "order: expected one of fcfs, newest-first"),
-        (
-            {"server": {"shared": True, "order": "round-robin"}},
-            "nothing waits its turn under discipline drop-new",
-        ),
+        ({"server": {"order": "round-robin"}}, "order: unknown key"),
         ({"arrivals": {"process": "poisson", "rate_per_ms": 1, "spread": True}}, "spread: belongs to"),
     ],
 )

@@ -12,14 +12,13 @@ from camera_node.robot.arm.hand_eye_mount import MAX_OFFSET_S
 from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, residuals, solve
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, jackknife, refine
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Diversity,
     Samples,
     angles,
     require_diversity,
-    rotation_mismatch_deg,
 )
 from camera_node.robot.calibration.hand_eye.time_offset import StreamCalibration, calibrate_streams
 
@@ -28,7 +27,6 @@ ALL_METHODS = (*METHODS, REFINED)
 # With fewer poses, each method's own scatter is as large as the differences between methods.
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
-_MISMATCH_DEG = 1.0
 # Larger values mean wrong input: inverted poses, millimetres, or poses of another body.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
 _ADVICE = (
@@ -59,7 +57,6 @@ class Calibration:
 
     method: the one asked for; transform, residuals: its X (4, 4) and residuals.
     rows: results of every method.
-    left_out_deg, left_out_mm: deviation of X when one of ``groups`` of samples is left out (jackknife).
     exact_arm: the refinement with the arm taken as exact, if the target's covariance is known.
     timed: the time offset, for two streams.
     warnings: one line each.
@@ -71,9 +68,6 @@ class Calibration:
     residuals: Residuals
     rows: tuple[MethodResult, ...]
     refined: Refinement
-    left_out_deg: float
-    left_out_mm: float
-    groups: int
     diversity: Diversity
     exact_arm: MethodResult | None = None
     timed: StreamCalibration | None = None
@@ -144,10 +138,9 @@ def _calibration(
     if samples.covariance is not None:
         start = (refined.x, refined.y)
         exact = row("exact arm", lambda: refine(samples, start, arm_noise=_EXACT_ARM).x)
-    left_deg, left_mm, groups = jackknife(samples, refined)
     return Calibration(
-        samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, left_deg, left_mm, groups,
-        spread, exact, timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
+        samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, spread, exact,
+        timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
     )  # fmt: skip
 
 
@@ -180,12 +173,10 @@ def _warnings(
         out.append(
             f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
         )
-    mismatch = rotation_mismatch_deg(samples)
-    threshold = max(_MISMATCH_DEG, 5 * float(np.median(mismatch)))
-    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(mismatch > threshold))})[:5]:
+    for i in refined.outliers[:5]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
-            f"degrees) and counts for {min(1.0, refined.weights[i]):.2f}"
+            f"degrees) and counts for {refined.weights[i]:.2f}"
         )
     if timed is not None and abs(timed.offset_s) >= MAX_OFFSET_S:
         out.append(

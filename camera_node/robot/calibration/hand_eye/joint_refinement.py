@@ -16,12 +16,12 @@ t over whole samples, not over single numbers, gives an outlier little weight
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.closed_form import predicted_hand, robust_start
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
@@ -35,9 +35,10 @@ from camera_node.robot.calibration.hand_eye.samples import (
 # Of Student's t. ``calibrate accuracy`` shows the loss of efficiency on data without outliers.
 _DEGREES_OF_FREEDOM = 8.0
 _ROUNDS, _INNER_ROUNDS = 12, 60
-_JACKKNIFE_GROUPS = 30
 # Radians, metres and seconds: smaller steps are far below what can be measured.
 _CONVERGED = 1e-8
+# Step of the central differences: radians and metres.
+_STEP = 1e-6
 # Lower bound of the noise: perfect data would make the likelihood infinite.
 _MIN_RAD, _MIN_M = 1e-7, 1e-7
 # A sample's weight is lower if its six whitened residuals have a sum of squares above 32. This happens to one
@@ -83,7 +84,6 @@ def refine(
     start: tuple[Array, Array] | None = None,
     arm_noise: tuple[float, float] | None = None,
     velocity: Array | None = None,
-    weights: Array | None = None,
 ) -> Refinement:
     """Maximize the likelihood of X and Y.
 
@@ -91,7 +91,6 @@ def refine(
     arm_noise: (radians, metres), fixed instead of estimated. Near zero takes the arm as exact, which makes
         sense only if the target's covariance is known.
     velocity: (N, 6) of the hand in its own axes (rad/s, m/s), to refine the time offset too.
-    weights: (N,), fixed instead of estimated.
     Raises CalibrationError.
     """
     x, y = start if start is not None else robust_start(samples)
@@ -105,7 +104,7 @@ def refine(
         if velocity is not None:
             e = e - velocity * offset_s
         seen = _target_covariance(samples, x, y)
-        step, noise, w = _solve_linearized(e, jacobian, seen, noise, weights, arm_noise is None)
+        step, noise, w = _solve_linearized(e, jacobian, seen, noise, arm_noise is None)
         x, y = _retract(x, step[:6]), _retract(y, step[6:12])
         if velocity is not None:
             offset_s += step[12]
@@ -140,27 +139,16 @@ def sample_information(samples: Samples, x: Array, y: Array, arm_noise: tuple[fl
     return np.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
 
 
-def jackknife(samples: Samples, found: Refinement) -> tuple[float, float, int]:
-    """Jackknife deviations of X in degrees and mm (roots of summed variances), and the number of groups: one
-    per sample, or at most 30 stretches of the recording."""
-    parts = np.array_split(np.arange(len(samples)), min(_JACKKNIFE_GROUPS, len(samples)))
-    rotations, shifts = [], []
-    for part in parts:
-        kept = np.setdiff1d(np.arange(len(samples)), part)
-        again = refine(
-            samples.take(kept), (found.x, found.y), (found.arm_noise_rad, found.arm_noise_m),
-            weights=found.weights[kept],
-        )  # fmt: skip
-        rotations.append(rotation_vectors(found.x[:3, :3].T @ again.x[:3, :3]))
-        shifts.append(again.x[:3, 3] - found.x[:3, 3])
-    factor = (len(parts) - 1) / len(parts)
-    spread = [np.sqrt(factor * ((v - v.mean(axis=0)) ** 2).sum()) for v in map(np.array, (rotations, shifts))]
-    return float(np.degrees(spread[0])), float(spread[1] * 1e3), len(parts)
+def derivative(of: Callable[[Array], Array], count: int) -> Array:
+    """Derivative (..., count) of a function of a step (count,), at zero, by central differences."""
+    steps = _STEP * np.eye(count)
+    return np.stack([(of(step) - of(-step)) / (2 * _STEP) for step in steps], axis=-1)
 
 
 def _retract(transform: Array, step: Array) -> Array:
+    """Transforms (..., 4, 4), turned about their own axes and shifted by a step (6,)."""
     turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
-    return transform_of(transform[:3, :3] @ turn, transform[:3, 3] + step[3:])
+    return transform_of(transform[..., :3, :3] @ turn, transform[..., :3, 3] + step[3:])
 
 
 def _residuals(samples: Samples, x: Array, y: Array) -> Array:
@@ -170,65 +158,18 @@ def _residuals(samples: Samples, x: Array, y: Array) -> Array:
 
 
 def _jacobian(samples: Samples, x: Array, y: Array, velocity: Array | None) -> Array:
-    """(N, 6, 12 or 13): Jacobian of the residuals by X, Y and the time offset.
-
-    Both setups predict the hand as a M b^-1: a = Y, M = T^-1, b = X for eye-in-hand; a = X, M = T, b = Y for
-    eye-to-hand.
-    """
-    held = samples.setup == EYE_IN_HAND
-    a, b, m = (y, x, inverse(samples.target)) if held else (x, y, samples.target)
-    lever = b[:3, :3].T @ b[:3, 3]
-    arm = m[:, :3, 3] - m[:, :3, :3] @ lever
-    am = a[:3, :3] @ m[:, :3, :3]
-    of_a = np.zeros((len(samples), 6, 6))
-    of_b = np.zeros((len(samples), 6, 6))
-    of_a[:, :3, :3] = np.swapaxes(m[:, :3, :3] @ b[:3, :3].T, 1, 2)
-    of_a[:, 3:, :3] = -a[:3, :3] @ _skew(arm)
-    of_a[:, 3:, 3:] = np.eye(3)
-    of_b[:, :3, :3] = -b[:3, :3]
-    of_b[:, 3:, :3] = -am @ _skew(lever)
-    of_b[:, 3:, 3:] = -am @ b[:3, :3].T
-    both = _to_hand_frame(samples, x, y, np.concatenate([of_b, of_a] if held else [of_a, of_b], axis=2))
+    """(N, 6, 12 or 13): derivative of the residuals by X, Y and the time offset."""
+    both = derivative(lambda step: _residuals(samples, _retract(x, step[:6]), _retract(y, step[6:])), 12)
     return both if velocity is None else np.concatenate([both, -velocity[:, :, None]], axis=2)
 
 
-def _to_hand_frame(samples: Samples, x: Array, y: Array, slopes: Array) -> Array:
-    """Jacobian (N, 6, P) of the predicted hand (rotation about its own axes, position in the base) as a
-    Jacobian of the residuals, which are rotation vectors and positions in the reported hand."""
-    turns = _residuals(samples, x, y)[:, :3]
-    k = _skew(turns)
-    out = np.empty_like(slopes)
-    # The inverse right Jacobian of SO(3), to second order in the error.
-    out[:, :3] = (np.eye(3) + k / 2 + k @ k / 12) @ slopes[:, :3]
-    out[:, 3:] = np.swapaxes(samples.hand[:, :3, :3], 1, 2) @ slopes[:, 3:]
-    return out
-
-
-def _skew(v: Array) -> Array:
-    """(..., 3, 3): cross-product matrices of vectors (..., 3)."""
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
-
-
 def _target_covariance(samples: Samples, x: Array, y: Array) -> Array | None:
-    """(N, 6, 6): covariance of the predicted hand from the target's, None if the target is exact."""
+    """(N, 6, 6): covariance of the residuals from the target's, None if the target is exact."""
     if samples.covariance is None:
         return None
-    turn, shift = samples.target[:, :3, :3], samples.target[:, :3, 3:]
-    back = np.swapaxes(turn, 1, 2)
-    slopes = np.zeros((len(samples), 6, 6))
-    if samples.setup == EYE_IN_HAND:  # Y T^-1 X^-1
-        lever = back @ (shift + (x[:3, :3].T @ x[:3, 3])[:, None])
-        slopes[:, :3, :3] = -x[:3, :3] @ turn
-        slopes[:, 3:, :3] = -y[:3, :3] @ _skew(lever[..., 0])
-        slopes[:, 3:, 3:] = -y[:3, :3] @ back
-    else:  # X T Y^-1
-        slopes[:, :3, :3] = y[:3, :3]
-        slopes[:, 3:, :3] = x[:3, :3] @ turn @ _skew(y[:3, :3].T @ y[:3, 3])
-        slopes[:, 3:, 3:] = x[:3, :3]
-    slopes = _to_hand_frame(samples, x, y, slopes)
+    slopes = derivative(
+        lambda step: _residuals(replace(samples, target=_retract(samples.target, step)), x, y), 6
+    )
     return np.asarray(slopes @ samples.covariance @ np.swapaxes(slopes, 1, 2))
 
 
@@ -256,27 +197,20 @@ def _converge_start(samples: Samples, x: Array, y: Array) -> tuple[Array, Array]
     def whitened(step: Array) -> Array:
         return (_residuals(samples, _retract(x, step[:6]), _retract(y, step[6:])) / scale).ravel()
 
-    def slopes(step: Array) -> Array:
-        # Derivative by a further step, not by this one: equal for small rotations.
-        found = _jacobian(samples, _retract(x, step[:6]), _retract(y, step[6:]), None)
-        return np.asarray((found / scale[:, None]).reshape(-1, 12))
-
-    step = least_squares(whitened, np.zeros(12), slopes, loss="soft_l1", x_scale=0.1, max_nfev=20).x
+    step = least_squares(whitened, np.zeros(12), loss="soft_l1", x_scale=0.1, max_nfev=20).x
     return _retract(x, step[:6]), _retract(y, step[6:])
 
 
 def _solve_linearized(
-    e: Array, jacobian: Array, seen: Array | None, noise: Array, weights: Array | None, estimate: bool
+    e: Array, jacobian: Array, seen: Array | None, noise: Array, estimate: bool
 ) -> tuple[Array, Array, Array]:
     """Consistent step (12 or 13,), noise (2,) and weights (N,) for residuals e + J step."""
-    w = np.ones(len(e)) if weights is None else weights
     step = np.zeros(jacobian.shape[2])
     for _ in range(_INNER_ROUNDS):
         covariances = _covariances(seen, len(e), noise)
         root = _whitener(covariances)
         now = np.einsum("nij,nj->ni", root, e + jacobian @ step)
-        if weights is None:
-            w = (_DEGREES_OF_FREEDOM + 6.0) / (_DEGREES_OF_FREEDOM + (now**2).sum(axis=1))
+        w = (_DEGREES_OF_FREEDOM + 6.0) / (_DEGREES_OF_FREEDOM + (now**2).sum(axis=1))
         slopes = root @ jacobian
         inverse_information: Array = np.asarray(np.linalg.pinv(_information(slopes, w), hermitian=True))
         before = step

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from camera_node.robot import figures
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
@@ -15,7 +15,7 @@ from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
 from camera_node.robot.calibration.hand_eye.samples import rotation_vectors
 from freshfield import files
 
-_BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
+_BLUE, _RED = "#0072B2", "#D55E00"
 
 
 def show(found: Calibration) -> str:
@@ -32,8 +32,7 @@ def show(found: Calibration) -> str:
         *(_row(row) for row in found.rows),
         "",
         f"{what} ({found.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned {_turn(found)}",
-        f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees; "
-        f"leaving out one of {found.groups}: {found.left_out_mm:.3f} mm, {found.left_out_deg:.4f} degrees",
+        f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees",
         f"  the arm's noise, estimated: {found.refined.arm_noise_m * 1e3:.3f} mm, "
         f"{np.degrees(found.refined.arm_noise_rad):.4f} degrees an axis",
     ]
@@ -66,8 +65,6 @@ def write_yaml(found: Calibration, path: Path) -> None:
         "transform": [[round(v, 9) for v in row] for row in answer.pop("transform")],
         **answer,
         "poses": len(found.samples),
-        "leave_out_mm": found.left_out_mm,
-        "leave_out_deg": found.left_out_deg,
         "arm_noise_mm": found.refined.arm_noise_m * 1e3,
         "arm_noise_deg": float(np.degrees(found.refined.arm_noise_rad)),
         "warnings": warnings,
@@ -81,10 +78,16 @@ def write_yaml(found: Calibration, path: Path) -> None:
 
 def plot(found: Calibration, path: Path) -> None:
     """Plot residuals, rotation axes and each pose's target position. Raises CalibrationError."""
-    plt = figures.pyplot()
-    if plt is None:
-        raise CalibrationError("--plot needs matplotlib (pip install 'freshfield[calibrate]')")
-    figure, (bars, ball, places) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    try:
+        with files.picture(path, 1, 3, size=(13, 4)) as ((bars, ball, places),):
+            _plot_residuals(found, bars)
+            _plot_axes(found, ball)
+            _plot_places(found, places)
+    except files.PlotError as error:
+        raise CalibrationError(f"--plot: {error}") from None
+
+
+def _plot_residuals(found: Calibration, bars: Any) -> None:
     count = np.arange(1, len(found.samples) + 1)
     bars.bar(count, found.residuals.mm, color=_BLUE)
     for i in found.refined.outliers:
@@ -94,6 +97,8 @@ def plot(found: Calibration, path: Path) -> None:
     right.plot(count, found.residuals.deg, ".", color="black")
     right.set_ylabel("residual (degrees, dots)")
 
+
+def _plot_axes(found: Calibration, ball: Any) -> None:
     rotation = found.samples.subsample(40).moved[:, :3, :3]
     first, second = np.triu_indices(len(rotation), 1)
     turns = rotation_vectors(np.swapaxes(rotation[first], 1, 2) @ rotation[second])
@@ -101,22 +106,17 @@ def plot(found: Calibration, path: Path) -> None:
     axes = turns / np.maximum(angle, 1e-12)[:, None]
     axes *= np.where(axes[:, 2:] < 0, -1.0, 1.0)  # an axis and its opposite are one
     drawn = ball.scatter(axes[:, 0], axes[:, 1], c=np.degrees(angle), s=8, vmin=0, vmax=180)
-    ball.add_patch(plt.Circle((0, 0), 1.0, fill=False, color=_GREY))
     ball.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), aspect="equal", xlabel="x", ylabel="y",
              title="axes of the turns, seen along z")  # fmt: skip
-    figure.colorbar(drawn, ax=ball, label="turn (degrees)")
+    ball.figure.colorbar(drawn, ax=ball, label="turn (degrees)")
 
+
+def _plot_places(found: Calibration, places: Any) -> None:
     put = target_at_rest(found.samples, found.transform)[:, :3, 3]
     put = (put - put.mean(axis=0)) * 1e3
     drawn = places.scatter(put[:, 0], put[:, 1], c=put[:, 2], s=25)
     places.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="where each pose puts the target")
-    figure.colorbar(drawn, ax=places, label="z (mm)")
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"--plot: {path}: {error}") from None
-    finally:
-        plt.close(figure)
+    places.figure.colorbar(drawn, ax=places, label="z (mm)")
 
 
 def _row(row: MethodResult) -> str:

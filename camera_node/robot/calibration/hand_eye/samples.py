@@ -7,7 +7,6 @@ in hand.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -176,20 +175,6 @@ def require_diversity(samples: Samples) -> Diversity:
     if found.reason is not None:
         raise CalibrationError(found.reason)
     return found
-
-
-def rotation_mismatch_deg(samples: Samples) -> Array:
-    """Median (N,) over the other samples of | angle of A_ij - angle of B_ij |. Both angles are equal for any
-    X (4.6), so a large value means a wrong detection or pairing."""
-    chosen = evenly_spaced(len(samples), _MAX_SAMPLES)
-    hand, target = samples.hand[:, :3, :3], samples.target[:, :3, :3]
-    out = np.empty(len(samples))
-    for i in range(len(samples)):
-        others = chosen[chosen != i]
-        a = angles(np.swapaxes(hand[others], 1, 2) @ hand[i])
-        b = angles(np.swapaxes(target[others], 1, 2) @ target[i])
-        out[i] = math.degrees(float(np.median(np.abs(a - b)))) if len(others) else 0.0
-    return out
 
 
 def _all_but(count: int) -> str:

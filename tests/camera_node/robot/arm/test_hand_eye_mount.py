@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.pose.pairing import SampleBuffer, interpolate_screw
+from camera_node.pose.pairing import SampleBuffer
 from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
 from freshfield.geometry import Pose, so3_exp
 
@@ -30,7 +30,7 @@ def written(tmp_path, **change):
 def test_a_camera_on_a_moving_hand(tmp_path):
     calibration = read_hand_eye(written(tmp_path))
     assert calibration.details == {"method": "refined"}
-    hand = SampleBuffer(interpolate_screw)
+    hand = SampleBuffer(Pose.interpolate)
     for k in range(10):
         hand.add(k * 10 * MS, Pose.from_matrix(transform((0, 0, 0.1 * k), (0.01 * k, 0, 0))))
     # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
@@ -42,7 +42,7 @@ def test_a_camera_on_a_moving_hand(tmp_path):
 
 def test_a_camera_that_stands_does_not_follow_the_hand(tmp_path):
     calibration = read_hand_eye(written(tmp_path, setup="eye-to-hand"))
-    poses = calibration.camera_poses(SampleBuffer(interpolate_screw))
+    poses = calibration.camera_poses(SampleBuffer(Pose.interpolate))
     np.testing.assert_allclose(poses.at(7)[0].matrix(), calibration.transform, atol=1e-12)
 
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.synthetic.effects.clock_drift import ClockDrift, ClockDriftParameters
+from camera_node.synthetic.effects.clock_drift import ClockDrift
 
 TODAY_NS = 1_790_000_000_123_456_789
 
 
 def make(seed: int = 0, **parameters: float) -> ClockDrift:
-    return ClockDrift(ClockDriftParameters(**parameters), np.random.default_rng(seed))
+    return ClockDrift(**parameters).start(np.random.default_rng(seed))
 
 
 def test_offset_and_drift():

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from camera_node.synthetic.effects.exposure_drift import ExposureDrift, ExposureDriftParameters
+from camera_node.synthetic.effects.exposure_drift import ExposureDrift
 
 
 def make(seed: int = 0, **parameters: float) -> ExposureDrift:
-    return ExposureDrift(ExposureDriftParameters(**parameters), np.random.default_rng(seed))
+    return ExposureDrift(**parameters).start(np.random.default_rng(seed))
 
 
 def test_a_stop_doubles_and_white_is_the_end():

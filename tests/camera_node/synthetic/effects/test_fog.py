@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects.fog import Fog, FogParameters
+from camera_node.synthetic.effects.fog import Fog
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Sphere
@@ -23,7 +23,7 @@ AIR = (1.0, 0.9, 0.7)
 
 
 def make(**parameters) -> Fog:
-    return Fog(FogParameters(**{"airlight": AIR, **parameters}), np.random.default_rng(0))
+    return Fog(**{"airlight": AIR, **parameters})
 
 
 def foggy(world: World, **parameters) -> World:

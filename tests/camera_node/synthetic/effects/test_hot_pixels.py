@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic.effects.hot_pixels import HotPixels, HotPixelsParameters
+from camera_node.synthetic.effects.hot_pixels import HotPixels
 
 BLACK = np.zeros((500, 400, 3), np.uint8)
 QUIET = {"hot_ppm": 0.0, "hits_per_megapixel": 0.0}
 
 
 def make(seed: int = 0, **parameters: float) -> HotPixels:
-    return HotPixels(HotPixelsParameters(**{**QUIET, **parameters}), np.random.default_rng(seed))
+    return HotPixels(**{**QUIET, **parameters}).start(np.random.default_rng(seed))
 
 
 def test_the_share_of_damaged_pixels_and_what_they_add():

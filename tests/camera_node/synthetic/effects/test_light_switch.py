@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects.light_switch import LightSwitch, LightSwitchParameters
+from camera_node.synthetic.effects.light_switch import LightSwitch
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.render import CameraRenderer
 
@@ -14,7 +14,7 @@ SMALL = {"count": 5, "width": 48, "height": 48, "supersample": 1}
 
 
 def make(**parameters) -> LightSwitch:
-    return LightSwitch(LightSwitchParameters(**parameters), np.random.default_rng(0))
+    return LightSwitch(**parameters)
 
 
 def test_the_scene_is_lit_as_ever_and_then_without_the_lamps_of_one_side():

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects.motion_blur import MotionBlur, MotionBlurParameters
+from camera_node.synthetic.effects.motion_blur import MotionBlur
 from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
-
-RNG = np.random.default_rng(0)
 
 
 def make(exposure_ms: float = 20.0, samples: int = 5) -> MotionBlur:
-    return MotionBlur(MotionBlurParameters(exposure_ms=exposure_ms, samples=samples), RNG)
+    return MotionBlur(exposure_ms=exposure_ms, samples=samples)
 
 
 def ramp(t_s: float) -> np.ndarray:

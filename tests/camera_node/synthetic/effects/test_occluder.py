@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects.occluder import Occluder, OccluderParameters
+from camera_node.synthetic.effects.occluder import Occluder
 
-RNG = np.random.default_rng(0)
 SMALL = {"width": 64, "height": 64, "supersample": 1}
 
 
 def make(**parameters: float) -> Occluder:
-    return Occluder(OccluderParameters(**parameters), RNG)
+    return Occluder(**parameters)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +66,7 @@ def test_no_sweep_stands_still():
 
 
 def test_parameters_say_what_is_valid():
-    for field in dataclasses.fields(OccluderParameters):
+    for field in dataclasses.fields(Occluder):
         if field.name != "in_truth":
             with pytest.raises(ValueError, match=field.name):
-                OccluderParameters(**{field.name: -1.0})
+                Occluder(**{field.name: -1.0})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic.effects.pose_noise import PoseNoise, PoseNoiseParameters
+from camera_node.synthetic.effects.pose_noise import PoseNoise
 from freshfield.geometry import Pose, look_at, so3_log
 
 POSE = Pose.from_matrix(look_at([1.0, -2.0, 1.5], [0.3, 0.2, 0.4]))
@@ -13,7 +13,7 @@ NONE = {"translation_mm": 0.0, "rotation_deg": 0.0}
 
 
 def make(seed: int = 0, **parameters: float) -> PoseNoise:
-    return PoseNoise(PoseNoiseParameters(**{**NONE, **parameters}), np.random.default_rng(seed))
+    return PoseNoise(**{**NONE, **parameters}).start(np.random.default_rng(seed))
 
 
 def errors(poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:

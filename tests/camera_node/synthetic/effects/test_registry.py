@@ -107,9 +107,8 @@ def test_every_file_is_registered_and_follows_the_protocol():
     }  # fmt: skip
     for name in fx.NAMES:
         cls = fx.effect_class(name)
-        assert callable(getattr(cls, methods[cls.kind]))
-        parameters = cls.Parameters()
-        assert dataclasses.is_dataclass(parameters) and parameters.in_truth is False
+        assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
+        assert dataclasses.is_dataclass(cls) and cls().in_truth is False
 
 
 def test_the_held_out_camera_shows_the_truth_unless_in_truth():

@@ -7,7 +7,7 @@ import pytest
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import load_effects
-from camera_node.synthetic.effects.rolling_shutter import RollingShutter, RollingShutterParameters
+from camera_node.synthetic.effects.rolling_shutter import RollingShutter
 from freshfield.geometry import Pinhole
 from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
 
@@ -15,7 +15,7 @@ CAMERA = Pinhole.from_fov(4, 11, 60.0)
 
 
 def make(**parameters: float) -> RollingShutter:
-    return RollingShutter(RollingShutterParameters(**parameters), np.random.default_rng(0))  # type: ignore[arg-type]
+    return RollingShutter(**parameters)  # type: ignore[arg-type]
 
 
 def clock(t_s: float) -> np.ndarray:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic.effects.sensor_noise import SensorNoise, SensorNoiseParameters
+from camera_node.synthetic.effects.sensor_noise import SensorNoise
 
 
 def make(seed: int = 0, **parameters: float) -> SensorNoise:
-    return SensorNoise(SensorNoiseParameters(**parameters), np.random.default_rng(seed))
+    return SensorNoise(**parameters).start(np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("level", [20, 128, 220])

@@ -9,7 +9,7 @@ import pytest
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import load_effects
-from camera_node.synthetic.effects.shadows import Shadows, ShadowsParameters
+from camera_node.synthetic.effects.shadows import Shadows
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import CameraRenderer, World
@@ -28,8 +28,7 @@ RED = Plain((0.8, 0.1, 0.1))
 
 
 def shadowed(world: World, opacity: float = 1.0, light_points: int = 0) -> World:
-    parameters = ShadowsParameters(opacity=opacity, light_points=light_points)
-    return with_effect(Shadows(parameters, np.random.default_rng(0)), world)
+    return with_effect(Shadows(opacity=opacity, light_points=light_points), world)
 
 
 def image(world: World, pose: np.ndarray = POSE) -> np.ndarray:
@@ -107,7 +106,7 @@ def test_a_light_among_the_moving_parts_does_no_harm():
 
 def test_the_person_of_the_room_darkens_what_is_behind_and_nothing_gets_brighter():
     scene = make_scene("room", {"width": 48, "height": 48, "supersample": 1})
-    shadows = Shadows(ShadowsParameters(), np.random.default_rng(0)).extend(scene)
+    shadows = Shadows().extend(scene)
     gap = shadows.render("cam00", 1.0).astype(int) - scene.render("cam00", 1.0)
     person = np.abs(scene.render("cam00", 1.0).astype(int) - scene.render("cam00", 3.0)).max(axis=-1) > 8
     assert gap[~person].max() <= 1 and (gap.min(axis=-1) < -6).mean() > 0.01

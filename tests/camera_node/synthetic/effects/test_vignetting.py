@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from camera_node.synthetic.effects.vignetting import Vignetting, VignettingParameters
+from camera_node.synthetic.effects.vignetting import Vignetting, gains
 from freshfield.geometry import Pinhole
 from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
 
@@ -17,7 +17,7 @@ WHITE = np.full((65, 129, 3), 200, np.uint8)
 
 
 def make(exponent: float = 4.0) -> Vignetting:
-    return Vignetting(VignettingParameters(exponent=exponent), np.random.default_rng(0))
+    return Vignetting(exponent=exponent)
 
 
 def test_known_pixels():
@@ -39,12 +39,12 @@ def test_the_exponent_is_a_parameter_and_none_changes_nothing():
 
 def test_it_follows_the_lens_off_its_center_and_distorted():
     lens = dataclasses.replace(CAMERA, cx=30.5, cy=20.5, distortion=(-0.1, 0.01, 0.0, 0.0))
-    gain = make().gain(lens)[..., 0]
+    gain = gains(lens, 4.0)[..., 0]
     assert np.unravel_index(gain.argmax(), gain.shape) == (20, 30)
     rays = lens.rays()
     assert np.allclose(gain, rays[..., 2] ** 4, atol=1e-6)
     assert not np.allclose(
-        gain, make().gain(dataclasses.replace(lens, distortion=(0.0,) * 4))[..., 0], atol=1e-3
+        gain, gains(dataclasses.replace(lens, distortion=(0.0,) * 4), 4.0)[..., 0], atol=1e-3
     )
 
 

@@ -12,7 +12,7 @@ from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, residuals, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
-from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, rotation_mismatch_deg
+from camera_node.robot.calibration.hand_eye.samples import Samples, diversity
 from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.datasets.records import DatasetError
 from tests.camera_node.robot.calibration.pictures import noisy_samples
@@ -62,7 +62,7 @@ def test_with_noise_on_the_arm_the_refinement_is_near_the_bound(trials, excess):
 
 
 def test_the_said_deviation_is_the_real_one():
-    """Over trials, the errors' mean square is what the covariance and the leaving out promise."""
+    """Over trials, the errors' mean square is what the covariance promises."""
     mm, std = [], []
     for trial in range(24):
         found = refine(noisy_samples(20, np.random.default_rng([9, trial])))
@@ -87,7 +87,6 @@ def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
     assert found.refined.outliers == [3, 11, 17]
     assert distance_mm(found.transform, X) < 1.0 < distance_mm(solve(spoilt, "park"), X)
     assert sum("does not fit the others" in w for w in found.warnings) == 3
-    assert set(np.argsort(rotation_mismatch_deg(spoilt))[-3:]) == {3, 11, 17}
 
 
 def test_same_samples_same_answer_bit_for_bit():
