@@ -25,9 +25,9 @@ import cv2
 import numpy as np
 
 from edge_server.page import start_page
-from edge_server.page.preview import BallScene, Preview
 from edge_server.report.machine import machine
 from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.preview import BallScene, Preview
 
 PUBLISH_S = 0.02
 TICK_MS, SHADES = 20, 60  # a shade lasts a tick; they repeat after 1.2 s

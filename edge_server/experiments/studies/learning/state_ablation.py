@@ -15,16 +15,13 @@ from edge_server.experiments.studies.learning.setup import (
     better,
     embeddings_missing,
     fixed_of,
-    named_runs,
     room,
-    runs_of,
     simple_policies,
 )
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
-from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Action, Spec
+from edge_server.experiments.training.scheduler.setting import layout_of
+from edge_server.scheduler.learned.learner_spec import Action
 
 EPISODES = {True: 100, False: 600}
 WHICH_VIEWS, CHAPTER_6 = "which views", "chapter 6"
@@ -59,10 +56,8 @@ class Ablation(TrainingStudy):
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
         reward, candidates = trainer.reward("set", "moving"), simple_policies("threshold")
         for name, used in variants.items():
-            spec = Spec("select", layout_of(setting, used))
-            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
-            trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
-            candidates |= named_runs(f"learnt {name}", trained)
+            config = trainer.config("select", reward, EPISODES, layout_of(setting, used))
+            candidates |= trainer.actors(f"learnt {name}", f"{self.name}-{name}", setting, config)
         evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
         return judge(evaluation, list(variants)), rows(evaluation)
 
@@ -75,10 +70,9 @@ class Ablation(TrainingStudy):
         for kind in KINDS:
             candidates |= simple_policies(kind)
             for name, used in variants.items():
-                spec = Spec(kind, layout_of(setting, used), OMEGAS_MS[kind])
-                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+                config = trainer.config(kind, reward, EPISODES, layout_of(setting, used), tries=3)
                 folder = f"{self.name}-ch6-{kind}-{name.replace(', ', '-')}"
-                candidates |= named_runs(learnt(kind, name), trainer.train_repeats(folder, setting, config))
+                candidates |= trainer.actors(learnt(kind, name), folder, setting, config)
         evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(16, 100)))
         return judge_chapter_6(evaluation, list(variants)), rows(evaluation, channel="ch6")
 
@@ -101,7 +95,7 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
     found = []
     for kind in KINDS:
         best, text = evaluation.best_fixed(kind)[0], fixed_of(evaluation, kind)
-        trained = {name: runs_of(evaluation, learnt(kind, name)) for name in variants}
+        trained = {name: evaluation.runs(learnt(kind, name)) for name in variants}
         about = f"room, ch6, {kind}"
         found += [
             better(f"{about}, by {name}", "better than the best fixed omega.", runs, best,
@@ -112,7 +106,7 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
             for name, runs in trained.items() if WHOLE in trained and name != WHOLE
         ]  # fmt: skip
     fullest = variants[0]
-    arrived, generated = (runs_of(evaluation, learnt(k, fullest)) for k in ("wait-arrived", "wait"))
+    arrived, generated = (evaluation.runs(learnt(k, fullest)) for k in ("wait-arrived", "wait"))
     claim = "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5)"
     best_arrived, best_generated = (evaluation.best_fixed(kind)[0] for kind in ("wait-arrived", "wait"))
     return [
@@ -125,7 +119,7 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
     """Verdicts on the policies trained with each variant of the state."""
     about = "room, ch5, moving, four viewpoints"
-    trained = {n: runs_of(evaluation, f"learnt {n}") for n in variants}
+    trained = {n: evaluation.runs(f"learnt {n}") for n in variants}
     best, text = evaluation.best_fixed("threshold")[0], fixed_of(evaluation, "threshold")
     found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
                     f"against {text}; ") for name, runs in trained.items()]  # fmt: skip
