@@ -51,8 +51,10 @@ class Edge:
             self.buffer.put(made, now_ns)
 
     def decide(self, now_ns: int) -> None:
-        generated = {c: item.generated_ns for c, item in self.buffer.newest().items()}
-        epoch = Epoch(now_ns, len(self.selected), generated)
+        newest = self.buffer.newest()
+        generated = {c: item.generated_ns for c, item in newest.items()}
+        received = {c: item.received_ns for c, item in newest.items()}
+        epoch = Epoch(now_ns, len(self.selected), generated, received_ns=received)
         assert all(math.isfinite(epoch.age_ms(c)) for c in generated)
         self.plan = self.plan or self.policy.plan(epoch)
         if now_ns >= self.plan.wait_until_ns and (chosen := self.policy.select(epoch, self.plan)):
