@@ -90,7 +90,7 @@ def test_a_slower_processor_is_charged_more_and_compared_with_one_that_stands_st
     found = json.loads(out.read_text())["shown"]
     fast, run = (found[name]["shown"]["7"] for name in ("as", "slow"))
     assert run["charged"]["ms_per_update"] == 4.0 * fast["charged"]["ms_per_update"] == 60.0
-    assert run["age_ms"]["mean"] > fast["age_ms"]["mean"] and run["updates"] < fast["updates"]
+    assert run["age_ms"]["mean"] > fast["age_ms"]["mean"]
     # What stands still is late by the whole mean age, what is carried on is not.
     perfect = run["perfect"]
     assert perfect["frozen"]["squared_error"]["moving"] > perfect["mean"]["squared_error"]["moving"]
