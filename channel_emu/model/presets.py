@@ -3,6 +3,7 @@ channels in files of other tools."""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,6 +60,7 @@ PRESETS = {
 
 FROM_FILES = {
     "mahimahi:FILE": "a Mahimahi trace: a line for each instant, in ms, at which 1500 bytes may leave",
+    "errant:FILE:OPERATOR/COUNTRY/RAT/QUALITY": "of ERRANT's profiles.csv: half the latency, and the upload",
 }  # fmt: skip
 """Presets that are read from files of other tools."""
 
@@ -73,4 +75,41 @@ def preset(name: str, folder: Path) -> dict[str, Any]:
         if not all(word.isdecimal() for word in words):
             raise SpellingError(f"{rest}: expected a whole number of ms a line, as Mahimahi has them")
         return {"discipline": "fcfs", "faults": {"mahimahi": [int(word) for word in words]}}
+    if kind == "errant" and rest.count(":") == 1:
+        path, _, profile = rest.partition(":")
+        return _errant(folder / path, profile)
     raise SpellingError(f"expected one of {', '.join([*PRESETS, *FROM_FILES])}, got {name!r}")
+
+
+_MOST_KBPS = 1e6  # more than any of its operators, and each 12 are a packet a second to be kept
+
+
+def _errant(path: Path, profile: str) -> dict[str, Any]:
+    """Gamma delays of half the profile's round trip (mean and standard deviation) behind a line of its upload
+    rate, on which packets queue."""
+    try:
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+        found = {"/".join(list(row.values())[:4]).lower(): row for row in rows}
+        if profile.lower() not in found:
+            raise SpellingError(f"{path}: no profile {profile!r}; write it like {next(iter(found), '-')}")
+        row = found[profile.lower()]
+        mean_ms, deviation_ms = float(row["latency_ms_avg"]) / 2, float(row["latency_ms_stdev"]) / 2
+        service = {"law": "gamma", "mean_ms": mean_ms, "shape": (mean_ms / deviation_ms) ** 2}
+        upload_kbps = float(row["upload_kbps"])
+        if not 0.0 < upload_kbps <= _MOST_KBPS:
+            raise SpellingError(
+                f"{path}: {profile}: upload_kbps is {upload_kbps:g}, expected up to {_MOST_KBPS:g}"
+            )
+        packets_per_s = upload_kbps / 12  # of 1500 bytes
+        span_s = 1 + int(1000 / packets_per_s)  # so that a whole number of packets fits well
+        count = max(1, round(packets_per_s * span_s))
+    except SpellingError:
+        raise
+    except (KeyError, TypeError, ZeroDivisionError, OverflowError, ValueError) as error:
+        raise SpellingError(f"{path}: not profiles of ERRANT: {error}") from None
+    times_ms = [-(-(i + 1) * span_s * 1000 // count) for i in range(count)]
+    return {
+        "service": service,
+        "discipline": "parallel",
+        "faults": {"mahimahi": {"opportunities_ms": times_ms}},
+    }

@@ -142,6 +142,30 @@ def test_short_spellings_stand_for_sections(tmp_path: Path, short: str, long: st
     assert dataclasses.replace(found, preset=None) == dataclasses.replace(expected, preset=None)
 
 
+def test_a_profile_of_errant(tmp_path: Path) -> None:
+    """Half the round trip each way, and as many packets of 1500 bytes as the upload has."""
+    head = "operator,country,rat,signal_quality,download_kbps,upload_kbps,latency_ms_avg,latency_ms_stdev\n"
+    (tmp_path / "p.csv").write_text(
+        head + "one,here,4G,good,9000,2400,80,20\none,here,3G,bad,900,130,200,50\n"
+        "one,here,3G,endless,900,1e9,200,50\n"
+    )
+    good, bad = [channel_from_mapping({"preset": f"errant:p.csv:one/here/{name}"}, "t", tmp_path)
+                 for name in ("4g/good", "3G/bad")]  # fmt: skip
+    assert (good.service.law, good.service.mean_ms, good.service.shape) == ("gamma", 40.0, 16.0)
+    for config, kbps in ((good, 2400), (bad, 130)):
+        times_ms = config.faults["mahimahi"].opportunities_ms
+        assert len(times_ms) * 12_000 / times_ms[-1] == pytest.approx(kbps, rel=0.001)
+    wrong = {
+        "p.csv:one/here/5g/good": "no profile",
+        "p.csv:one/here/3G/endless": "upload_kbps is 1e",
+        "no.csv:x": "cannot be read",
+        "p.csv": "expected one of",
+    }
+    for words, why in wrong.items():
+        with pytest.raises(ValueError, match=why):
+            channel_from_mapping({"preset": f"errant:{words}"}, "t", tmp_path)
+
+
 def test_only_listed_faults_are_imported() -> None:
     names = [f"channel_emu.model.faults.{name}" for name in NAMES]
     kept = {name: sys.modules.pop(name) for name in names if name in sys.modules}
