@@ -168,6 +168,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
                      "thesis's (6.4.2)")  # fmt: skip
     sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
                      "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms")  # fmt: skip
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="the same: exp:30ms,exp:60ms")
     sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
                      "state, reset:{at_ms: [50]}; may be given several times")  # fmt: skip
     sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and states=low/high, "
@@ -210,6 +211,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
     """The channel of ``_add_channel_options``; a scenario spells its section in the same way."""
+    if args.service and args.service_by_state:
+        raise spelling.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
     folder = Path()
     if args.scenario:
@@ -218,6 +221,8 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
     for key in ("arrivals", "service", "chain", "service_state", "discipline"):
         if value := vars(args)[key]:
             section[key] = spelled_out(key, value)
+    if args.service_by_state:
+        section["service"] = spelled_out("service", args.service_by_state)
     if args.fault:
         section["faults"] = dict(section.get("faults") or {})
         for text in args.fault:

@@ -1,10 +1,12 @@
 """Metrics of age, each a function of one sample path: what was delivered when (thesis 5.1 to 5.6).
 
-``METRICS`` has them by the name that people type; ``measure`` reads such a spelling.
+``METRICS`` has them by the name that people type; ``measure`` reads such a spelling. A metric that needs a
+process at the sender (what the frames are about, how urgent it is) is given its path.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.model.spelling import SpellingError, span_ms
+from channel_emu.model.chain import Chain, two_state_generator
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.spelling import SpellingError, rate_per_ms, span_ms
 
 Instants = NDArray[np.int64]
 
@@ -45,12 +49,16 @@ def sawtooth(delivered_ns: Instants, generated_ns: Instants, end_ns: int) -> Saw
 
 def mean_age_ms(saw: Sawtooth) -> float | None:
     """Continuous time average from the first delivery to the end; None where nothing arrived."""
-    if not len(saw.delivered_ns) or saw.end_ns <= saw.delivered_ns[0]:
-        return None
-    # Integers are subtracted first, because float64 would lose nanoseconds of absolute time.
-    floor = (saw.delivered_ns - saw.generated_ns).astype(float)
-    length = np.diff(np.append(saw.delivered_ns, saw.end_ns)).astype(float)
-    return float((length * (floor + length / 2)).sum() / length.sum() / 1e6)
+    return _time_average_ms(saw, saw.delivered_ns[:0], np.ones(1))
+
+
+def urgency_ms(saw: Sawtooth, changes_ns: Instants, weights: NDArray[np.float64]) -> float | None:
+    """Urgency of information (Zheng, Zhou, Niu, IEEE Trans. Commun. 68(12), 2020): time average of weight
+    times age, which is the expected squared error of a Wiener process of unit variance a ms.
+
+    weights: of the context, (S + 1,): before the first of ``changes_ns`` (S,), and from each of them on.
+    """
+    return _time_average_ms(saw, changes_ns, weights)
 
 
 def query_age_ms(saw: Sawtooth, every_ms: float) -> float | None:
@@ -77,6 +85,26 @@ def shown_age_ms(saw: Sawtooth, computing_ms: float, refresh_ms: float) -> float
     return None if at_refresh is None else at_refresh + refresh_ms / 2
 
 
+def incorrect_age_ms(saw: Sawtooth, changes_ns: Instants, states: Instants) -> float | None:
+    """Age of incorrect information (Maatouk et al., IEEE/ACM Trans. Netw. 28(5), 2020): time average of how
+    long the receiver has been wrong, which takes the newest frame's state for the present one.
+
+    states: of the source, (S + 1,): before the first of ``changes_ns`` (S,), and from each of them on.
+    """
+    if not len(saw.delivered_ns) or saw.end_ns <= saw.delivered_ns[0]:
+        return None
+    begin = saw.delivered_ns[0]
+    at = np.unique(np.concatenate((saw.delivered_ns, changes_ns[changes_ns > begin], [saw.end_ns])))
+    at = at[at <= saw.end_ns]
+    true = states[np.searchsorted(changes_ns, at[:-1], side="right")]
+    known = states[np.searchsorted(changes_ns, newest_at(saw, at[:-1]), side="right")]
+    # The end of the last interval, up to each one, in which the receiver was right.
+    right_ns = np.maximum.accumulate(np.where(true == known, at[1:], begin))
+    from_ns, to_ns = (at[:-1] - right_ns).astype(float), (at[1:] - right_ns).astype(float)
+    area = np.where(true == known, 0.0, (to_ns - from_ns) * (to_ns + from_ns) / 2)
+    return float(area.sum() / (saw.end_ns - begin) / 1e6)
+
+
 def peak_age_ms(saw: Sawtooth) -> float | None:
     """Mean of the ages just before each delivery; None with fewer than two."""
     if len(saw.delivered_ns) < 2:
@@ -100,11 +128,35 @@ def mean_of_known(values: list[float | None]) -> float | None:
 
 class Metric(NamedTuple):
     """about: one line, with what follows the name. values: readers of what follows. of: the metric, given a
-    path and these values."""
+    path, these values and, where it is ``drawn``, the random numbers of a process at the sender."""
 
     about: str
     values: tuple[Callable[[str], float], ...]
     of: Callable[..., float | None]
+    drawn: bool = False
+
+
+def _two_states(saw: Sawtooth, away: float, back: float, rng: CounterRng) -> tuple[Instants, Instants]:
+    """Changes and states of a process that leaves state 0 at the rate ``away`` and state 1 at ``back``."""
+    path = Chain(two_state_generator(away, back), rng, initial=0).recent(0, saw.end_ns)
+    starts, states = np.array(path, np.int64).T
+    return starts[1:], states
+
+
+def _incorrect(saw: Sawtooth, away: float, back: float, rng: CounterRng) -> float | None:
+    return incorrect_age_ms(saw, *_two_states(saw, away, back, rng))
+
+
+def _urgency(saw: Sawtooth, weight: float, away: float, back: float, rng: CounterRng) -> float | None:
+    changes_ns, states = _two_states(saw, away, back, rng)
+    return urgency_ms(saw, changes_ns, np.where(states == 1, weight, 1.0))
+
+
+def _weight(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ValueError(f"a weight is finite and at least 0, not {text}")
+    return value
 
 
 METRICS = {
@@ -115,10 +167,18 @@ METRICS = {
         "age of what a screen shows, by time of computing and interval of refreshes, shown:20ms:16.7ms",
         (span_ms, span_ms), shown_age_ms,
     ),
+    "incorrect": Metric(
+        "age of incorrect information on a source of two states, left at these rates, incorrect:1/2s:1/2s",
+        (rate_per_ms, rate_per_ms), _incorrect, drawn=True,
+    ),
+    "urgency": Metric(
+        "age times a weight while it is urgent, which begins and ends at these rates, urgency:5:1/3s:1/1s",
+        (_weight, rate_per_ms, rate_per_ms), _urgency, drawn=True,
+    ),
 }  # fmt: skip
 
 
-def measure(text: str, saw: Sawtooth) -> float | None:
+def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:
     """A metric as people type it, in ms; None where nothing arrived. Raises SpellingError."""
     name, *words = text.split(":")
     if name not in METRICS:
@@ -126,7 +186,7 @@ def measure(text: str, saw: Sawtooth) -> float | None:
     metric = METRICS[name]
     try:
         values = [read(word) for read, word in zip(metric.values, words, strict=True)]
-        return metric.of(saw, *values)
+        return metric.of(saw, *values, *([CounterRng(seed, camera, f"age.{name}")] if metric.drawn else []))
     except ValueError:
         raise SpellingError(f"metric {text!r}: {metric.about}") from None
 
@@ -166,3 +226,18 @@ class RunningAge:
         """Twice the area under the current tooth."""
         length = until_ns - self._delivered_ns
         return length * (2 * (self._delivered_ns - self._generated_ns) + length)
+
+
+def _time_average_ms(saw: Sawtooth, changes_ns: Instants, weights: NDArray[np.float64]) -> float | None:
+    """Of the age times a weight that changes; see ``urgency_ms``."""
+    if not len(saw.delivered_ns) or saw.end_ns <= saw.delivered_ns[0]:
+        return None
+    starts, born = saw.delivered_ns, saw.generated_ns
+    if len(changes_ns):
+        more = changes_ns[(changes_ns > starts[0]) & (changes_ns < saw.end_ns)]
+        starts = np.unique(np.concatenate((starts, more)))
+        born = newest_at(saw, starts)
+    weight = weights[np.searchsorted(changes_ns, starts, side="right")]
+    # Integers are subtracted first, because float64 would lose nanoseconds of absolute time.
+    floor, length = (starts - born).astype(float), np.diff(np.append(starts, saw.end_ns)).astype(float)
+    return float((weight * length * (floor + length / 2)).sum() / length.sum() / 1e6)

@@ -26,15 +26,14 @@ _PERIOD_NS = 10**6
 PERIOD_MS, MEAN_MS = 30.0, 60.0  # of captures and delays in the thesis's chapter 5
 
 
-def periodic_loop(cameras: int, seconds: float, seed: int = 0) -> float:
-    """Mean age in ms at slot boundaries of 1 ms, after deliveries, of D/M/1/0 stepped slot by slot (5.2,
-    5.5)."""
+def periodic_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 1.0) -> float:
+    """Mean age in ms at slot boundaries, after deliveries, of D/M/1/0 stepped slot by slot (5.2, 5.5)."""
     draw = random.Random(seed).expovariate
-    every, rate = round(PERIOD_MS), 1 / MEAN_MS
+    every, rate = round(PERIOD_MS / slot_ms), slot_ms / MEAN_MS
     left, sending, newest = [0] * cameras, [0] * cameras, [0] * cameras
     links = range(cameras)
     total = 0
-    slots = round(seconds * 1e3)
+    slots = round(seconds * 1e3 / slot_ms)
     for now in range(slots):
         boundary = now % every == 0
         for link in links:
@@ -47,7 +46,7 @@ def periodic_loop(cameras: int, seconds: float, seed: int = 0) -> float:
                 sending[link] = now
                 left[link] = math.ceil(draw(rate))
             total += now - newest[link]
-    return total / (slots * cameras)
+    return total * slot_ms / (slots * cameras)
 
 
 def bench_simulate(

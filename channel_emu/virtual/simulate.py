@@ -65,7 +65,8 @@ class Simulation:
             "mean_age_ms": ages.mean_of_known([ages.mean_age_ms(s) for s in saws]),
             "mean_age_slotted_ms": ages.mean_of_known([ages.query_age_ms(s, self.slot_ms) for s in saws]),
             "peak_age_ms": ages.mean_of_known([ages.peak_age_ms(s) for s in saws]),
-            "metrics_ms": {m: ages.mean_of_known([ages.measure(m, s) for s in saws]) for m in metrics},
+            "metrics_ms": {text: ages.mean_of_known([ages.measure(text, saw, self.seed, run.camera)
+                                        for saw, run in zip(saws, self.runs)]) for text in metrics},
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
             "dropped": counts["dropped_busy"],

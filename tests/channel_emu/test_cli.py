@@ -37,7 +37,7 @@ def simulate(capsys, *words: str) -> dict:
 
 def test_simulate_takes_short_spellings(capsys) -> None:
     found = simulate(
-        capsys, "--arrivals", "periodic:30ms", "--service", "exp:30ms,exp:60ms", "--chain",
+        capsys, "--arrivals", "periodic:30ms", "--service-by-state", "exp:30ms,exp:60ms", "--chain",
         "mu1=1/30,mu2=1/30", "--service-state", "modulated", "--discipline", "drop-new", "--cameras", "3",
         "--seconds", "120", "--seed", "4",
     )  # fmt: skip
@@ -54,7 +54,7 @@ def test_simulate_takes_short_spellings(capsys) -> None:
 
 def test_a_chain_of_any_number_of_states(capsys) -> None:
     found = simulate(
-        capsys, "--service", "exp:5ms,exp:20ms,exp:80ms", "--seconds", "3000", "--chain",
+        capsys, "--service-by-state", "exp:5ms,exp:20ms,exp:80ms", "--seconds", "3000", "--chain",
         "{generator_per_ms: [[-0.3, 0.2, 0.1], [0.05, -0.05, 0], [0.4, 0.4, -0.8]], initial: s2}",
     )  # fmt: skip
     shares = [0.05 * 0.8, 0.3 * 0.8 - 0.1 * 0.4, 0.1 * 0.05]  # of the balance equations, by hand
@@ -131,8 +131,9 @@ def test_rates(text: str, value: float) -> None:
         (["--arrivals", "poisson:1/0ms"], "is not a rate"),
         (["--service", "exp"], "expected exp:60ms"),
         (["--service", "gamma:60ms:big"], "expected exp:60ms"),
-        (["--service", "exp:30ms,det:60ms"], "expected one law"),
-        (["--service", "exp:1ms,exp:2ms"], "there is no chain"),
+        (["--service-by-state", "exp:30ms,det:60ms"], "expected one law"),
+        (["--service", "exp:1ms", "--service-by-state", "exp:1ms,exp:2ms"], "exclude each other"),
+        (["--service-by-state", "exp:1ms,exp:2ms"], "there is no chain"),
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--chain", "mu3=1"], "expected mu1="),
         (["--chain", "{generator_per_ms: [[-1, 1]"], "not a mapping; write {generator_per_ms"),

@@ -45,6 +45,43 @@ def metric(text: str, seconds: float, **section: object) -> float:
     return simulate(channel_from_mapping(section), 1, seconds, seed=5).summary([text])["metrics_ms"][text]
 
 
+def path(seconds: float, **section: object) -> ages.Sawtooth:
+    return simulate(channel_from_mapping(section), 1, seconds, seed=5).runs[0].sawtooth()
+
+
+def two_states(away: float, back: float, seconds: float) -> np.ndarray:
+    """When a process changes that leaves state 0 at the rate ``away`` and state 1 at ``back`` (per ms)."""
+    count = round(seconds * 1e3 / (1 / away + 1 / back))
+    stays = np.random.default_rng(1).exponential((1 / away, 1 / back), (count, 2))
+    return (stays.ravel().cumsum() * MS).astype(np.int64)
+
+
+@pytest.mark.parametrize(("rate", "away", "back"), [(0.5, 0.5, 0.5), (0.5, 0.2, 0.6)])
+def test_age_of_incorrect_information_of_poisson_updates(rate: float, away: float, back: float) -> None:
+    """They arrive at once, on a source of two states."""
+    changes = two_states(away, back, 1500)
+    found = ages.incorrect_age_ms(
+        path(1490, arrivals=f"poisson:{rate}"), changes, np.arange(len(changes) + 1) % 2
+    )
+    assert found == near(exact.incorrect_without_delay(rate, away, back))
+    if away == back:
+        assert found == near(away / (2 * away + rate) / (away + rate))
+
+
+def test_a_source_that_is_spelled_out() -> None:
+    """The metric draws its source itself, another one for each seed."""
+    once = metric("incorrect:0.3:0.3", 20, arrivals="poisson:1")
+    assert once == pytest.approx(exact.incorrect_without_delay(1.0, 0.3, 0.3), rel=0.15)
+    assert metric("incorrect:0.3:0.3", 20, arrivals="poisson:1") == once
+
+
+def test_age_of_incorrect_information_by_hand() -> None:
+    """The source is 0, from 10 ms on 1, from 25 ms on 0. Delivered at 5 ms: of 2 ms; at 20 ms: of 12 ms."""
+    saw = ages.Sawtooth(np.array([5, 20]) * MS, np.array([2, 12]) * MS, 35 * MS)
+    found = ages.incorrect_age_ms(saw, np.array([10, 25]) * MS, np.array([0, 1, 0]))
+    assert found == pytest.approx((10**2 / 2 + 10**2 / 2) / 30)  # wrong from 10 to 20 and from 25 on
+
+
 def test_query_age() -> None:
     """Independent queries meet the average age; queries just after each delivery the least one."""
     mm1 = {"arrivals": "poisson:0.5", "service": "exp:1ms", "discipline": "fcfs"}
@@ -59,6 +96,20 @@ def test_age_of_what_is_shown() -> None:
     mm1 = {"arrivals": "poisson:0.5", "service": "exp:1ms", "discipline": "lcfs-preempt"}
     expected = exact.mm1_preemptive(0.5, 1.0) + 4 + 0.85
     assert metric("shown:4ms:1.7ms", 1000, **mm1) == near(expected)
+
+
+def test_urgency() -> None:
+    """A context that does not look at the channel weighs every age alike: E[weight] times the age."""
+    changes = two_states(0.02, 0.06, 3000)
+    saw = path(2990, arrivals="poisson:0.5", service="exp:1ms", discipline="lcfs-preempt")
+    found = ages.urgency_ms(saw, changes, 1.0 + 4.0 * (np.arange(len(changes) + 1) % 2))
+    assert found == near((5 + 3) / 4 * exact.mm1_preemptive(0.5, 1.0))
+    saw = ages.Sawtooth(np.array([5]) * MS, np.array([2]) * MS, 15 * MS)
+    found = ages.urgency_ms(saw, np.array([11]) * MS, np.array([1.0, 3.0]))
+    assert found == pytest.approx((6 * 6 + 3 * 4 * 11) / 10)  # ages 3 to 9, then three times 9 to 13
+    assert metric("urgency:1:0.02:0.06", 9, arrivals="poisson:0.5") == pytest.approx(
+        metric("age", 9, arrivals="poisson:0.5")
+    )
 
 
 def test_losses_by_state() -> None:
@@ -82,10 +133,13 @@ def test_losses_by_state() -> None:
         "query:fast",
         "query:0",
         "shown:1",
+        "incorrect:1",
         "peak:1ms",
+        "urgency:nan:1:1",
+        "urgency:-5:1:1",
     ],
 )
 def test_a_metric_that_cannot_be_read(text: str) -> None:
     saw = ages.Sawtooth(np.array([5]) * MS, np.array([2]) * MS, 15 * MS)
     with pytest.raises(SpellingError, match=f"metric '{text}'"):
-        ages.measure(text, saw)
+        ages.measure(text, saw, 0, "cam00")
