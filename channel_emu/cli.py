@@ -172,7 +172,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
                      "state, reset:{at_ms: [50]}; may be given several times")  # fmt: skip
     sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and states=low/high, "
-                     "scope=per-camera, initial=low, or {generator_per_ms: [[..]]}")  # fmt: skip
+                     "scope=per-camera, initial=low, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
     sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
     sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
     sub.add_argument(
@@ -395,12 +395,13 @@ def _bench(args: argparse.Namespace) -> int:
 
 def _add_accuracy(commands: Any) -> None:
     sub = commands.add_parser(
-        "accuracy", help="what accuracy costs in time: the simulation's error against seconds",
-        description="Measures the mean age against its exact value, by seconds simulated and computed.",
+        "accuracy", help="what accuracy costs in time: the simulation's error against seconds and slots",
+        description="Measures the mean age against its exact value: by seconds simulated and computed, and "
+        "by slot length (bias and speed).",
     )  # fmt: skip
     sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="the first one (default: %(default)s)")
-    sub.add_argument("--out", type=Path, metavar="DIR", help="write the table as CSV and a figure there")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="write the tables as CSV and a figure there")
     sub.add_argument("--json", action="store_true")
     sub.set_defaults(go=_accuracy)
 
@@ -410,9 +411,9 @@ def _accuracy(args: argparse.Namespace) -> int:
 
     if args.out:  # before measuring: it takes minutes
         args.out.mkdir(parents=True, exist_ok=True)
-    rows = measure(args.quick, args.seed)
-    print(json.dumps(rows) if args.json else show(rows))
-    for path in write(rows, args.out) if args.out else ():
+    tables = measure(args.quick, args.seed)
+    print(json.dumps(tables) if args.json else show(tables))
+    for path in write(tables, args.out) if args.out else ():
         print(f"wrote {path}", file=sys.stderr)
     return 0
 

@@ -1,7 +1,8 @@
 """The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
 
 Every jump of the chain has its own instant, so a chain that switches many times during a frame's transit is
-exact too.
+exact too. With ``slot_ms`` the state is drawn at slot boundaries only and kept in between, as in the thesis
+(6.27): the same distribution at the boundaries, without the jumps between them.
 """
 
 from __future__ import annotations
@@ -45,6 +46,42 @@ def check_generator(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64
     return off - np.diag(rates)
 
 
+def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
+    """P(u) = exp(Q u), u in ms (6.27): closed form for two states, else uniformisation and squaring.
+
+    Uniformisation adds only non-negative terms, so nothing cancels; rows are renormalised after each
+    squaring, so a stiff chain keeps its probabilities.
+    """
+    q = check_generator(generator_per_ms)
+    if span_ms < 0:
+        raise ChainError(f"a span of time is not negative, got {span_ms} ms")
+    if q.shape == (2, 2):
+        a, b = q[0, 1], q[1, 0]
+        if a + b == 0.0:
+            return np.eye(2)
+        moved = -math.expm1(-(a + b) * span_ms) / (a + b)
+        kept = math.exp(-(a + b) * span_ms)
+        # Sums, not one minus the others: small probabilities keep their digits.
+        return np.array([[(b + a * kept) / (a + b), a * moved], [b * moved, (a + b * kept) / (a + b)]])
+    fastest = float(-q.diagonal().min())
+    if fastest * span_ms == 0.0:
+        return np.eye(len(q))
+    halvings = max(0, math.ceil(math.log2(fastest * span_ms)))
+    mass = fastest * span_ms * 2.0**-halvings
+    step = np.eye(len(q)) + q / fastest
+    term = np.eye(len(q)) * math.exp(-mass)
+    total = term.copy()
+    for k in range(1, 40):
+        term = term @ step * (mass / k)
+        total += term
+    for _ in range(halvings + 1):
+        total /= total.sum(1, keepdims=True)
+        if halvings:
+            halvings -= 1
+            total = total @ total
+    return total
+
+
 def stationary(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stationary distribution, (M,): for two states (mu2, mu1)/(mu1 + mu2). Raises ChainError if not unique.
 
@@ -76,10 +113,18 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
     return [int(state) for state in closed.pop()]
 
 
+def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probability of leaving each state in one step, (M,): the sum of the row's other entries, which keeps
+    digits that one minus the diagonal has lost."""
+    return np.minimum((transitions - np.diag(np.diag(transitions))).sum(1), 1.0)
+
+
 class Chain:
     """A path of the chain, extended on demand. Instants may be queried in any order until forgotten.
 
     generator_per_ms: (M, M). initial: the first state; drawn from the stationary distribution if None.
+    slot_ms: None follows every jump; a number samples the state every so many ms. A state then lasts a
+    geometric number of slots, which is one draw and the same in law as a draw a slot.
     """
 
     def __init__(
@@ -87,21 +132,31 @@ class Chain:
         generator_per_ms: NDArray[np.float64],
         rng: CounterRng,
         initial: int | None = None,
+        slot_ms: float | None = None,
     ) -> None:
         q = check_generator(generator_per_ms)
         self.generator_per_ms = q
         self.states = len(q)
         self._rng = rng
+        self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
+        if slot_ms is not None:
+            if self.slot_ns < 1:
+                raise ChainError(f"a slot lasts at least a nanosecond, got {slot_ms:g} ms")
+            q = transition_matrix(q, self.slot_ns / 1e6)
         off = q - np.diag(np.diag(q))
-        self.leaving_per_ms = off.sum(1)
+        leave = leaving(q) if self.slot_ns else off.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            jumps = np.cumsum(off / self.leaving_per_ms[:, None], 1)
+            jumps = np.cumsum(off / off.sum(1)[:, None], 1)
+            # Parameter of the sojourn's length by state: the leaving rate in 1/ms; in slots, the logarithm of
+            # the probability to stay for one more.
+            self.sojourn_rate = np.log1p(-leave) if self.slot_ns else leave
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
         last = np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])
         self.jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps)
         self._jump_lists = self.jumps.tolist()
-        self._leaving_per_ms: list[float] = self.leaving_per_ms.tolist()
-        self._refuse_too_fast()
+        self._sojourn_rates = [float(r) for r in self.sojourn_rate]
+        if not self.slot_ns:
+            self._refuse_too_fast()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
@@ -161,7 +216,10 @@ class Chain:
             if self._number - mark == _CHECK_EVERY:
                 # The stationary distribution does not show this rate, as before an absorbing state.
                 if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
-                    raise ChainError("the chain switches more than 10000 times a ms: slow it down")
+                    raise ChainError(
+                        "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
+                        "boundaries (sampled: slots)"
+                    )
                 mark, mark_ns = self._number, start
             target = bisect_right(self._jump_lists[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1
@@ -170,11 +228,16 @@ class Chain:
             self._until = self._sojourn_end(start, target)
 
     def _sojourn_end(self, start_ns: int, state: int) -> int:
-        rate = self._leaving_per_ms[state]
+        rate = self._sojourn_rates[state]
         if rate == 0.0:
             return NEVER_NS
-        sojourn_ms = -math.log(self._rng.pair(self._number)[0]) / rate
-        return saturating_add(start_ns, saturating_round(sojourn_ms * 1e6))
+        logarithm = math.log(self._rng.pair(self._number)[0])
+        if not self.slot_ns:
+            return saturating_add(start_ns, saturating_round(-logarithm / rate * 1e6))
+        slots = logarithm / rate
+        if slots * self.slot_ns >= NEVER_NS:
+            return NEVER_NS
+        return saturating_add(start_ns, (int(slots) + 1) * self.slot_ns)
 
     def _draw_initial(self) -> int:
         shares = np.cumsum(stationary(self.generator_per_ms))
@@ -192,5 +255,5 @@ class Chain:
         if jumps_per_ms > MAX_JUMPS_PER_MS:
             raise ChainError(
                 f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
-                "followed: slow it down"
+                "followed: slow it down, or sample it at slot boundaries (sampled: slots)"
             )

@@ -20,7 +20,9 @@ from channel_emu.model.chain import (
     MAX_JUMPS_PER_MS,
     ChainError,
     check_generator,
+    leaving,
     stationary,
+    transition_matrix,
     two_state_generator,
 )
 from channel_emu.model.faults import per_state
@@ -33,6 +35,7 @@ PROCESSES = ("as-offered", "periodic", "poisson")
 LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
 SERVICE_STATES = ("at-start", "modulated")
 SCOPES = ("shared", "per-camera")
+SAMPLINGS = ("continuous", "slots")
 
 
 @dataclass(frozen=True)
@@ -77,9 +80,17 @@ class ChainConfig:
     initial: str | None = None
     """The state it starts in; drawn from the stationary distribution if not given."""
     scope: str = "shared"
+    sampled: str = "continuous"
+    """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
+    the slot, as the thesis does; ``channel-emu accuracy`` measures the bias."""
+    slot_ms: float | None = None
 
     def __post_init__(self) -> None:
         _one_of("scope", self.scope, SCOPES)
+        _one_of("sampled", self.sampled, SAMPLINGS)
+        _belongs("slot_ms", self.slot_ms, self.sampled == "slots", "sampled slots")
+        if self.slot_ms is not None and not 1e-3 <= self.slot_ms <= 1e9:
+            raise ValueError(f"slot_ms: expected 0.001 to 1e9, got {self.slot_ms:g}")
         pair = (self.mu1_per_ms is not None) + (self.mu2_per_ms is not None)
         if pair != (0 if self.generator_per_ms is not None else 2):
             raise ValueError("expected mu1_per_ms and mu2_per_ms, or generator_per_ms")
@@ -109,9 +120,12 @@ class ChainConfig:
         return check_generator(np.array(self.generator_per_ms, float))
 
     def switches_per_ms(self) -> float:
-        """How often the state changes in the long run. Raises ChainError where there is no long run."""
+        """How often the sampled state changes in the long run. Raises ChainError where there is none."""
         generator = self.generator()
-        return float(-stationary(generator) @ generator.diagonal())
+        shares = stationary(generator)
+        if self.slot_ms is None:
+            return float(-shares @ generator.diagonal())
+        return float(shares @ leaving(transition_matrix(generator, self.slot_ms))) / self.slot_ms
 
     def names(self) -> list[str]:
         count = 2 if self.generator_per_ms is None else len(self.generator_per_ms)

@@ -129,7 +129,8 @@ def service(text: str, folder: Path) -> dict[str, Any]:
 
 
 def chain(text: str) -> dict[str, Any]:
-    """``mu1=1/30,mu2=1/30``, optionally ``states=low/high``, ``scope=per-camera``, ``initial=low``."""
+    """``mu1=1/30,mu2=1/30``, optionally ``states=low/high``, ``scope=per-camera``, ``initial=low``,
+    ``slots=1ms``."""
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -139,8 +140,10 @@ def chain(text: str) -> dict[str, Any]:
             found[key] = value
         elif key == "states" and value:
             found["states"] = value.split("/")
+        elif key == "slots" and value:
+            found |= {"sampled": "slots", "slot_ms": span_ms(value)}
         else:
-            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1)"
+            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1, slots=1ms)"
             raise SpellingError(f"{text!r}: expected {expected}")
     return found
 

@@ -98,6 +98,7 @@ def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
         "service gamma": {"service": "gamma:0.01ms:2"},
         "service lognormal": {"service": "lognormal:0.01ms:0.5"},
         "chain of two states": {"chain": "mu1=1/30,mu2=1/30"},
+        "chain at 1 ms slots": {"chain": "mu1=1/30,mu2=1/30,slots=1ms"},
         "Poisson sampling": {"arrivals": "poisson:100"},
         "server of 18 cameras": {"server": {"shared": True}},
     }.items():

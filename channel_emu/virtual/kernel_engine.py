@@ -174,7 +174,7 @@ def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:
     if chain is None:
         return np.array([0, NEVER_NS], np.int64), np.zeros(1, np.int64)
     key = _key(seed, camera, "channel.chain")
-    return chain_path.chain_path(chain.leaving_per_ms, chain.jumps, key, chain.initial, end_ns)
+    return chain_path.chain_path(chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, end_ns)
 
 
 def _key(seed: int, camera: str, purpose: str) -> NDArray[np.uint64]:

@@ -21,6 +21,7 @@ from channel_emu.model import nanoseconds
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
+_NEVER = float(NEVER_NS)
 # Random numbers are drawn in blocks that amortize the call and fit into the L1 cache.
 _BLOCK = 256
 
@@ -30,10 +31,10 @@ saturating_add = njit(nanoseconds.saturating_add, nogil=True)
 
 
 @njit(cache=True, nogil=True)
-def chain_path(leaving_per_ms, jumps, key, initial, horizon_ns):
+def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
     """(starts, states) up to the first sojourn that ends after the horizon.
 
-    leaving_per_ms (M,), jumps (M, M), initial: the attributes of ``chain.Chain``.
+    sojourn_rate (M,), jumps (M, M), slot_ns, initial: the attributes of ``chain.Chain``.
     """
     starts = np.empty(1024, np.int64)
     states = np.empty(1024, np.int64)
@@ -46,9 +47,15 @@ def chain_path(leaving_per_ms, jumps, key, initial, horizon_ns):
         if k == 0:
             fill(count, u, v, key)
         end = NEVER_NS
-        if leaving_per_ms[state] != 0.0:
-            sojourn_ms = -math.log(u[k]) / leaving_per_ms[state]
-            end = saturating_add(starts[count], saturating_round(sojourn_ms * 1e6))
+        if sojourn_rate[state] != 0.0:
+            if slot_ns == 0:
+                end = saturating_add(
+                    starts[count], saturating_round(-math.log(u[k]) / sojourn_rate[state] * 1e6)
+                )
+            else:
+                slots = math.log(u[k]) / sojourn_rate[state]
+                if slots * slot_ns < _NEVER:
+                    end = saturating_add(starts[count], (np.int64(slots) + 1) * slot_ns)
         count += 1
         if count + 1 >= len(starts):
             starts = np.concatenate((starts, np.empty_like(starts)))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from channel_emu.model.chain import Chain, ChainError, stationary, two_state_generator
+from channel_emu.model.chain import Chain, ChainError, stationary, transition_matrix, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.nanoseconds import NEVER_NS
 
@@ -21,6 +21,57 @@ def sojourns(chain: Chain, until_ns: int) -> tuple[np.ndarray, np.ndarray]:
     pairs = chain.recent(0, until_ns)
     starts, states = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     return np.diff(starts) / 1e6, states[:-1]
+
+
+def test_transition_matrix_of_two_states_is_the_thesis_closed_form() -> None:
+    mu1, mu2, u = 1 / 30, 1 / 60, 17.0
+    fading = math.exp(-(mu1 + mu2) * u)
+    expected = [
+        [mu2 / (mu1 + mu2) + mu1 / (mu1 + mu2) * fading, mu1 / (mu1 + mu2) * (1 - fading)],
+        [mu2 / (mu1 + mu2) * (1 - fading), mu1 / (mu1 + mu2) + mu2 / (mu1 + mu2) * fading],
+    ]
+    np.testing.assert_allclose(transition_matrix(two_state_generator(mu1, mu2), u), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("span_ms", [0.0, 1e-6, 0.3, 10.0, 1e5])
+def test_transition_matrix_of_more_states_against_the_matrix_exponential(span_ms: float) -> None:
+    expm = pytest.importorskip("scipy.linalg").expm
+    expected = expm(THREE * span_ms)
+    np.testing.assert_allclose(transition_matrix(THREE, span_ms), expected, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("span_ms", [0.0, 1e-9, 1.0, 1e9, 1e15])
+def test_stiff_transition_matrices_stay_stochastic(span_ms: float) -> None:
+    for generator in (
+        two_state_generator(1e-9, 1e9),
+        np.array([[-1e9, 1e9, 0], [1e-9, -1 - 1e-9, 1], [0, 1e-9, -1e-9]]),
+    ):
+        p = transition_matrix(generator, span_ms)
+        assert (p >= 0).all()
+        np.testing.assert_allclose(p.sum(1), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("span_ms", [1e-3, 1.0, 1e6, 3e9])
+def test_stiff_transition_matrices_keep_their_digits(span_ms: float) -> None:
+    """Rates of 1e-9 and 1e9 together, against 200 digits: every probability to ten."""
+    mpmath = pytest.importorskip("mpmath")
+    for generator in (
+        np.array([[-1e9, 1e9, 0.0], [1.0, -1.0 - 1e-9, 1e-9], [0.0, 1e-9, -1e-9]]),
+        np.array([[-1e-9, 1e-9, 0.0], [1e9, -2e9, 1e9], [0.0, 0.0, 0.0]]),
+        two_state_generator(1e-9, 1e9),
+    ):
+        with mpmath.workdps(200):
+            exact_q = mpmath.matrix(generator.tolist())
+            for i in range(len(generator)):  # the diagonal to all digits too
+                exact_q[i, i] = -sum(exact_q[i, j] for j in range(len(generator)) if j != i)
+            # By its eigenvalues: a series would need 1e18 terms.
+            values, vectors = mpmath.eig(exact_q)
+            decay = mpmath.diag([mpmath.exp(value * mpmath.mpf(span_ms)) for value in values])
+            exact = (vectors * decay * vectors**-1).apply(mpmath.re)
+            expected = np.array(
+                [[float(exact[i, j]) for j in range(len(generator))] for i in range(len(generator))]
+            )
+        np.testing.assert_allclose(transition_matrix(generator, span_ms), expected, rtol=1e-10, atol=1e-30)
 
 
 def test_stationary_distribution_keeps_its_digits() -> None:
@@ -96,24 +147,45 @@ def test_forgetting_keeps_memory_bounded_and_shares_exact() -> None:
         forgetting.segment(0)
 
 
-def test_degenerate_chains() -> None:
+def test_a_slot_keeps_its_state_and_slots_forget_what_was_between() -> None:
+    """Switching a thousand times a slot, each slot is drawn anew: an even coin, whatever came before."""
+    chain = Chain(two_state_generator(1e3, 1e3), CounterRng(0, "", "channel.chain"), 0, 1.0)
+    assert all(chain.state(slot * 10**6 + 1) == chain.state(slot * 10**6 + 999_999) for slot in range(100))
+    states = np.array([chain.state(slot * 10**6) for slot in range(4000)])
+    assert states.mean() == pytest.approx(0.5, abs=4 * 0.5 / 4000**0.5)
+    assert np.corrcoef(states[1:], states[:-1])[0, 1] == pytest.approx(0, abs=4 / 4000**0.5)
+
+
+def test_slots_take_what_is_too_fast_to_follow() -> None:
+    fast = np.array([[-1e9, 1e9, 0.0], [1e9, -2e9, 1e9], [0.0, 1e-9, -1e-9]])
+    stiff = np.array([[-1e9, 5e8, 5e8], [1e9, -2e9, 1e9], [1e9, 1e9, -2e9]])
+    with pytest.raises(ChainError, match="sampled: slots"):
+        path(stiff)
+    chain = Chain(stiff, CounterRng(0, "", "channel.chain"), None, 1.0)
+    np.testing.assert_allclose(chain.occupancy(20_000 * 10**6), stationary(stiff), atol=0.02)
+    # The state that is left once in 1e9 ms is kept.
+    assert Chain(fast, CounterRng(0, "", "channel.chain"), 2, 1.0).segment(0)[1] > 10**6 * 10**6
+    with pytest.raises(ChainError, match="at least a nanosecond"):
+        Chain(stiff, CounterRng(0, "", "channel.chain"), None, 1e-9)
+
+
+@pytest.mark.parametrize("slot_ms", [None, 1.0])
+def test_degenerate_chains(slot_ms: float | None) -> None:
     """One state; and an absorbing one, in which it ends."""
-    one = path(np.zeros((1, 1)))
+    one = Chain(np.zeros((1, 1)), CounterRng(0, "", "channel.chain"), None, slot_ms)
     assert one.segment(10**15) == (0, NEVER_NS) and one.occupancy(10**15) == [1.0]
-    absorbed = path([[-1.0, 1.0], [0.0, 0.0]], initial=0)
+    absorbed = Chain(np.array([[-1.0, 1.0], [0.0, 0.0]]), CounterRng(0, "", "channel.chain"), 0, slot_ms)
     left = absorbed.segment(0)[1]
     assert left < 100 * 10**6 and absorbed.segment(left) == (1, NEVER_NS)
 
 
-def test_what_is_too_fast_to_follow_is_refused() -> None:
-    with pytest.raises(ChainError, match="slow it down"):
-        path([[-1e9, 5e8, 5e8], [1e9, -2e9, 1e9], [1e9, 1e9, -2e9]])
-
-
-def test_kernel_draws_the_same_path() -> None:
+@pytest.mark.parametrize("slot_ms", [None, 2.5])
+def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
     kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
     for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
-        chain = path(generator, seed=9)
+        chain = Chain(np.array(generator), CounterRng(9, "", "channel.chain"), None, slot_ms)
         key = np.array(CounterRng(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(chain.leaving_per_ms, chain.jumps, key, chain.initial, 10**11)
+        starts, states = kernel.chain_path(
+            chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11
+        )
         assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

@@ -23,7 +23,9 @@ def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
     horizon_ms = 40_000_000
     path = chain(mu1, mu2, seed=3)
     key = np.array(CounterRng(3, "", "channel.chain").key, np.uint64)
-    starts, states = kernel.chain_path(path.leaving_per_ms, path.jumps, key, path.initial, horizon_ms * 10**6)
+    starts, states = kernel.chain_path(
+        path.sojourn_rate, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
+    )
     arrivals_key = np.array(CounterRng(3, "cam00", "channel.arrivals").key, np.uint64)
     found = kernel.poisson_arrivals(rates / 1e6, starts, states, arrivals_key, horizon_ms * 10**6)
     counts = np.bincount(found // round(window * 1e6), minlength=int(horizon_ms / window))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("numba", reason="the tables are measured on the numba kernel")
+pytest.importorskip("scipy", reason="the tables' intervals need scipy")
 
 from channel_emu.cli import main
 from channel_emu.model.faults import NAMES
@@ -40,13 +41,23 @@ def test_longer_runs_err_less() -> None:
     assert rows[-1]["seconds"] == pytest.approx(316.2, abs=0.1)
 
 
+def test_the_measured_bias_of_slots_is_the_exact_one() -> None:
+    rows = accuracy_cost.chain_slots(5, 30_000)
+    assert {row["slot_ms"] for row in rows if row["what"] == "chain fast"} >= {0.0, 0.2, 2.0}
+    for row in rows:
+        error = abs(row["bias_measured_pct"] - row["bias_exact_pct"])
+        assert error < 3 * row["half_width_pct"]
+    assert max(row["bias_exact_pct"] for row in rows) > 50  # and there is a bias to measure
+
+
 @pytest.mark.slow
 def test_the_command_writes_tables_and_figure(tmp_path: Path, capsys) -> None:
     assert main(["accuracy", "--quick", "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
-    assert "rms error" in text
-    with (tmp_path / "accuracy-duration.csv").open() as file:
-        assert len(list(csv.DictReader(file))) >= 3
+    assert "rms error" in text and "chain thesis" in text
+    for name in ("duration", "slots"):
+        with (tmp_path / f"accuracy-{name}.csv").open() as file:
+            assert len(list(csv.DictReader(file))) >= 3
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -70,3 +81,6 @@ def test_commands_print_json(capsys, monkeypatch) -> None:
         assert main([*words, "--seconds", "60", *more]) == 0
         ages.append(json.loads(capsys.readouterr().out)["mean_age_ms"])
     assert ages[1] > 2 * ages[0]  # six cameras wait for one line
+    assert main(["simulate", "--preset", "ch6", "--chain", "mu1=1/30,mu2=1/30,slots=5ms", "--seconds", "20",
+                 "--json"]) == 0  # fmt: skip
+    assert sum(json.loads(capsys.readouterr().out)["state_share"].values()) == pytest.approx(1)

@@ -34,7 +34,12 @@ CHANNELS = [
       for d in DISCIPLINES for s in ("at-start", "modulated")),
     *({"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
       for d in ("fcfs", "parallel")),
-    {"preset": "ch6", "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low"}},
+    *({"preset": "ch6", "discipline": "fcfs", "service_state": s,
+       "chain": {"sampled": "slots", "slot_ms": slot_ms, **more}}
+      for s in ("at-start", "modulated") for slot_ms, more in ((1.0, {}), (7.3, {"scope": "per-camera"}))),
+    {"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 1e9, "sampled": "slots", "slot_ms": 0.5}},
+    {"preset": "ch6", "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low", "sampled": "slots",
+                                "slot_ms": 2.0}},
     {"preset": "ch5", "arrivals": {"spread": True}},
     *({"preset": "ch6", "discipline": d, "faults": {"loss": [0.1, 0.6]}, "chain": {"scope": "per-camera"}}
       for d in ("drop-new", "newest-waits")),
