@@ -177,12 +177,9 @@ def state_probabilities(model: TwoStateModel, lines: Sequence[Timeline]) -> list
     """The state's distribution at each event given all observations, one array (N, 2) a timeline."""
     from channel_emu.estimate import hmm_kernels
 
-    found = []
-    for line in lines:
-        steps = _propagators(model, line)
-        _, weights = hmm_kernels.smooth(_UNIFORM, steps, _emissions(model, line)[0])
-        found.append((weights * steps).sum(1))
-    return found
+    return [
+        hmm_kernels.smooth(_UNIFORM, _propagators(model, line), _emissions(model, line)[0]) for line in lines
+    ]
 
 
 def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> TwoStateModel:

@@ -42,26 +42,23 @@ def forward(initial, steps, emissions):
 
 @njit(cache=True)
 def smooth(initial, steps, emissions):
-    """Log likelihood, and weights (N, M, M) such that ``weights[k, i, j] * steps[k, i, j]`` is the
-    probability, given everything, of state i at observation k-1 and j at k.
+    """Probability (N, M) of each state at each observation, given all of them; 0 where they are impossible.
 
     Baum, Petrie, Soules and Weiss 1970, with the scaling of Rabiner, Proc. IEEE 77(2), 1989.
     """
     n, m = emissions.shape
     total, before, mass = forward(initial, steps, emissions)
+    states = np.zeros((n, m))
     if total == -math.inf:
-        return total, np.zeros((n, m, m))
-    weights = np.empty((n, m, m))
+        return states
     after = np.ones(m)  # p(what follows | state), scaled
     nxt = np.empty(m)
     for k in range(n - 1, -1, -1):
+        nxt[:] = 0.0
         for i in range(m):
             for j in range(m):
-                weights[k, i, j] = before[k, i] * emissions[k, j] * after[j] / mass[k]
-        for i in range(m):
-            value = 0.0
-            for j in range(m):
-                value += steps[k, i, j] * emissions[k, j] * after[j]
-            nxt[i] = value / mass[k]
+                value = steps[k, i, j] * emissions[k, j] * after[j] / mass[k]
+                states[k, j] += before[k, i] * value
+                nxt[i] += value
         after[:] = nxt
-    return total, weights
+    return states

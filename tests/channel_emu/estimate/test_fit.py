@@ -270,7 +270,7 @@ def test_without_arrivals_a_step_is_the_chains_transition_matrix() -> None:
     silent = dataclasses.replace(MODEL, rate_per_ms=None)
     steps = hmm._Propagator(silent, 3).steps(span_ms)
     for span, step in zip(span_ms, steps):
-        assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-14)
+        assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-10)
 
 
 def test_a_step_against_small_time_steps() -> None:
@@ -286,20 +286,18 @@ def test_a_step_against_small_time_steps() -> None:
 
 
 def test_the_kernel_agrees_with_sums_over_all_paths() -> None:
-    """Eight observations, every one of the 2^9 paths: likelihood and pair probabilities."""
+    """Eight observations, every one of the 2^9 paths: likelihood and probabilities of the states."""
     line = line_of(8)
     steps, (seen, _) = hmm._propagators(MODEL, line), hmm._emissions(MODEL, line)
-    total, pairs = 0.0, np.zeros((8, 2, 2))
+    total, states = 0.0, np.zeros((8, 2))
     for path in np.ndindex(*[2] * 9):
         p = 0.5 * math.prod(steps[k, path[k], path[k + 1]] * seen[k, path[k + 1]] for k in range(8))
         total += p
         for k in range(8):
-            pairs[k, path[k], path[k + 1]] += p
+            states[k, path[k + 1]] += p
     even = np.array([0.5, 0.5])
-    found, weights = kernel.smooth(even, steps, seen)
-    assert found == pytest.approx(math.log(total), rel=1e-12)
-    assert kernel.forward(even, steps, seen)[0] == pytest.approx(found, rel=1e-14)
-    assert weights * steps == pytest.approx(pairs / total, rel=1e-10)
+    assert kernel.forward(even, steps, seen)[0] == pytest.approx(math.log(total), rel=1e-12)
+    assert kernel.smooth(even, steps, seen) == pytest.approx(states / total, rel=1e-10)
 
 
 def test_the_maximum_is_flat_and_higher_than_all_around_it(tmp_path: Path) -> None:

@@ -17,6 +17,13 @@ def make(**parameters) -> LightSwitch:
     return LightSwitch(**parameters)
 
 
+def left_of(light: Light, **parameters) -> Light:
+    """What is left of it when the lamps are out."""
+    switch = make(**parameters).extend(make_scene("room", SMALL)).world.switch
+    assert switch is not None
+    return switch.without(light)
+
+
 def test_the_scene_is_lit_as_ever_and_then_without_the_lamps_of_one_side():
     scene = make_scene("room", SMALL)
     switched = make(period_s=2.0 * scene.period_s, azimuth_deg=0.0).extend(scene)
@@ -33,7 +40,7 @@ def test_the_scene_is_lit_as_ever_and_then_without_the_lamps_of_one_side():
 def test_the_side_without_lamps_darkens_most():
     scene = make_scene("room", SMALL)
     light = scene.world.light
-    east, west = (make(azimuth_deg=a).without(light) for a in (0.0, 180.0))
+    east, west = (left_of(light, azimuth_deg=a) for a in (0.0, 180.0))
     assert east.points[:, 0].mean() < light.points[:, 0].mean() < west.points[:, 0].mean()
     for left in (east, west):
         assert left.point_color == pytest.approx(light.point_color)  # the lamps that stay are as bright
@@ -41,7 +48,7 @@ def test_the_side_without_lamps_darkens_most():
 
 def test_one_lamp_stays_on():
     lone = Light(np.array([[0.0, 0.0, 3.0]]), 1.0, 2.0, (0.1, 0.1, 0.1), (0.1, 0.1, 0.1))
-    assert len(make(share=1.0).without(lone).points) == 1
+    assert len(left_of(lone, share=1.0).points) == 1
 
 
 def test_rows_and_worlds_whose_bodies_move_otherwise_are_dim_too():
