@@ -26,7 +26,7 @@ Write what a run or a fit has made as files for other programs. RUN is its folde
 --mesh         triangles with colours: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
 --points       surface points with colours (.ply)
---colmap       DIR/images and a model in DIR/sparse/0, as text
+--colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 --trajectory   poses as the TUM benchmark has them; a file for each camera that moved
 
@@ -64,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--splats", type=Path, metavar="FILE", help=".ply")
     add("--points", type=Path, metavar="FILE", help=".ply")
     add("--colmap", type=Path, metavar="DIR")
+    add("--binary", action="store_true", help="of --colmap: binary instead of text")
     add("--transforms", type=Path, metavar="DIR")
     add("--trajectory", type=Path, metavar="FILE")
     add("--count", type=int, default=20000, metavar="N", help="points of --points and others [%(default)s]")
@@ -136,6 +137,8 @@ class Export:
                 raise ExportError(f"--{name} {path}: expected a file that ends in {' or '.join(endings)}")
         if args.count < 1:
             raise ExportError(f"--count {args.count}: expected 1 or more")
+        if args.binary and args.colmap is None:
+            raise ExportError("--binary is for --colmap DIR")
         if args.mesh is None and (args.measure is not None or args.json is not None):
             raise ExportError("--measure and --json are for --mesh FILE")
         if args.measure is not None and self._compare is None:
@@ -206,7 +209,7 @@ class Export:
         from edge_server.export.colmap import write_model
         from edge_server.export.run_source import write_images
 
-        write_model(folder / "sparse" / "0", self.source.shots, self.cloud)
+        write_model(folder / "sparse" / "0", self.source.shots, self.cloud, self.args.binary)
         write_images(folder / "images", self.source.shots)
         print(f"{folder}: {len(self.source.shots)} images, {len(self.cloud.points)} points", flush=True)
 
