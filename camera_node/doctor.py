@@ -23,7 +23,7 @@ from pathlib import Path
 from camera_node.config import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
 from camera_node.sources.base import rate
 from freshfield import transport
-from freshfield.clock import OffsetEstimator, WallClock
+from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 
 LEAST_FREE_GB = 2.0
@@ -195,7 +195,7 @@ async def _exchange(target: str, security: transport.Transport) -> tuple[float, 
     import grpc
     import grpc.aio
 
-    from camera_node.clocksync import exchange
+    from camera_node.clock_offset import OffsetEstimator, exchange
 
     estimator, clock = OffsetEstimator(), WallClock()
     async with security.aio_channel(target) as channel:

@@ -17,8 +17,8 @@ from typing import Any
 import grpc.aio
 
 from camera_node.capture import Camera, EncodedShot, prepare
+from camera_node.clock_offset import ClockSync
 from camera_node.clocks import NodeClock
-from camera_node.clocksync import ClockSync
 from camera_node.outbox import Outbox
 from camera_node.sender import Sender
 from freshfield.clock import Clock, WallClock

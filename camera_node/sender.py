@@ -13,8 +13,8 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from camera_node.clock_offset import Offset
 from camera_node.outbox import Outbox
-from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
 from freshfield.limits import MAX_CAPTURE_AGE_NS, MAX_REASONS
 from freshfield.transport import backoff_s, peer_text

@@ -12,7 +12,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.kernels.fisher_information import MOMENTS, fisher_information
-from edge_server.viewpoints.selector import CaptureState
+from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import Pinhole
 
 _CAMERAS_A_RUN = 8  # as many tile lists are kept at a time

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
-from edge_server.viewpoints.selector import CaptureState
+from edge_server.viewpoints.registry import CaptureState
 
 Array = NDArray[np.float64]
 

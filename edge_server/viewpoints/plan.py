@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Field, View
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
-from edge_server.viewpoints.selector import CaptureState, Selector
+from edge_server.viewpoints.registry import CaptureState, Selector
 
 # Values that differ by less than this share of their size are equal.
 _EQUAL = 1e-9

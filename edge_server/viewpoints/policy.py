@@ -22,7 +22,7 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
-from edge_server.viewpoints.selector import CaptureState
+from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Wall and virtual clocks behind one method, and the estimate of another machine's clock.
+"""Wall and virtual clocks behind one method.
 
 Nothing else in the project reads the wall clock: links, buffers, policies and the edge's loop are given a
 time or a clock, so that a whole deployment can run in virtual time from one seed.
@@ -6,10 +6,7 @@ time or a clock, so that a whole deployment can run in virtual time from one see
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import deque
-from dataclasses import dataclass
 from typing import Protocol
 
 
@@ -53,50 +50,3 @@ class VirtualClock:
         if now_ns < self._now:
             raise ValueError(f"virtual time cannot go back from {self._now} to {now_ns} ns")
         self._now = int(now_ns)
-
-
-@dataclass(frozen=True)
-class Offset:
-    """Another clock minus this one.
-
-    uncertainty_ns: bound of the error, half the round trip of the exchange that the estimate rests on.
-    """
-
-    offset_ns: int
-    uncertainty_ns: int
-
-
-class OffsetEstimator:
-    """NTP's estimate: the offset of the exchange with the shortest round trip among the last 16.
-
-    The bound of an exchange grows by ``drift_ppm`` of its age, so that the estimate follows a drifting clock.
-    Thread-safe.
-    """
-
-    def __init__(self, drift_ppm: float = 50.0) -> None:
-        self._samples: deque[tuple[int, int, int]] = deque(maxlen=16)
-        self._drift = drift_ppm * 1e-6
-        self._lock = threading.Lock()
-
-    def add(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
-        """One exchange: sent by this clock, received and replied to by the other, returned by this one.
-        Impossible exchanges are ignored."""
-        round_trip = (returned_ns - sent_ns) - (replied_ns - received_ns)
-        if round_trip < 0 or replied_ns < received_ns:
-            return
-        offset = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
-        with self._lock:
-            self._samples.append((returned_ns, offset, round_trip // 2))
-
-    def estimate(self, now_ns: int) -> Offset | None:
-        """Best offset at ``now_ns`` of this clock; None before the first exchange."""
-        with self._lock:
-            samples = list(self._samples)
-        if not samples:
-            return None
-
-        def bound(sample: tuple[int, int, int]) -> int:
-            return sample[2] + int(max(0, now_ns - sample[0]) * self._drift)
-
-        best = min(samples, key=bound)
-        return Offset(best[1], bound(best))

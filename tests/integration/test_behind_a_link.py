@@ -12,10 +12,11 @@ import grpc
 import numpy as np
 import pytest
 
+from camera_node.clock_offset import OffsetEstimator
 from channel_emu.model import ages
 from channel_emu.testing import channel
 from freshfield import ledger
-from freshfield.clock import OffsetEstimator, WallClock
+from freshfield.clock import WallClock
 from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc

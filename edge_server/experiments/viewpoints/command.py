@@ -24,7 +24,7 @@ from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.experts import TASTES
 from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.preferences import PERSON
-from edge_server.viewpoints.selector import SELECTORS, make_selector
+from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError

@@ -16,7 +16,7 @@ from edge_server.fields.splat.kernels.project import BASE
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.fisher import FisherRF, information
-from edge_server.viewpoints.selector import CaptureState
+from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, random_params, static

@@ -12,7 +12,7 @@ from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.features import GEOMETRY
 from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
-from edge_server.viewpoints.selector import CaptureState, make_selector
+from edge_server.viewpoints.registry import CaptureState, make_selector
 from freshfield.geometry import Pinhole
 
 LENS = Pinhole.from_fov(16, 16, 50.0)

@@ -1,13 +1,16 @@
-"""Keeps an estimate of the peer's clock: one small exchange a second on the channel of the frames."""
+"""The peer's clock minus ours, estimated from one small exchange a second on the channel of the frames."""
 
 from __future__ import annotations
 
 import asyncio
+import threading
+from collections import deque
+from dataclasses import dataclass
 
 import grpc
 import grpc.aio
 
-from freshfield.clock import Clock, Offset, OffsetEstimator
+from freshfield.clock import Clock
 from freshfield.v1 import clock_pb2 as pb
 from freshfield.v1 import clock_pb2_grpc as rpc
 
@@ -15,6 +18,53 @@ PERIOD_S = 1.0
 # The first exchanges follow one another closely, so that early frames get a good estimate too.
 _FIRST = 4
 _FIRST_PERIOD_S = 0.05
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Another clock minus this one.
+
+    uncertainty_ns: bound of the error, half the round trip of the exchange that the estimate rests on.
+    """
+
+    offset_ns: int
+    uncertainty_ns: int
+
+
+class OffsetEstimator:
+    """NTP's estimate: the offset of the exchange with the shortest round trip among the last 16.
+
+    The bound of an exchange grows by ``drift_ppm`` of its age, so that the estimate follows a drifting clock.
+    Thread-safe.
+    """
+
+    def __init__(self, drift_ppm: float = 50.0) -> None:
+        self._samples: deque[tuple[int, int, int]] = deque(maxlen=16)
+        self._drift = drift_ppm * 1e-6
+        self._lock = threading.Lock()
+
+    def add(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
+        """One exchange: sent by this clock, received and replied to by the other, returned by this one.
+        Impossible exchanges are ignored."""
+        round_trip = (returned_ns - sent_ns) - (replied_ns - received_ns)
+        if round_trip < 0 or replied_ns < received_ns:
+            return
+        offset = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
+        with self._lock:
+            self._samples.append((returned_ns, offset, round_trip // 2))
+
+    def estimate(self, now_ns: int) -> Offset | None:
+        """Best offset at ``now_ns`` of this clock; None before the first exchange."""
+        with self._lock:
+            samples = list(self._samples)
+        if not samples:
+            return None
+
+        def bound(sample: tuple[int, int, int]) -> int:
+            return sample[2] + int(max(0, now_ns - sample[0]) * self._drift)
+
+        best = min(samples, key=bound)
+        return Offset(best[1], bound(best))
 
 
 class ClockSync:
