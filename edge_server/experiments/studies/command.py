@@ -61,7 +61,7 @@ STUDIES = {
                     "what is learnt against the time it takes, by the effort of a fit and the embedding"),
 }  # fmt: skip
 # Studies that consist of cases: --case selects some of them.
-CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
+CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "ablation", "reward-cost")
 # Studies that train: they take long and are not part of "all".
 LEARNING = tuple(name for name, (module, *_) in STUDIES.items() if module.startswith("learning."))
 # Studies of captures: they run in this process, and are not part of "all" either.
