@@ -93,10 +93,6 @@ def from_trace(path: Path, found: trace.Trace) -> Recording:
     if not found.records:
         raise RecordingError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
-    if sampled and all(r.arrived_ns is None for r in found.records):
-        raise RecordingError(
-            f"{path}: it does not say when frames arrived at the link (an older version): record it again"
-        )
     first_ns = min(r.offered_ns for r in found.records)
     cameras, too_long = [], 0
     for name, records in found.by_camera().items():

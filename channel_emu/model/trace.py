@@ -26,7 +26,7 @@ from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
 
-VERSION = 1
+VERSION = 2
 _INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
 
 
@@ -44,6 +44,7 @@ class Record:
     number: int
     bytes: int
     offered_ns: int
+    arrived_ns: int | None
     outcome: str | None
     state: int
     started_ns: int | None
@@ -53,7 +54,6 @@ class Record:
     actual_ns: int | None = None
     duplicated: bool = False
     flips: tuple[tuple[float, int], ...] = ()
-    arrived_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,8 @@ def read(path: Path) -> Trace:
     try:
         head = json.loads(lines[0])
         if head["freshfield_trace"] != VERSION:
-            raise TraceError(f"{path}: trace version {head['freshfield_trace']}, expected {VERSION}")
+            version = head["freshfield_trace"]
+            raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
         config = channel_from_mapping(head["channel"], f"{path}: channel")
         seed = int(head["seed"])
     except (json.JSONDecodeError, KeyError, TypeError):

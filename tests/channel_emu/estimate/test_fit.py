@@ -93,11 +93,6 @@ def test_frames_that_waited_to_be_served_do_not_bias_the_rate(tmp_path: Path) ->
     found = fit(path, "1").parameters["rate_per_ms"]
     assert found.interval is not None and found.interval[1] / found.interval[0] < 1.05
     assert holds(found, 1 / 60)
-    older = path.read_text().splitlines()
-    records = [json.dumps({**json.loads(line), "arrived_ns": None}) for line in older[1:]]
-    path.write_text("\n".join([older[0], *records, ""]))
-    with pytest.raises(recordings.RecordingError, match="record it again"):
-        fit(path, "1")
 
 
 def test_cameras_with_chains_of_their_own(tmp_path: Path) -> None:
@@ -270,7 +265,7 @@ def test_without_arrivals_a_step_is_the_chains_transition_matrix() -> None:
     silent = dataclasses.replace(MODEL, rate_per_ms=None)
     steps = hmm._Propagator(silent, 3).steps(span_ms)
     for span, step in zip(span_ms, steps):
-        assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-10)
+        assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-14)
 
 
 def test_a_step_against_small_time_steps() -> None:

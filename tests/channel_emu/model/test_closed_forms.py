@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("numba", reason="the closed forms are checked on the numba kernel")
 pytest.importorskip("scipy", reason="the closed forms need scipy")
 
-from channel_emu.model.closed_forms import drop_new_age_ms
 from scipy import stats
 
 from channel_emu.model import ages
+from channel_emu.model.closed_forms import drop_new_age_ms
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 from tests.channel_emu.model import exact_forms as exact

@@ -94,9 +94,9 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
 @pytest.mark.parametrize(
     ("line", "old", "new", "why"),
     [
-        (0, '"freshfield_trace":1', '"other":1', "no trace header"),
+        (0, '"freshfield_trace":2', '"other":2', "no trace header"),
         (0, "{", "nonsense", "no trace header"),
-        (0, '"freshfield_trace":1', '"freshfield_trace":9', "version 9"),
+        (0, '"freshfield_trace":2', '"freshfield_trace":1', "version 1, expected 2: record it again"),
         (0, '"discipline"', '"rain"', "rain: unknown key"),
         (1, '"camera"', '"kamera"', "line 2 is not a trace record"),
         (1, '"offered_ns":', '"offered_ns":-', "line 2: offered_ns: expected nanoseconds"),

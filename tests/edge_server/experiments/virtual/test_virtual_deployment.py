@@ -116,7 +116,7 @@ def test_the_books_close_with_every_fault_and_damage_is_refused():
 @pytest.mark.parametrize(
     "channel",
     [{"preset": "ch5"},
-     {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"}}],
+     {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True}}],
     ids=["own lines", "one line"],
 )  # fmt: skip
 def test_the_links_decide_as_the_simulation_does(channel):
