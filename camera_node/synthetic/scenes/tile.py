@@ -26,7 +26,7 @@ _BACKGROUND = (0.80, 0.83, 0.86)
 _TARGET = (0.0, 0.0, 0.03)
 _RADIUS_M = 0.85
 BOTTOM_M = -0.06
-_BENCH_BOUNDS = [[-0.9, -0.7, -0.1], [0.9, 0.72, 0.6]]
+_BENCH_BOUNDS = [[-1.6, -0.65, -0.4], [1.6, 0.72, 1.4]]
 # cam00, then three rings of the half-hemisphere on the -y side.
 _ANGLES_DEG = [(0.0, 40.0)] + [
     (a, e)

@@ -1,6 +1,6 @@
 """From pixels to the mesh of one object: the tile on its bench (scenario ``scan``), cut out in several ways.
 
-A camera's viewpoints lie around the tile as the scenario's arm takes them. A field is fitted to whole
+A camera's viewpoints are those that the scenario asks its arm for. A field is fitted to whole
 images, and to images cut by the scenario's own ``edge.foreground``, by GrabCut in its detector's boxes, by
 these boxes alone, and by true masks. Of each the mesh is compared with the tile's surface, bench and tools
 not being part of it: error, the share of the surface within 3 mm of the mesh, and the share of the mesh that
@@ -50,7 +50,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
         import skimage  # noqa: F401 -- said before minutes of fitting, not after
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
-    size, step_deg, steps = (96, 30, 100) if run.quick else (192, 20, 400)
+    size, step_deg, steps = (96, 24.0, 100) if run.quick else (192, 15.0, 400)
     loaded = load(SCENARIO)
     edge, source = read_config(loaded), source_config(loaded)
     assert isinstance(source, WorldConfig) and source.arm is not None and source.arm.path is not None
@@ -59,7 +59,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     poses = [
         on_sphere(path.target_m, path.radius_m, azimuth, elevation)
         for elevation in path.elevations_deg
-        for azimuth in range(-180, 180, step_deg)
+        for azimuth in np.arange(path.azimuths_deg[0], path.azimuths_deg[1] + 1e-9, step_deg)
     ]
     views = [View(f"v{k:02d}", scene.view(lens, p).image(0.0), p, lens) for k, p in enumerate(poses)]
     masks = [scene.object_mask(lens, pose) for pose in poses]
