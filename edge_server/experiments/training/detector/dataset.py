@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +111,7 @@ def _render_shard(job: tuple[str, str, int, int, int, int, Path]) -> None:
             parts.append(LabeledImages(*object_scenes.variation(_seed(seed, k), purpose, side).take()))
     whole = joined(parts)
     counts = [len(b) for b in whole.boxes]
-    masks = {} if whole.masks is None else {"masks": whole.masks}
+    masks: dict[str, Any] = {} if whole.masks is None else {"masks": whole.masks}
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("wb") as file:
         np.savez(file, images=whole.images, counts=counts, boxes=np.concatenate(whole.boxes), **masks)

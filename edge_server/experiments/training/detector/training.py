@@ -78,7 +78,7 @@ def train(
             assigned = assign_batch(found, truths)
             scored, boxed = detection_loss(found, truths, assigned)
             losses = [scored, boxed]
-            if masks is not None:
+            if masks is not None and weights is not None and maps is not None:
                 losses.append(mask_loss(weights, maps, truths, masks, assigned))
             optimizer.zero_grad(set_to_none=True)
             sum(losses[1:], losses[0]).backward()
