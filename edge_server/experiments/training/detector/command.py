@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -23,8 +24,9 @@ or one that finds an object to scan and cuts it out.
 Pictures and boxes are rendered (room, tower, tile with people, carts, balls and drums; --of tile: the tile
 among other things, with its masks), the detector is trained, exported to ONNX in float32 and in static 8
 bits, and each is measured on worlds and cameras that it has never seen. Ctrl-C stops after which the same
-command goes on; the same seed and threads give the same weights. In OUT: detector_fp32.onnx,
-detector_int8.onnx, detector.json (log and quality); --of tile: tile_fp32.onnx and so on. Use one:
+command goes on; the same seed and threads give the same weights. --start begins from the weights of an
+earlier training. In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality), with
+--of tile tile_fp32.onnx and so on. Use one:
 
   edge: {embedding: {model: runs/detector/detector_fp32.onnx}}
   edge: {foreground: {detector: runs/tile/tile_int8.onnx}}
@@ -67,12 +69,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
     worlds, epochs, held = (20, 2, 4) if args.quick else (args.worlds, args.epochs, HELD_OUT_WORLDS)
     subject, kinds, out = args.of, SUBJECTS[args.of], folder(args)
-    settings = Settings(args.seed, args.side, worlds, epochs, args.rate, args.threads, subject)
+    start = "" if args.start is None else file_digest(args.start)
+    settings = Settings(args.seed, args.side, worlds, epochs, args.rate, args.threads, subject, start)
     out.mkdir(parents=True, exist_ok=True)
     pictures = out / "pictures"
     known = render("train", worlds, args.side, args.seed, pictures, args.workers, subject)
     unseen = render("held-out", held, args.side, args.seed, pictures, args.workers, subject)
-    model, log = train(known, settings, out / "checkpoint.pt")
+    model, log = train(known, settings, out / "checkpoint.pt", args.start)
     name = "detector" if subject == "scenes" else subject
     fp32, int8 = out / f"{name}_fp32.onnx", out / f"{name}_int8.onnx"
     export.export_fp32(model, args.side, fp32, {"author": "freshfield", "seed": args.seed}, kinds)
@@ -101,6 +104,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
     write_json(out / f"{name}.json", results, indent=1)
     return results
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal. CheckpointError: it cannot be read."""
+    from edge_server.experiments.training.detector.training import CheckpointError
+
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"--start {path}: cannot be read: {error.strerror}") from None
 
 
 def folder(args: argparse.Namespace) -> Path:
@@ -176,6 +189,7 @@ def _parser() -> argparse.ArgumentParser:
         help="that train; they decide the weights too [%(default)s]",
     )
     add("--workers", type=at_least(1), default=2, metavar="N", help="processes that render [%(default)s]")
+    add("--start", type=Path, metavar="FILE", help="checkpoint.pt of an earlier training to begin from")
     add("--quick", action="store_true", help="20 worlds, 2 epochs: to try it out")
     add("--json", action="store_true", help="print detector.json instead of a summary")
     return parser

@@ -35,7 +35,7 @@ class CheckpointError(ValueError):
 @dataclass(frozen=True)
 class Settings:
     """Settings that decide the weights bit for bit; threads too, because they split sums. subject: of
-    ``dataset.SUBJECTS``."""
+    ``dataset.SUBJECTS``. start: SHA-256 of the checkpoint whose weights it begins from; empty: none."""
 
     seed: int = 0
     side: int = 128
@@ -44,13 +44,15 @@ class Settings:
     rate: float = 2e-3
     threads: int = 1
     subject: str = "scenes"
+    start: str = ""
 
 
 def train(
-    dataset: LabeledImages, settings: Settings, checkpoint: Path
+    dataset: LabeledImages, settings: Settings, checkpoint: Path, start: Path | None = None
 ) -> tuple[Detector, list[dict[str, Any]]]:
     """Train, or resume from ``checkpoint``; with masks, if ``dataset`` has some. Returns the averaged
-    detector in eval mode, and a row of losses per epoch. CheckpointError: made with other settings.
+    detector in eval mode, and a row of losses per epoch. start: a checkpoint of an earlier training, of the
+    same subject, whose averaged weights this one begins from. CheckpointError: made with other settings.
     FloatingPointError: the loss diverged."""
     torch.set_num_threads(settings.threads)
     torch.use_deterministic_algorithms(True)
@@ -59,6 +61,13 @@ def train(
     kinds, prototypes = len(SUBJECTS[settings.subject]), 0 if dataset.masks is None else PROTOTYPES
     model = Detector(kinds, prototypes)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
+    if start is not None:
+        try:
+            model.load_state_dict(_read(start)["averaged"])
+        except RuntimeError:
+            raise CheckpointError(
+                f"{start}: holds another network; begin from one of the same --of"
+            ) from None
     averaged = Detector(kinds, prototypes).eval()
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
@@ -119,11 +128,8 @@ def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list
     """Load what ``_save`` wrote into ``parts``; returns the log so far."""
     if not checkpoint.is_file():
         return []
-    try:
-        kept = torch.load(checkpoint, weights_only=True)
-        known = kept["settings"]
-    except Exception as error:  # torch's reader raises whatever its archive's layers raise
-        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+    kept = _read(checkpoint)
+    known = kept["settings"]
     for key, value in asdict(settings).items():
         if known.get(key) != value:
             raise CheckpointError(
@@ -134,6 +140,16 @@ def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list
         part.load_state_dict(kept[name])
     log: list[dict[str, Any]] = kept["log"]
     return log
+
+
+def _read(checkpoint: Path) -> dict[str, Any]:
+    """What ``_save`` wrote. CheckpointError: it cannot be read."""
+    try:
+        kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)
+        kept["settings"], kept["averaged"]
+    except Exception as error:  # torch's reader raises whatever its archive's layers raise
+        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+    return kept
 
 
 def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list[dict[str, Any]]) -> None:

@@ -236,6 +236,21 @@ def test_it_learns_and_repeats_bit_for_bit_stopped_or_not(tmp_path):
     assert [r["box_loss"] for r in relog] == [r["box_loss"] for r in log]
 
 
+def test_a_training_may_begin_from_another_one(tmp_path):
+    pictures = discs(BATCH)
+    settings = dataclasses.replace(SETTINGS, epochs=1, subject="tile")
+    first, _ = train(pictures, settings, tmp_path / "a.pt")
+    # So slow that it goes nowhere: what comes out is what it began from.
+    slow = dataclasses.replace(settings, rate=1e-9, start="a")
+    second, _ = train(pictures, slow, tmp_path / "b.pt", tmp_path / "a.pt")
+    weights, others = (dict(model.named_parameters()) for model in (first, second))
+    assert all(torch.allclose(weights[name], others[name], atol=1e-5) for name in weights)
+    with pytest.raises(CheckpointError, match="trained with start a, not b"):
+        train(pictures, dataclasses.replace(slow, start="b"), tmp_path / "b.pt", tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match="holds another network"):
+        train(squares(BATCH), SETTINGS, tmp_path / "c.pt", tmp_path / "a.pt")
+
+
 def test_a_checkpoint_of_other_settings_or_none_at_all_is_refused(tmp_path):
     pictures = squares(BATCH)
     path = tmp_path / "c.pt"
