@@ -444,6 +444,59 @@ def attacks() -> str:
     return f"Load average {run['load_average']:.0f}, {run['cores']} cores.\n\n" + table(head, rows)
 
 
+def masks() -> str:
+    """How well the shipped detector of the tile finds it and cuts it out, on what it was not trained on."""
+    log = measured("edge_server/foreground/models/tile.json")
+    where = {
+        "unseen worlds": "other worlds, near and far",
+        "own rig of tile": "`tile`, its own 19 cameras",
+        "own rig of cell": "`cell`, as the hand sees it",
+        "own rig of scan": "`scan`, as the hand sees it",
+        "own rig of scan, from its rig": "the bench of `scan`, from the cameras of `tile`",
+    }
+    rows = []
+    for key, words in where.items():
+        boxes = log["quality"]["tile_int8"][key]
+        ours, cut = (log["masks"][name][key] for name in ("tile_int8", "tile_int8, grabcut"))
+        alarms = ours["false_alarms"]
+        shares = [f"{x:.2f}" for x in (ours["iou"], ours["iou_p10"], cut["iou"])]
+        rows.append([
+            words, ours["images"], f"{boxes['map50']:.2f}", f"{boxes['map50_95']:.2f}",
+            f"{100 * ours['found']:.0f} %", *shares,
+            "" if alarms is None else f"{100 * alarms:.0f} % of {ours['empty_images']}",
+        ])  # fmt: skip
+    head = ["pictures", "that show it", "AP at IoU .5", "AP, .5 to .95", "found", "mask IoU, mean",
+            "one in ten below", "by GrabCut in the same boxes", "false alarms without it"]  # fmt: skip
+    return table(head, rows)
+
+
+def scanned() -> str:
+    """Meshes of the tile on its bench, by what its images were cut with (``edge-server bench scanned``)."""
+    run = measured("docs/results/scanned.json")["scanned"]
+    names = {
+        "whole images": "nothing: whole images",
+        "whole images, mesh cut to a box by hand": "a box in space by hand",
+        "box": "the detector's boxes", "grabcut": "GrabCut in its boxes", "detector": "the detector's masks",
+        "true masks": "true masks",
+    }  # fmt: skip
+    rows = []
+    for key, words in names.items():
+        row = run["rows"][key]
+        if "failed" in row:
+            rows.append([words, "", row["failed"], "", "", "", ""])
+            continue
+        rows.append([
+            words, f"{row['iou']:.2f}" if "iou" in row else "", f"{row['chamfer_mm']:.1f}",
+            f"{row['accuracy_mm']:.1f}", f"{row['completeness_mm']:.1f}", f"{100 * row['complete']:.0f} %",
+            f"{100 * row['precise']:.0f} %",
+        ])  # fmt: skip
+    head = ["cut with", "mask IoU", "chamfer, mm", "mesh to tile, mm", "tile to mesh, mm", "tile within 3 mm",
+            "mesh within 3 mm"]  # fmt: skip
+    size = run["size"]
+    about = f"{run['views']} images of {size} x {size}, `{run['field']}`, {run['steps']} steps, one seed."
+    return f"{about}\n\n{table(head, rows)}"
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "attacks": attacks,
     "soak": lambda: soak("soak"),
@@ -468,6 +521,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "hindsight": lambda: compared("hindsight"),
     "figures": figures,
     "verdicts": verdicts,
+    "masks": masks,
+    "scanned": scanned,
 }
 
 

@@ -12,11 +12,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from camera_node.bounds import Bounded, bounded
 from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
-from camera_node.synthetic.render import CameraRenderer, Image, World
-from freshfield.geometry import Array, Pinhole
+from camera_node.synthetic.placement import place_static
+from camera_node.synthetic.render import CameraRenderer, Image, World, cast_rays
+from freshfield.geometry import Array, Pinhole, world_rays
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, read_section
 
@@ -72,8 +76,9 @@ class Scene:
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out. target: the point (3,) that cameras
     look at, or away from. bounds (2, 3): lower and upper corner in metres of everything that can be seen,
     except an occluder. period_s: frames repeat after this time, a multiple of 0.6 s. moving: False if every
-    instant is the same. static_key: identifies the static parts of scenes with a motion_seed, whose
-    renderers share what they hold of these; None otherwise.
+    instant is the same. object_parts: so many of the world's static parts, from the first, are the object
+    that is looked at; None: all of them. static_key: identifies the static parts of scenes with a
+    motion_seed, whose renderers share what they hold of these; None otherwise.
     """
 
     name: str
@@ -84,6 +89,7 @@ class Scene:
     bounds: Array
     period_s: float
     moving: bool = True
+    object_parts: int | None = None
     static_key: str | None = field(default=None, repr=False, compare=False)
     _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
 
@@ -115,6 +121,16 @@ class Scene:
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
         """A renderer for any other camera."""
         return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
+
+    def object_mask(self, camera: Pinhole, camera_to_world: Array) -> NDArray[np.bool_]:
+        """Which pixels (H, W) of a camera show the object (``object_parts``), by the rays through their
+        centres; what moves hides nothing here."""
+        origin, rays = world_rays(camera, camera_to_world)
+        rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
+        placed = place_static(self.world.static_parts)
+        _, which = cast_rays(origin, rays, placed, np.full(rays.shape[1], np.inf))
+        count = len(placed.parts) if self.object_parts is None else self.object_parts
+        return np.asarray(((which >= 0) & (which < count)).reshape(camera.height, camera.width))
 
     def with_world(self, world: World, period_s: float | None = None, moving: bool | None = None) -> Scene:
         """The same cameras in another world (an effect adds to it). None: as before."""

@@ -15,7 +15,18 @@ from typing import Any
 
 from freshfield.scenario import read_section
 
-DEFAULT, GRABCUT, BOX, OWN = "default", "grabcut", "box", "detector"
+DEFAULT, TILE, GRABCUT, BOX, OWN = "default", "tile", "grabcut", "box", "detector"
+MODELS = Path(__file__).parent / "models"
+# A detector that we ship for one object, by name: its file in ``MODELS``.
+OBJECTS = {TILE: "tile_int8.onnx"}
+# Why an image is used whole, by the name of its count in ``foreground.Counts``.
+WHY = {
+    "not_detected": "nothing was found in it",
+    "empty_box": "the box has no area within it",
+    "empty_mask": "no pixel of the box was found to be the object",
+    "full_mask": "all of it was found to be the object",
+    "failed": "the model failed on it",
+}
 Four = tuple[float, float, float, float]
 
 
@@ -27,12 +38,13 @@ class ForegroundError(ValueError):
 class ForegroundConfig:
     """The section ``edge.foreground`` of a scenario.
 
-    detector: YOLO detection or segmentation ONNX (v8, v11), relative to the scenario, or ``default``, the
-    small one shipped for our own scenes. box: [left, top, right, bottom] as shares of the image, instead of a
-    detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum score;
-    of several detections the surest counts. margin: added to each side of a detected box, as a share of it.
-    segment: ``detector`` (its own masks, of a segmentation model), ``grabcut`` or ``box`` (the
-    whole box); none: the detector's masks if it has some, else grabcut.
+    detector: YOLO detection or segmentation ONNX (v8, v11), relative to the scenario, or a shipped one:
+    ``tile`` finds the tile and gives its masks (``edge-server train-detector --of tile``), ``default``
+    people, carts, balls and drums of our scenes. box: [left, top, right, bottom] as shares of the image,
+    instead of a detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum
+    score; of several detections the surest counts. margin: added to each side of a detected box, as a share
+    of it. segment: ``detector`` (its own masks, of a segmentation model), ``grabcut`` or ``box`` (the whole
+    box); none: the detector's masks if it has some, else grabcut.
     iterations: of grabcut. side: longest side, pixels, for grabcut; the mask is then enlarged.
     doubt: supervision weight, 0 to 1, of background pixels within the box, against 1 outside: a false hole in
     the object contradicts all other views, an unsupervised pixel does not.
@@ -71,6 +83,6 @@ def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundCon
     """Read the section ``edge.foreground`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
     config = read_section(ForegroundConfig, values, f"{scenario}: edge.foreground")
-    if config.detector in (None, DEFAULT):
+    if config.detector in (None, DEFAULT, *OBJECTS):
         return config
     return replace(config, detector=str(scenario.parent / str(config.detector)))

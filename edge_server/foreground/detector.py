@@ -18,7 +18,7 @@ from edge_server.embed import EmbeddingError, model_path
 from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, parse_model
 from edge_server.embed.embedder import open_session, reason_of
 from edge_server.embed.letterbox import blob, checked
-from edge_server.foreground import ForegroundError
+from edge_server.foreground import MODELS, OBJECTS, ForegroundError
 
 Array = NDArray[np.float64]
 
@@ -40,11 +40,11 @@ class Detection:
 
 
 class Detector:
-    """A YOLO detection or segmentation model. path: its ONNX file, or ``default`` for the shipped one.
-    ForegroundError: the file is missing or unusable."""
+    """A YOLO detection or segmentation model. path: its ONNX file, or the name of a shipped one (``default``,
+    ``OBJECTS``). ForegroundError: the file is missing or unusable."""
 
     def __init__(self, path: str) -> None:
-        file = model_path(path)
+        file = MODELS / OBJECTS[path] if path in OBJECTS else model_path(path)
         self.name = file.name
         self._session = open_model(file)
         image = self._session.get_inputs()[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -12,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.foreground import BOX, DEFAULT, OWN, ForegroundConfig, ForegroundError
+from edge_server.foreground import BOX, DEFAULT, OBJECTS, OWN, WHY, ForegroundConfig, ForegroundError
 from edge_server.foreground.segment import Box, Segmenter, make_segmenter, whole_box
+
+log = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8]
 Weight = NDArray[np.float32]
@@ -40,6 +43,7 @@ class Foreground:
         self.counts = Counts()
         self.seconds = 0.0
         self._boxes, self._segmenter = boxes, segmenter
+        self._said: set[tuple[str, str]] = set()
 
     def apply(self, camera: str, image: Image) -> tuple[Image, Weight | None]:
         """Mask uint8 ``image`` (H, W, 3 or 4). Return RGBA (H, W, 4) and each pixel's supervision weight,
@@ -54,6 +58,7 @@ class Foreground:
         counted = found if isinstance(found, str) else "masked"
         setattr(self.counts, counted, getattr(self.counts, counted) + 1)
         if isinstance(found, str):
+            self._say(camera, found)
             return image, None
         mask, box = found
         out = np.empty((*image.shape[:2], 4), np.uint8)
@@ -67,6 +72,12 @@ class Foreground:
         inside = weight[box[1] : box[3], box[0] : box[2]]
         inside[~mask[box[1] : box[3], box[0] : box[2]]] = doubt
         return out, weight
+
+    def _say(self, camera: str, why: str) -> None:
+        """Log the first image of a camera that passes whole, for each reason."""
+        if camera and (camera, why) not in self._said:
+            self._said.add((camera, why))
+            log.warning("camera %s: an image is used whole: %s (further ones: edge.json)", camera, WHY[why])
 
     def _mask(self, camera: str, image: Image) -> tuple[NDArray[np.bool_], Box] | str:
         """Object mask (H, W) and box; if the image passes unchanged, why: a name of ``Counts``."""
@@ -157,7 +168,7 @@ def make_foreground(config: ForegroundConfig) -> Foreground:
         if error.name is None or error.name.split(".")[0] not in ("onnx", "onnxruntime"):
             raise
         package = error.name.split(".")[0]
-        what = "the shipped detector" if config.detector == DEFAULT else "an ONNX model"
+        what = "the shipped detector" if config.detector in (DEFAULT, *OBJECTS) else "an ONNX model"
         raise ForegroundError(
             f"{what} needs {package}, which is not installed: pip install 'freshfield[embed]'"
         ) from None

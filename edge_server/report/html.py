@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
+from edge_server.foreground import WHY
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
@@ -47,7 +48,7 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
         _section("Fidelity over time", _figure(figures, "fidelity")),
         _section("Mesh", _mesh_table(report)),
         _section("Age", _figure(figures, "ages"), _details("By camera", _age_table(report))),
-        _section("Updates", _figure(figures, "updates"), _updates_line(report)),
+        _section("Updates", _figure(figures, "updates"), _updates_line(report), _cut_line(report)),
         _section("What accuracy costs in time", _figure(figures, "frontier")),
         _section("Frames", _frames_table(report), _details("By camera", _frames_by_camera(report))),
         _section("Channel", _figure(figures, "channel"), _channel_table(report)),
@@ -189,6 +190,19 @@ def _updates_line(report: Report) -> str:
     return (
         f"<p>{u['count']} updates, median {_n(u['ms_p50'], 0)} ms, 95 % within {_n(u['ms_p95'], 0)} ms{met}; "
         f"the first {_n(first, 1)} s after the edge started{idle}{damaged}{shed}.</p>"
+    )
+
+
+def _cut_line(report: Report) -> str:
+    """How many images the foreground was cut out of, and how many passed whole."""
+    cut = report.get("foreground")
+    if not cut:
+        return ""
+    whole = [f"{cut[name]} ({why})" for name, why in WHY.items() if cut.get(name)]
+    spent = _n(cut["ms_per_image"], 0, " ms")
+    return (
+        f"<p>The object was cut out of {cut['masked']} images, {spent} each; "
+        f"used whole: {', '.join(whole) or 'none'}.</p>"
     )
 
 

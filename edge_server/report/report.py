@@ -66,6 +66,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
         "age_ms": ages(files.ages),
         "updates": updates(series, edge.get("updates") or {}),
+        "foreground": edge.get("foreground"),
         "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
         "channel": {
             name: files.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")

@@ -27,6 +27,7 @@ NAMES = {
     "lego",
     "kitchen",
     "cell",
+    "scan",
     "card",
     "thesis",
 }

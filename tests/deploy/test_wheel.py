@@ -75,7 +75,8 @@ def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     scenarios = ROOT / "deploy/scenarios"
     shipped = {f"freshfield/scenarios/{path.relative_to(scenarios)}" for path in scenarios.rglob("*.*")}
-    models = {f"edge_server/embed/models/{p.name}" for p in (ROOT / "edge_server/embed/models").iterdir()}
+    folders = [ROOT / f"edge_server/{room}/models" for room in ("embed", "foreground")]
+    models = {str(path.relative_to(ROOT)) for folder in folders for path in folder.iterdir()}
     assert shipped <= names and models <= names
     assert {"freshfield_up/cli.py", "edge_server/frontier.json"} <= names
     assert not [name for name in names if name.startswith(("tests/", "deploy/", "docs/"))]

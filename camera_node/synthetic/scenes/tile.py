@@ -1,7 +1,8 @@
 """Scene ``tile``: a static inspection object in the manner of the thesis's reactor tile (section 4.7).
 
 A metal carrier holds two rows of slightly inclined, grooved segments (castellations) with bolts, paint
-marks and damage; the background is plain. Cameras stand on a half-hemisphere; cam00 is held out.
+marks and damage; the background is plain, or with ``bench`` a workbench on which other things stand. Cameras
+stand on a half-hemisphere; cam00 is held out.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.motion import PERIOD_UNIT_S
-from camera_node.synthetic.placement import Part
+from camera_node.synthetic.placement import Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import FOV_DEG, BaseParams, Scene, pinhole
-from camera_node.synthetic.shapes import Box, Cylinder, Sphere
+from camera_node.synthetic.shapes import Box, Cylinder, Quad, Sphere
 from freshfield.geometry import Array
 
 _BACKGROUND = (0.80, 0.83, 0.86)
 _TARGET = (0.0, 0.0, 0.03)
 _RADIUS_M = 0.85
+BOTTOM_M = -0.06
+_BENCH_BOUNDS = [[-1.6, -0.65, -0.4], [1.6, 0.72, 1.4]]
 # cam00, then three rings of the half-hemisphere on the -y side.
 _ANGLES_DEG = [(0.0, 40.0)] + [
     (a, e)
@@ -35,7 +38,10 @@ _ANGLES_DEG = [(0.0, 40.0)] + [
 
 @dataclass(frozen=True)
 class Params(BaseParams):
+    """bench: the tile lies on a workbench before a wall, with tools, boxes and scrap around it."""
+
     horizontal_fov_deg: float = bounded(40.0, *FOV_DEG)
+    bench: bool = False
 
 
 def build(params: Params) -> Scene:
@@ -45,16 +51,24 @@ def build(params: Params) -> Scene:
         points=grid, strength=0.95, falloff_m=1.2, tint=(1.0, 0.97, 0.92),
         ambient_below=(0.28, 0.29, 0.31), ambient_above=(0.50, 0.52, 0.54),
     )  # fmt: skip
+    tile = object_parts()
+    around = _bench() if params.bench else []
     return Scene(
         name="tile",
         params=params,
         cameras=build_rig(_ANGLES_DEG, _TARGET, _RADIUS_M, params.count, pinhole(params)),
         target=_TARGET,
-        world=World(tuple(_carrier() + _segments() + _bolts()), (), light, _BACKGROUND),
-        bounds=np.array([[-0.26, -0.20, -0.07], [0.26, 0.20, 0.13]]),
+        world=World((*tile, *around), (), light, _BACKGROUND),
+        bounds=np.array(_BENCH_BOUNDS if params.bench else [[-0.26, -0.20, -0.07], [0.26, 0.20, 0.13]]),
         period_s=PERIOD_UNIT_S,
         moving=False,
+        object_parts=len(tile),
     )
+
+
+def object_parts() -> list[Part]:
+    """The tile itself, its lowest point ``BOTTOM_M`` high."""
+    return _carrier() + _segments() + _bolts()
 
 
 def _at(x: float, y: float, z: float, tilt_x_deg: float = 0.0, tilt_y_deg: float = 0.0) -> Array:
@@ -145,3 +159,36 @@ def _bolts() -> list[Part]:
     # A round inspection probe left on the carrier: something that is not flat.
     parts.append(Part(Sphere(0.030), spotted, _at(0.19, -0.13, 0.02)))
     return parts
+
+
+def _bench() -> list[Part]:
+    """A workbench with a wall behind it, and what lies on it, none of it part of the tile."""
+    wood = tx.Planks((0.66, 0.50, 0.34), (0.52, 0.37, 0.23), 0.16, 0.9)
+    wall = tx.Brick((0.58, 0.60, 0.63), (0.44, 0.45, 0.47), 0.22, 0.075, 0.008)
+    steel = tx.Noise(tx.Plain((0.50, 0.51, 0.54)), 0.04, 0.12, seed=71, stretch=4.0)
+    hazard = tx.Stripes((0.95, 0.76, 0.12), (0.16, 0.15, 0.15), 0.07, soft=0.006)
+    brass = tx.Stripes((0.80, 0.62, 0.26), (0.62, 0.44, 0.16), 1 / 6, soft=0.06)
+    orange = tx.Checker((0.90, 0.42, 0.12), (0.98, 0.90, 0.78), 1 / 8, 0.5, 0.05)
+    books = tx.Stripes((0.20, 0.30, 0.46), (0.86, 0.83, 0.76), 0.024, 1, 0.004)
+    top, low = Box((0.85, 0.65, 0.02)), BOTTOM_M
+
+    def standing(shape: Box | Cylinder | Sphere, height: float, texture: tx.Texture, x: float, y: float,
+                 turn_deg: float = 0.0) -> Part:  # fmt: skip
+        return Part(shape, texture, at(x, y, low + height, turn_deg))
+
+    return [
+        Part(top, wood, at(0.0, 0.0, low - 0.02)),
+        Part(Quad((1.6, 0.9)), wall, facing((1, 0, 0), (0, 0, 1), (0.0, 0.72, 0.5)), casts_shadow=False),
+        standing(Box((0.12, 0.07, 0.05)), 0.05, tx.Plain((0.72, 0.16, 0.14)), -0.46, 0.26, 25.0),
+        standing(Box((0.10, 0.08, 0.02)), 0.02, steel, 0.42, 0.02, 15.0),
+        standing(Box((0.044, 0.062, 0.022)), 0.022, steel, 0.40, 0.03, 60.0),
+        standing(Box((0.09, 0.12, 0.03)), 0.03, books, 0.10, 0.40, 8.0),
+        standing(Box((0.20, 0.03, 0.03)), 0.03, hazard, -0.08, -0.36, -6.0),
+        standing(Cylinder(0.045, 0.06), 0.06, tx.Plain((0.14, 0.42, 0.33)), 0.38, 0.34),
+        standing(Cylinder(0.030, 0.045), 0.045, brass, -0.40, -0.12),
+        standing(Cylinder(0.020, 0.012), 0.012, brass, -0.33, 0.05),
+        standing(Cylinder(0.014, 0.010), 0.010, brass, 0.31, -0.14),
+        standing(Sphere(0.04), 0.04, orange, 0.44, -0.30),
+        standing(Sphere(0.03), 0.03, tx.Plain((0.20, 0.22, 0.62)), -0.30, -0.25),
+        standing(Box((0.05, 0.05, 0.05)), 0.05, tx.Plain((0.88, 0.86, 0.80)), -0.26, 0.38, 40.0),
+    ]

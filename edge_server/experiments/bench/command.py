@@ -48,6 +48,8 @@ growth     how cost grows with cameras, image size, speed and people, from room:
            shed; in virtual time; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
            each stage; needs the extra surface; not part of all
+scanned    meshes of the tile alone, of scenario scan: from images cut out by its detector, by GrabCut, by
+           true masks, and whole; needs the extras surface and embed; not part of all
 
 With --json FILE figures are written scene by scene as they are measured; at the end of a part also FILE
 with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
@@ -55,7 +57,7 @@ with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on
 
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
-MORE = ("embed", "foreground", "peer", "shown", "growth", "surface")
+MORE = ("embed", "foreground", "peer", "shown", "growth", "surface", "scanned")
 # Parts that store each figure as it comes, and skip what is known.
 _RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
 _MODULES = {"growth": "shown.growth", "drift": "track"}  # where a part is in no module of its own name

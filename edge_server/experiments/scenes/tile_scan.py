@@ -66,15 +66,17 @@ def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
 
 
 def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
-    """The surface that the scan's cameras see, see ``surface.metrics``."""
+    """The object's surface that the scan's cameras see, see ``surface.metrics``."""
     placed = place_static(scan.scene.world.static_parts)
+    parts = scan.scene.object_parts
+    parts = len(placed.parts) if parts is None else parts
     points, normals = [], []
     for view in scan.views:
         fine = view.intrinsics.scaled(_FINE)
         origin, rays = world_rays(fine, view.camera_to_world)
         rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
         t, which = cast_rays(origin, rays, placed, np.full(rays.shape[1], np.inf))
-        hit = np.flatnonzero(which >= 0)
+        hit = np.flatnonzero((which >= 0) & (which < parts))
         met = origin[:, None] + t[hit] * rays[:, hit]
         _, facing = surface_properties(placed, which[hit], met, rays[:, hit])
         seen = -(facing * rays[:, hit]).sum(axis=0) >= np.cos(np.deg2rad(STEEPEST_DEG))

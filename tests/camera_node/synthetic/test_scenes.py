@@ -69,6 +69,23 @@ def test_everything_seen_lies_within_the_bounds(name):
         assert np.isfinite(t).all() or name == "tile"
 
 
+def test_on_the_bench_the_tile_alone_is_the_object():
+    plain, bench = (
+        make_scene("tile", {"count": 5, "supersample": 1, **SMALL, "bench": b}) for b in (False, True)
+    )
+    assert bench.object_parts == plain.object_parts == len(plain.world.static_parts)
+    assert len(bench.world.static_parts) > bench.object_parts
+    for name, (lens, pose) in plain.cameras.items():
+        alone, among = plain.object_mask(lens, pose), bench.object_mask(lens, pose)
+        assert np.array_equal(alone, np.isfinite(plain.renderer(name).distance()))
+        assert not (among & ~alone).any() and among.sum() > 0.9 * alone.sum(), "something may stand before it"
+        origin, rays = world_rays(lens, pose)
+        t = bench.renderer(name).distance()
+        points = (origin + np.where(np.isfinite(t), t, 0.0)[..., None] * rays)[np.isfinite(t)]
+        assert len(points) > 1.5 * alone.sum()
+        assert (points >= bench.bounds[0] - 1e-6).all() and (points <= bench.bounds[1] + 1e-6).all()
+
+
 @pytest.mark.parametrize("speed", [0.05, 0.4, 1.0, 4.0])
 def test_the_cart_of_the_tower_moves_at_the_speed_asked_for(speed):
     scene = make_scene("tower", {"speed_m_per_s": speed, **SMALL})

@@ -114,6 +114,19 @@ def test_the_report_shows_frames_that_were_left_out_and_updates_that_made_no_ste
     assert "left out for lack of time: 17" in page and "without time for a step: 3" in page
 
 
+def test_the_report_says_of_how_many_images_the_object_was_cut_out_and_why_not_of_the_others(tmp_path):
+    write_run(tmp_path)
+    assert "cut out of" not in (build_report(tmp_path) and (tmp_path / "report.html").read_text())
+    edge = json.loads((tmp_path / "edge.json").read_text())
+    cut = {"masked": 41, "not_detected": 3, "empty_box": 0, "empty_mask": 0, "full_mask": 1, "failed": 0,
+           "ms_per_image": 2.4}  # fmt: skip
+    (tmp_path / "edge.json").write_text(json.dumps(edge | {"foreground": cut}))
+    assert build_report(tmp_path)["foreground"] == cut
+    page = (tmp_path / "report.html").read_text()
+    assert "The object was cut out of 41 images, 2 ms each; used whole: 3 (nothing was found in it)" in page
+    assert "1 (all of it was found to be the object)" in page
+
+
 def test_every_figure_is_drawn_and_inside_the_page(run):
     out, _ = run
     names = ["comparison", "fidelity", "ages", "updates", "channel", "processes"]

@@ -23,13 +23,13 @@ Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Images (n, 3, H, W) in [0, 1] -> output0 (n, 4 + kinds, cells)."""
 
 
-def measure(run: Run, dataset: LabeledImages) -> dict[str, Any]:
+def measure(run: Run, dataset: LabeledImages, kinds: Sequence[str] = KINDS) -> dict[str, Any]:
     """{map50, map50_95, by_kind: {kind: {ap50, ap50_95, true}}, images} over ``dataset``."""
     found: list[Array] = []
     for part in network_inputs(dataset.images, _BATCH):
-        found += [detections(out) for out in run(part)]
+        found += [detections(out[: 4 + len(kinds)]) for out in run(part)]
     by_kind = {}
-    for k, kind in enumerate(KINDS):
+    for k, kind in enumerate(kinds):
         true = [b[b[:, 4] == k, :4].astype(np.float64) for b in dataset.boxes]
         of_kind = [d[d[:, 5] == k, :5] for d in found]
         if total := sum(map(len, true)):

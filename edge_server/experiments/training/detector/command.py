@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -10,22 +11,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.common.arguments import command_parser, run_command
+from edge_server.experiments.common.arguments import at_least, command_parser, run_command
 
 DESCRIPTION = """\
-Train the small detector whose backbone gives the default embeddings, on variations of our own scenes.
+Train a small detector on variations of our own scenes: the one whose backbone gives the default embeddings,
+or one that finds an object to scan and cuts it out.
 
   edge-server train-detector --out runs/detector              # about 15 minutes on two cores
+  edge-server train-detector --of tile --out runs/tile        # about 20
   edge-server train-detector --quick --out runs/try           # a minute: everything once, little learnt
 
-Pictures and boxes are rendered (room, tower, tile with people, carts, balls and drums), the detector is
-trained, exported to ONNX in float32 and in static 8 bits, and each is measured on worlds and cameras that
-it has never seen. Ctrl-C stops after which the same command goes on; the same seed gives the same weights.
-In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality). Use one:
+Pictures and boxes are rendered (room, tower, tile with people, carts, balls and drums; --of tile: the tile
+among other things, with its masks), the detector is trained, exported to ONNX in float32 and in static 8
+bits, and each is measured on worlds and cameras that it has never seen. Ctrl-C stops after which the same
+command goes on; the same seed gives the same weights. --start begins from the weights of an
+earlier training. In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality), with
+--of tile tile_fp32.onnx and so on. Use one:
 
   edge: {embedding: {model: runs/detector/detector_fp32.onnx}}
+  edge: {foreground: {detector: runs/tile/tile_int8.onnx}}
 """
 HELD_OUT_WORLDS = 40
+SIDE = 128  # pixels, of the pictures
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         results = run(args)
         print(json.dumps(results) if args.json else show(results))
 
-    stopped = f"the same command goes on with what is in {args.out}"
+    stopped = f"the same command goes on with what is in {folder(args)}"
     return run_command("train-detector", work, (CheckpointError, FloatingPointError), stopped)
 
 
@@ -55,41 +62,76 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     """Run all steps; returns the contents of detector.json."""
     from edge_server.experiments.training.detector import export
     from edge_server.experiments.training.detector.average_precision import measure
-    from edge_server.experiments.training.detector.dataset import of_own_rigs, render
+    from edge_server.experiments.training.detector.dataset import SUBJECTS, of_own_rigs, render
     from edge_server.experiments.training.detector.network import parameters
-    from edge_server.experiments.training.detector.scenes import KINDS
     from edge_server.experiments.training.detector.training import Settings, train
     from edge_server.report.machine import machine, versions
     from freshfield.files import write_json
 
-    settings = Settings(args.seed, worlds=20, epochs=2) if args.quick else Settings(args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
-    side, pictures = settings.side, args.out / "pictures"
-    known = render("train", settings.worlds, side, args.seed, pictures)
-    unseen = render("held-out", 4 if args.quick else HELD_OUT_WORLDS, side, args.seed, pictures)
-    model, log = train(known, settings, args.out / "checkpoint.pt")
-    fp32, int8 = args.out / "detector_fp32.onnx", args.out / "detector_int8.onnx"
-    export.export_fp32(model, side, fp32, {"author": "freshfield", "seed": args.seed})
-    spread = export.add_projection(fp32, export.pooled_features(fp32, known.images))
+    worlds, epochs, held = (20, 2, 4) if args.quick else (args.worlds, args.epochs, HELD_OUT_WORLDS)
+    subject, kinds, out = args.of, SUBJECTS[args.of], folder(args)
+    start = "" if args.start is None else file_digest(args.start)
+    settings = Settings(args.seed, SIDE, worlds, epochs, args.rate, subject=subject, start=start)
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = out / "pictures"
+    known = render("train", worlds, SIDE, args.seed, pictures, subject)
+    unseen = render("held-out", held, SIDE, args.seed, pictures, subject)
+    model, log = train(known, settings, out / "checkpoint.pt", args.start)
+    name = "detector" if subject == "scenes" else subject
+    fp32, int8 = out / f"{name}_fp32.onnx", out / f"{name}_int8.onnx"
+    export.export_fp32(model, SIDE, fp32, {"author": "freshfield", "seed": args.seed}, kinds)
+    more: dict[str, Any] = {}
+    if known.masks is None:
+        more["projection_variance"] = export.add_projection(fp32, export.pooled_features(fp32, known.images))
     step = max(1, len(known) // export.CALIBRATION_IMAGES)
     export.export_int8(fp32, known.images[::step][: export.CALIBRATION_IMAGES], int8)
     quality: dict[str, Any] = {}
-    rigs = of_own_rigs(side)
+    sets = {"unseen worlds": unseen}
+    sets |= {f"own rig of {where}": p for where, p in of_own_rigs(SIDE, subject).items()}
     for path in (fp32, int8):
         detect = export.runner(path)
-        sets = {"unseen worlds": unseen, **{f"own rig of {name}": p for name, p in rigs.items()}}
-        quality[path.stem] = {name: measure(detect, p) for name, p in sets.items()}
+        quality[path.stem] = {where: measure(detect, p, kinds) for where, p in sets.items()}
         quality[path.stem]["bytes"] = path.stat().st_size
+    if known.masks is None:
+        more["int8_agreement"] = _agreement(fp32, int8, unseen.images)
+    else:
+        more["masks"] = _masks(fp32, int8, sets)
     results = {
-        "settings": asdict(settings), "kinds": KINDS, "parameters": parameters(model),
+        "settings": asdict(settings), "kinds": kinds, "parameters": parameters(model),
         "pictures": {"train": len(known), "held_out": len(unseen)}, "boxes": sum(map(len, known.boxes)),
-        "quality": quality, "projection_variance": spread,
-        "int8_agreement": _agreement(fp32, int8, unseen.images), "epochs": log,
+        "quality": quality, **more, "epochs": log,
         "trained_s": round(sum(row["seconds"] for row in log), 1),
         "machine": machine(), "versions": versions(),
     }  # fmt: skip
-    write_json(args.out / "detector.json", results, indent=1)
+    write_json(out / f"{name}.json", results, indent=1)
     return results
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal. CheckpointError: it cannot be read."""
+    from edge_server.experiments.training.detector.training import CheckpointError
+
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"--start {path}: cannot be read: {error.strerror}") from None
+
+
+def folder(args: argparse.Namespace) -> Path:
+    """Where everything is written."""
+    default = Path("runs/detector" if args.of == "scenes" else f"runs/detector-{args.of}")
+    return default if args.out is None else Path(args.out)
+
+
+def _masks(fp32: Path, int8: Path, sets: dict[str, Any]) -> dict[str, Any]:
+    """Masks of both files against the truth, and of GrabCut in the boxes of the smaller one."""
+    from edge_server.experiments.training.detector.mask_quality import measure_masks
+
+    ways = ((fp32.stem, fp32, None), (int8.stem, int8, None), (f"{int8.stem}, grabcut", int8, "grabcut"))
+    return {
+        name: {where: measure_masks(path, p, segment) for where, p in sets.items()}
+        for name, path, segment in ways
+    }
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
@@ -106,22 +148,40 @@ def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
 
 def show(results: dict[str, Any]) -> str:
     """The results as text."""
-    pictures, agreement = results["pictures"]["train"], results["int8_agreement"]["cosine_mean"]
+    pictures = results["pictures"]["train"]
     lines = [f"{results['parameters']} parameters, {pictures} pictures, {results['boxes']} boxes"]
     for name, sets in results["quality"].items():
         lines.append(f"{name}: {sets['bytes'] / 1e3:.0f} kB")
         for where, found in sets.items():
             if isinstance(found, dict):
                 lines.append(f"  {where:20} mAP@.5 {found['map50']:.3f}  mAP@.5:.95 {found['map50_95']:.3f}")
-    lines.append(f"embedding of int8 against fp32: mean cosine {agreement:.4f}")
+    for name, by_set in results.get("masks", {}).items():
+        lines.append(f"masks of {name}:")
+        for where, found in by_set.items():
+            words = [f"found {100 * found['found']:.1f} %", f"IoU {found['iou'] or 0.0:.3f}"]
+            if found["false_alarms"] is not None:
+                words.append(f"false alarms {100 * found['false_alarms']:.1f} %")
+            lines.append(f"  {where:30} {', '.join(words)}")
+    if "int8_agreement" in results:
+        agreement = results["int8_agreement"]["cosine_mean"]
+        lines.append(f"embedding of int8 against fp32: mean cosine {agreement:.4f}")
     return "\n".join(lines)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-detector", DESCRIPTION)
     add = parser.add_argument
-    add("--out", type=Path, default=Path("runs/detector"), metavar="DIR", help="[%(default)s]")
+    add("--of", choices=("scenes", "tile"), default="scenes", help="what it finds: people, carts, balls and "
+        "drums of our scenes, or the tile, with its mask [%(default)s]")  # fmt: skip
+    add("--out", type=Path, metavar="DIR", help="[runs/detector, of tile runs/detector-tile]")
     add("--seed", type=int, default=0, help="[%(default)s]")
+    add(
+        "--worlds", type=at_least(20), default=400, metavar="N",
+        help="to train on, 8 pictures each [%(default)s]",
+    )  # fmt: skip
+    add("--epochs", type=at_least(1), default=18, metavar="N", help="[%(default)s]")
+    add("--rate", type=float, default=2e-3, help="of learning [%(default)s]")
+    add("--start", type=Path, metavar="FILE", help="checkpoint.pt of an earlier training to begin from")
     add("--quick", action="store_true", help="20 worlds, 2 epochs: to try it out")
     add("--json", action="store_true", help="print detector.json instead of a summary")
     return parser

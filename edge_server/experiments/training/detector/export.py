@@ -6,7 +6,7 @@ import contextlib
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +41,14 @@ AXES = 64
 _LEAST_SPREAD = 1e-3
 
 
-def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any]) -> None:
+def export_fp32(
+    model: Detector, side: int, path: Path, about: dict[str, Any], kinds: Sequence[str] = KINDS
+) -> None:
     """Write the detector with any number of images of any size whose sides are multiples of 16."""
     model = model.eval()
+    axes = {INPUT: {0: "n", 2: "height", 3: "width"}, "output0": {0: "n", 2: "cells"}}
+    if model.prototypes:
+        axes["output1"] = {0: "n", 2: "mask_height", 3: "mask_width"}
     with warnings.catch_warnings():
         # The newer exporter needs another package and gives the same operators.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -54,12 +59,13 @@ def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any]) -
             dynamo=False,
             opset_version=OPSET,
             input_names=[INPUT],
-            output_names=["output0"],
-            dynamic_axes={INPUT: {0: "n", 2: "height", 3: "width"}, "output0": {0: "n", 2: "cells"}},
+            output_names=[name for name in axes if name != INPUT],
+            dynamic_axes=axes,
         )
     exported = onnx.load(str(path))
     onnx.checker.check_model(exported)
-    _describe(exported, side, about)
+    task = "segment" if model.prototypes else "detect"
+    _describe(exported, side, {"task": task, **about}, kinds)
     onnx.save(exported, str(path))
 
 
@@ -70,9 +76,14 @@ def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
     """
     model = onnx.load(str(fp32))
     heads = ("/model.10/", "/model.11/")
-    # From the last convolutions of the heads on: logits and distances need their full range.
+    # From the last convolutions of the heads and of the prototypes on: logits and distances need their full
+    # range.
     inner = [n.name for n in model.graph.node if not n.name.startswith("/model.")]
-    last = [n.name for n in model.graph.node if n.name.startswith(heads) and ".1/" in n.name]
+    last = [
+        n.name
+        for n in model.graph.node
+        if (n.name.startswith(heads) and ".1/" in n.name) or n.name.startswith("/model.12/out/")
+    ]
     with _quiet(), tempfile.TemporaryDirectory(prefix="freshfield-int8-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(fp32), str(prepared), skip_symbolic_shape=True)
@@ -150,10 +161,10 @@ def _session(model: str | bytes) -> ort.InferenceSession:
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any]) -> None:
+def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any], kinds: Sequence[str]) -> None:
     """Set the metadata that the family's exporter writes, so that its tools can read the file."""
-    names = "{" + ", ".join(f"{k}: '{kind}'" for k, kind in enumerate(KINDS)) + "}"
-    values = {"task": "detect", "stride": "16", "imgsz": f"[{side}, {side}]", "names": names, **about}
+    names = "{" + ", ".join(f"{k}: '{kind}'" for k, kind in enumerate(kinds)) + "}"
+    values = {"stride": "16", "imgsz": f"[{side}, {side}]", "names": names, **about}
     _set_metadata(model, {key: str(value) for key, value in values.items()})
 
 

@@ -66,59 +66,95 @@ class SPPF(nn.Module):
 
 
 class Head(nn.Module):
-    """Head of one map: scores of the kinds as logits, and distances to the four sides of the box in
-    strides."""
+    """Head of one map: scores of the kinds as logits, distances to the four sides of the box in strides, and
+    of a detector with masks the weights of their prototypes."""
 
-    def __init__(self, channels: int, kinds: int) -> None:
+    def __init__(self, channels: int, kinds: int, prototypes: int = 0) -> None:
         super().__init__()
         self.box = nn.Sequential(Conv(channels, 32, 3), nn.Conv2d(32, 4, 1))
         self.score = nn.Sequential(Conv(channels, 32, 3), nn.Conv2d(32, kinds, 1))
         nn.init.constant_(self.score[1].bias, -4.6)  # type: ignore[arg-type]  # one cell in a hundred holds something
+        self.mask = nn.Sequential(Conv(channels, 16, 3), nn.Conv2d(16, prototypes, 1)) if prototypes else None
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        return F.softplus(self.box(x)), self.score(x)
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        return F.softplus(self.box(x)), self.score(x), None if self.mask is None else self.mask(x)
+
+
+class Prototypes(nn.Module):
+    """Maps at half the image's side whose weighted sums are masks, as logits: the neck's fine map, enlarged
+    twice, each time beside the backbone's map of that size."""
+
+    def __init__(self, fine: int, quarter: int, half: int, prototypes: int) -> None:
+        super().__init__()
+        self.up = nn.Upsample(scale_factor=2, mode="nearest")
+        self.cv1 = Conv(fine + quarter, quarter, 3)
+        self.cv2 = Conv(quarter + half, half, 3)
+        self.cv3 = Conv(half, half, 3)
+        self.out = nn.Conv2d(half, prototypes, 1)
+
+    def forward(self, fine: Tensor, quarter: Tensor, half: Tensor) -> Tensor:
+        x = self.cv1(torch.cat([self.up(fine), quarter], 1))
+        return self.out(self.cv3(self.cv2(torch.cat([self.up(x), half], 1))))
 
 
 class Detector(nn.Module):
     """Images (B, 3, H, W) in [0, 1], sides multiples of 16, -> output0 (B, 4 + kinds, cells): centre, width
-    and height in pixels and a score for each kind, as every detector of the family gives them."""
+    and height in pixels and a score for each kind, as every detector of the family gives them.
 
-    def __init__(self, kinds: int) -> None:
+    With ``prototypes``, as every segmentation model of the family: output0 (B, 4 + kinds + prototypes, cells)
+    has the weights of the mask's prototypes below, and output1 (B, prototypes, H / 2, W / 2) is these."""
+
+    def __init__(self, kinds: int, prototypes: int = 0) -> None:
         super().__init__()
         a, b, c, d = WIDTHS
-        self.kinds = kinds
+        self.kinds, self.prototypes = kinds, prototypes
         self.model = nn.ModuleList(
             [
                 Conv(3, a, 3, 2), Conv(a, b, 3, 2), C2f(b, b), Conv(b, c, 3, 2), C2f(c, c, 2),
                 Conv(c, d, 3, 2), C2f(d, d), SPPF(d),
                 nn.Upsample(scale_factor=2, mode="nearest"), C2f(c + d, c, residual=False),
-                Head(c, kinds), Head(d, kinds),
+                Head(c, kinds, prototypes), Head(d, kinds, prototypes),
             ]
         )  # fmt: skip
+        if prototypes:
+            self.model.append(Prototypes(c, b, a, prototypes))
 
     def raw(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Boxes (B, cells, 4) as left, top, right, bottom in pixels, logits (B, cells, kinds), and the cells'
         centres and strides (cells, 3)."""
+        return self.raw_with_masks(x)[:3]
+
+    def raw_with_masks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """``raw``, and of a detector with masks each cell's weights (B, cells, prototypes) and the prototypes
+        (B, prototypes, H / 2, W / 2), else None."""
         m = self.model
-        for k in range(5):
-            x = m[k](x)
-        fine = x
+        half = m[0](x)
+        quarter = m[2](m[1](half))
+        fine = m[4](m[3](quarter))
         coarse = m[7](m[6](m[5](fine)))
         fine = m[9](torch.cat([m[8](coarse), fine], 1))
-        boxes, logits, cells = [], [], []
+        boxes, logits, cells, weights = [], [], [], []
         for head, stride, feature in ((m[10], STRIDES[0], fine), (m[11], STRIDES[1], coarse)):
-            side, score = head(feature)
+            side, score, weight = head(feature)
             centre = _cells(feature, stride)
             side = side.flatten(2).transpose(1, 2) * stride
             boxes.append(torch.cat([centre[:, :2] - side[..., :2], centre[:, :2] + side[..., 2:]], 2))
             logits.append(score.flatten(2).transpose(1, 2))
             cells.append(centre)
-        return torch.cat(boxes, 1), torch.cat(logits, 1), torch.cat(cells)
+            if weight is not None:
+                weights.append(weight.flatten(2).transpose(1, 2))
+        found = torch.cat(boxes, 1), torch.cat(logits, 1), torch.cat(cells)
+        if not weights:
+            return *found, None, None
+        return *found, torch.cat(weights, 1), m[12](fine, quarter, half)
 
-    def forward(self, x: Tensor) -> Tensor:
-        boxes, logits, _ = self.raw(x)
+    def forward(self, x: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        boxes, logits, _, weights, prototypes = self.raw_with_masks(x)
         low, high = boxes[..., :2], boxes[..., 2:]
-        return torch.cat([(low + high) / 2, high - low, logits.sigmoid()], 2).transpose(1, 2)
+        table = [(low + high) / 2, high - low, logits.sigmoid()]
+        if weights is None or prototypes is None:
+            return torch.cat(table, 2).transpose(1, 2)
+        return torch.cat([*table, weights], 2).transpose(1, 2), prototypes
 
 
 def _cells(feature: Tensor, stride: int) -> Tensor:

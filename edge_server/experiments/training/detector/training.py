@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.training.detector.dataset import LabeledImages
-from edge_server.experiments.training.detector.loss import detection_loss
+from edge_server.experiments.training.detector.dataset import SUBJECTS, LabeledImages
+from edge_server.experiments.training.detector.loss import assign_batch, detection_loss, mask_loss
 from edge_server.experiments.training.detector.network import Detector
-from edge_server.experiments.training.detector.scenes import KINDS, MIN_SIDE_PX, Boxes
+from edge_server.experiments.training.detector.scenes import MIN_SIDE_PX, Boxes, boxes_of
 
 BATCH = 32
 WARMUP_STEPS = 100
 # The exported weights are an average over about this many steps.
 AVERAGED_STEPS = 300
+PROTOTYPES = 8  # of a detector with masks
 
 
 class CheckpointError(ValueError):
@@ -33,7 +34,8 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that decide the weights bit for bit; threads too, because they split sums."""
+    """Settings that decide the weights bit for bit; threads too, because they split sums. subject: of
+    ``dataset.SUBJECTS``. start: SHA-256 of the checkpoint whose weights it begins from; empty: none."""
 
     seed: int = 0
     side: int = 128
@@ -41,20 +43,32 @@ class Settings:
     epochs: int = 18
     rate: float = 2e-3
     threads: int = 1
+    subject: str = "scenes"
+    start: str = ""
 
 
 def train(
-    dataset: LabeledImages, settings: Settings, checkpoint: Path
+    dataset: LabeledImages, settings: Settings, checkpoint: Path, start: Path | None = None
 ) -> tuple[Detector, list[dict[str, Any]]]:
-    """Train, or resume from ``checkpoint``. Returns the averaged detector in eval mode, and a row of losses
-    per epoch. CheckpointError: made with other settings. FloatingPointError: the loss diverged."""
+    """Train, or resume from ``checkpoint``; with masks, if ``dataset`` has some. Returns the averaged
+    detector in eval mode, and a row of losses per epoch. start: a checkpoint of an earlier training, of the
+    same subject, whose averaged weights this one begins from. CheckpointError: made with other settings.
+    FloatingPointError: the loss diverged."""
     torch.set_num_threads(settings.threads)
     torch.use_deterministic_algorithms(True)
     torch.manual_seed(settings.seed)
     # Channels last: a quarter less time per step.
-    model = Detector(len(KINDS))
+    kinds, prototypes = len(SUBJECTS[settings.subject]), 0 if dataset.masks is None else PROTOTYPES
+    model = Detector(kinds, prototypes)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
-    averaged = Detector(len(KINDS)).eval()
+    if start is not None:
+        try:
+            model.load_state_dict(_read(start)["averaged"])
+        except RuntimeError:
+            raise CheckpointError(
+                f"{start}: holds another network; begin from one of the same --of"
+            ) from None
+    averaged = Detector(kinds, prototypes).eval()
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
     parts = {"model": model, "averaged": averaged, "optimizer": optimizer}
@@ -62,28 +76,35 @@ def train(
     per_epoch = len(dataset) // BATCH
     progress = Progress(settings.epochs - len(log))
     for epoch in range(len(log), settings.epochs):
-        began, sums = time.perf_counter(), np.zeros(2)
+        began, sums = time.perf_counter(), np.zeros(3)
         model.train()
-        for k, (images, truths) in enumerate(_batches(dataset, settings, epoch)):
+        for k, (images, truths, masks) in enumerate(_batches(dataset, settings, epoch)):
             step = epoch * per_epoch + k
             for group in optimizer.param_groups:
                 group["lr"] = settings.rate * _schedule(step, settings.epochs * per_epoch)
-            scored, boxed = detection_loss(model.raw(images), truths)
+            *predicted, weights, maps = model.raw_with_masks(images)
+            found = predicted[0], predicted[1], predicted[2]
+            assigned = assign_batch(found, truths)
+            scored, boxed = detection_loss(found, truths, assigned)
+            losses = [scored, boxed]
+            if masks is not None and weights is not None and maps is not None:
+                losses.append(mask_loss(weights, maps, truths, masks, assigned))
             optimizer.zero_grad(set_to_none=True)
-            (scored + boxed).backward()
+            sum(losses[1:], losses[0]).backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
             optimizer.step()
             _average(averaged, model, step)
-            sums += (float(scored.detach()), float(boxed.detach()))
-        score_loss, box_loss = (round(float(v), 5) for v in sums / per_epoch)
-        if not math.isfinite(score_loss + box_loss):
-            raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite: take another seed")
+            sums[: len(losses)] += [float(loss.detach()) for loss in losses]
+        score_loss, box_loss, masked = (round(float(v), 5) for v in sums / per_epoch)
+        if not math.isfinite(score_loss + box_loss + masked):
+            raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite; lower the rate")
         seconds = round(time.perf_counter() - began, 1)
-        log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
+        row = {"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss}
+        log.append({**row, **({"mask_loss": masked} if prototypes else {}), "seconds": seconds})
         _save(checkpoint, settings, parts, log)
         progress.advance(1)
-        losses = f"loss {score_loss:.3f} + {box_loss:.3f}"
-        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", losses)
+        words = f"loss {score_loss:.3f} + {box_loss:.3f}{f' + {masked:.3f}' if prototypes else ''}"
+        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", words)
     return averaged, log
 
 
@@ -107,11 +128,8 @@ def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list
     """Load what ``_save`` wrote into ``parts``; returns the log so far."""
     if not checkpoint.is_file():
         return []
-    try:
-        kept = torch.load(checkpoint, weights_only=True)
-        known = kept["settings"]
-    except Exception as error:  # torch's reader raises whatever its archive's layers raise
-        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+    kept = _read(checkpoint)
+    known = kept["settings"]
     for key, value in asdict(settings).items():
         if known.get(key) != value:
             raise CheckpointError(
@@ -124,6 +142,16 @@ def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list
     return log
 
 
+def _read(checkpoint: Path) -> dict[str, Any]:
+    """What ``_save`` wrote. CheckpointError: it cannot be read."""
+    try:
+        kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)
+        kept["settings"], kept["averaged"]
+    except Exception as error:  # torch's reader raises whatever its archive's layers raise
+        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+    return kept
+
+
 def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list[dict[str, Any]]) -> None:
     new = checkpoint.with_suffix(".part")
     states = {name: part.state_dict() for name, part in parts.items()}
@@ -131,24 +159,32 @@ def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list
     new.replace(checkpoint)
 
 
-def _batches(dataset: LabeledImages, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
-    """Augmented batches of one epoch, a function of seed and epoch alone."""
+def _batches(
+    dataset: LabeledImages, settings: Settings, epoch: int
+) -> Iterator[tuple[Tensor, list[Tensor], Tensor | None]]:
+    """Augmented batches of one epoch, a function of seed and epoch alone: images, boxes, and masks where the
+    dataset has some."""
     order = np.random.default_rng([settings.seed, epoch]).permutation(len(dataset))
     for first in range(0, len(dataset) - BATCH + 1, BATCH):
         images, truths = [], []
         for i in order[first : first + BATCH]:
             rng = np.random.default_rng([settings.seed, epoch, int(i)])
-            image, boxes = augmented(dataset.images[i], dataset.boxes[i], rng)
-            images.append(image)
+            image = dataset.images[i]
+            if dataset.masks is not None:
+                image = np.dstack([image, np.where(dataset.masks[i], 255, 0).astype(np.uint8)])
+            image_, boxes = augmented(image, dataset.boxes[i], rng)
+            images.append(image_)
             truths.append(torch.from_numpy(boxes))
-        yield torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), truths
+        batch = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+        yield batch[:, :3], truths, None if dataset.masks is None else batch[:, 3]
 
 
 def augmented(
     image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], Boxes]:
     """A randomly augmented image (side, side, 3) in [0, 1] and its boxes: mirrored, scaled, shifted, with
-    another exposure and tint, sometimes blurred or noisy."""
+    another exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the mask of its
+    one object, from 0 to 255: it moves along, and the box is that of what it still shows."""
     side = image.shape[0]
     boxes = boxes.copy()
     if rng.random() < 0.5:
@@ -159,7 +195,7 @@ def augmented(
         shift = (1.0 - scale) * side / 2 + rng.uniform(-0.15, 0.15, 2) * side
         warp = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
         image = np.asarray(cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side),
-                                          borderValue=(114, 114, 114)), np.uint8)  # fmt: skip
+                                          borderValue=(114, 114, 114, 0)), np.uint8)  # fmt: skip
         before = np.maximum(boxes[:, 2:4] - boxes[:, :2], 1.0).prod(axis=1)
         boxes[:, :4] = boxes[:, :4] * scale + np.tile(shift, 2)
         boxes[:, :4] = boxes[:, :4].clip(0, side)
@@ -169,7 +205,10 @@ def augmented(
             size.prod(axis=1) > 0.25 * before * scale**2
         )
         boxes = boxes[kept]
-    out = image.astype(np.float32) / 255.0
+    mask = image[..., 3:]
+    if mask.shape[2]:
+        boxes = boxes_of(np.where(mask[..., 0] > 127, 0, -1), [0])
+    out = image[..., :3].astype(np.float32) / 255.0
     out = out * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3).astype(np.float32) + rng.uniform(
         -0.08, 0.08
     )
@@ -177,4 +216,5 @@ def augmented(
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.2)))
     if rng.random() < 0.3:
         out = out + rng.normal(0.0, rng.uniform(0.005, 0.04), out.shape)
-    return np.clip(out, 0.0, 1.0).astype(np.float32), boxes.astype(np.float32)
+    out = np.concatenate([np.clip(out, 0.0, 1.0).astype(np.float32), mask.astype(np.float32) / 255.0], axis=2)
+    return out, boxes.astype(np.float32)

@@ -38,6 +38,33 @@ def exported(tmp_path_factory):
     return model, folder / "fp32.onnx", folder / "int8.onnx"
 
 
+def test_masks_go_through_the_file_into_what_a_deployment_runs(tmp_path):
+    from edge_server.foreground.detector import Detector as Deployed
+
+    torch.manual_seed(4)
+    model = Detector(1, 8)
+    with torch.no_grad():
+        model.train()(torch.rand(8, 3, 64, 64))
+        model.model[10].score[1].bias.fill_(2.0)  # untrained, but sure
+    export_fp32(model.eval(), 64, tmp_path / "fp32.onnx", {}, ("tile",))
+    export_int8(tmp_path / "fp32.onnx", IMAGES, tmp_path / "int8.onnx")
+    with torch.no_grad():
+        table, maps = model(torch.from_numpy(IMAGES[:1].transpose(0, 3, 1, 2).astype(np.float32) / 255))
+    for name, least in (("fp32", 0.999), ("int8", 0.9)):
+        found = Deployed(str(tmp_path / f"{name}.onnx"))
+        assert found.gives_masks and found.kinds == {0: "tile"} and (found.width, found.height) == (64, 64)
+        best = found.detect(IMAGES[0], 0.25)[0]
+        # Of the same cell, the mask that torch computes.
+        size = torch.tensor([best.box[2] - best.box[0], best.box[3] - best.box[1]])
+        centre = torch.tensor([best.box[0] + best.box[2], best.box[1] + best.box[3]]) / 2
+        cell = (table[0, :4].T - torch.cat([centre, size])).abs().sum(1).argmin()
+        logits = torch.einsum("m,mhw->hw", table[0, 5:, cell], maps[0])
+        true = (
+            torch.nn.functional.interpolate(logits[None, None], (64, 64), mode="bilinear")[0, 0].numpy() > 0
+        )
+        assert (best.mask() == true).mean() > least
+
+
 @pytest.mark.parametrize("shape", [(1, 64, 64), (3, 48, 96)])
 def test_float_is_what_torch_computes_at_any_size(exported, shape):
     model, fp32, _ = exported

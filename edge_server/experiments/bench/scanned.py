@@ -1,0 +1,161 @@
+"""From pixels to the mesh of one object: the tile on its bench (scenario ``scan``), cut out in several ways.
+
+A camera's viewpoints are those that the scenario asks its arm for. A field is fitted to whole
+images, and to images cut by the scenario's own ``edge.foreground``, by GrabCut in its detector's boxes, by
+these boxes alone, and by true masks. Of each the mesh is compared with the tile's surface, bench and tools
+not being part of it: error, the share of the surface within 3 mm of the mesh, and the share of the mesh that
+is tile. Of whole images, a mesh is also made within the tile's box in space, given by hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from time import perf_counter as _now
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.config import WorldConfig, source_config
+from camera_node.synthetic.camera_rig import on_sphere
+from camera_node.synthetic.scene import Scene, make_scene, pinhole
+from edge_server.config import EdgeConfig, read_config
+from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.common.tables import markdown_table, number
+from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
+from edge_server.experiments.training.detector.mask_quality import found_mask, iou
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import make_field
+from edge_server.foreground import BOX, GRABCUT, ForegroundError
+from edge_server.foreground.foreground import make_foreground
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import DepthMap
+from edge_server.surface.metrics import Truth, compare
+from edge_server.surface.reconstruct import Corner, MeshSettings, make_depth_maps, mesh_from_depth_maps
+from freshfield.machine_load import LoadMeter
+from freshfield.scenario import load
+
+SCENARIO = "scan"
+SPACING_M = 0.0015  # between points of the truth
+ABOVE_M = 0.015  # where a box by hand begins, above the lower end of the scene's bounds
+_WHOLE, _BY_HAND, _TRUE = "whole images", "whole images, mesh cut to a box by hand", "true masks"
+
+Mask = NDArray[np.bool_]
+
+
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{views, size, steps, rows: {way: facts}}. BenchError: an extra is missing."""
+    try:
+        import skimage  # noqa: F401 -- said before minutes of fitting, not after
+    except ImportError:
+        raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
+    size, step_deg, steps = (96, 24.0, 100) if run.quick else (192, 15.0, 400)
+    loaded = load(SCENARIO)
+    edge, source = read_config(loaded), source_config(loaded)
+    assert isinstance(source, WorldConfig) and source.arm is not None and source.arm.path is not None
+    scene = make_scene(source.scene, {**source.scene_parameters(), "count": 1, "width": size, "height": size})
+    lens, path = pinhole(scene.params), source.arm.path
+    poses = [
+        on_sphere(path.target_m, path.radius_m, azimuth, elevation)
+        for elevation in path.elevations_deg
+        for azimuth in np.arange(path.azimuths_deg[0], path.azimuths_deg[1] + 1e-9, step_deg)
+    ]
+    views = [View(f"v{k:02d}", scene.view(lens, p).image(0.0), p, lens) for k, p in enumerate(poses)]
+    masks = [scene.object_mask(lens, pose) for pose in poses]
+    truth = surface_truth(Scan(scene, tuple(views)), SPACING_M)
+    load_meter = LoadMeter()
+    rows: dict[str, Any] = {}
+    for way in (_WHOLE, "box", "grabcut", "detector", _TRUE):
+        given, facts = _cut(way, views, masks, edge)
+        # Whole images go on beyond the tile: their field has no known end.
+        field, began = make_field(edge.field, {} if way == _WHOLE else edge.field_options, seed=0), _now()
+        field.fit(given, Budget(steps=steps))
+        maps = make_depth_maps(field.snapshot(), given, MeshSettings())
+        rows[way] = {**facts, **_compared(maps, MeshSettings(), truth), "seconds": _now() - began}
+        if way == _WHOLE:
+            rows[_BY_HAND] = {
+                **_compared(maps, MeshSettings(bounds=_box(scene)), truth),
+                "seconds": _now() - began,
+            }
+        print(f"  {way}: {_said(rows[way])}", flush=True)
+    return {
+        "views": len(views), "size": size, "steps": steps, "field": edge.field, "rows": rows,
+        "outside_cores": load_meter.outside_cores(),
+    }  # fmt: skip
+
+
+def _cut(
+    way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfig
+) -> tuple[list[View], dict[str, Any]]:
+    """The views as they are given to the field; their masks' IoU (mean, least) and milliseconds an image."""
+    if way == _WHOLE:
+        return list(views), {}
+    if way == _TRUE:
+        images = [
+            np.dstack([np.where(m[..., None], v.image, 0), np.where(m, 255, 0)]).astype(np.uint8)
+            for v, m in zip(views, masks)
+        ]
+        return [dataclasses.replace(v, image=i) for v, i in zip(views, images)], {"iou": 1.0, "least": 1.0}
+    segment = {"box": BOX, "grabcut": GRABCUT}.get(way, edge.foreground.segment)
+    try:
+        cut = make_foreground(dataclasses.replace(edge.foreground, segment=segment))
+    except ForegroundError as error:
+        raise BenchError(str(error)) from None
+    out, ious = [], []
+    for view, mask in zip(views, masks):
+        image, weight = cut.apply(view.camera, view.image)
+        # An image in which nothing was found is used whole.
+        found = found_mask(image, full=True)
+        ious.append(0.0 if found is None else iou(found, mask))
+        out.append(dataclasses.replace(view, image=image, weight=weight))
+    status = cut.status()
+    return out, {
+        "iou": float(np.mean(ious)), "least": min(ious), "whole": len(views) - cut.counts.masked,
+        "ms": status["ms_per_image"],
+    }  # fmt: skip
+
+
+def _box(scene: Scene) -> tuple[Corner, Corner]:
+    """The box that a person would put around the tile: its own, ending a little above the bench."""
+    (x0, y0, z0), (x1, y1, z1) = make_scene(scene.name, {"count": 1}).bounds.tolist()
+    return (x0, y0, z0 + ABOVE_M), (x1, y1, z1)
+
+
+def _compared(maps: Sequence[DepthMap], settings: MeshSettings, truth: Truth) -> dict[str, Any]:
+    try:
+        mesh = mesh_from_depth_maps(maps, settings)
+        return {**dataclasses.asdict(compare(mesh, truth)), "triangles": len(mesh.faces)}
+    except SurfaceError as error:
+        return {"failed": str(error)}
+
+
+def _said(row: dict[str, Any]) -> str:
+    if "failed" in row:
+        return str(row["failed"])
+    return f"chamfer {row['chamfer_mm']:.2f} mm, {100 * row['complete']:.1f} % of the surface within 3 mm"
+
+
+def table(figures: dict[str, Any]) -> str:
+    """One Markdown table: a row a way to cut."""
+    about = (
+        f"The tile on the bench of `{SCENARIO}`, {figures['views']} images of {figures['size']} x "
+        f"{figures['size']}, {figures['field']}, {figures['steps']} steps; outside cores: "
+        f"{figures['outside_cores']}."
+    )
+    rows: list[tuple[Any, ...]] = []
+    for way, row in figures["rows"].items():
+        masks = (number(row.get("iou")), number(row.get("least")), number(row.get("ms")))
+        if "failed" in row:
+            rows.append((way, *masks, row["failed"], *[""] * 5))
+            continue
+        rows.append((
+            way, *masks, f"{row['chamfer_mm']:.2f}", f"{row['accuracy_mm']:.2f}",
+            f"{row['completeness_mm']:.2f}", f"{100 * row['complete']:.0f} %",
+            f"{100 * row['precise']:.0f} %", f"{row['seconds']:.0f}",
+        ))  # fmt: skip
+    head = (
+        "cut by|mask IoU|least|ms|chamfer mm|mesh to tile mm|tile to mesh mm|surface within 3 mm|"
+        "mesh within 3 mm|seconds"
+    )
+    return f"{about}\n\n{markdown_table(head.split('|'), rows)}"

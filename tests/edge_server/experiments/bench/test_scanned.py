@@ -1,0 +1,23 @@
+"""``edge-server bench scanned``: from images of the bench to meshes of the tile."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from edge_server.cli import main as edge_server
+
+
+@pytest.mark.slow
+def test_masks_leave_the_tile_alone(tmp_path, capsys):
+    for module in ("skimage", "onnxruntime", "onnx"):
+        pytest.importorskip(module, reason=f"{module} is not installed (extras surface, embed)")
+    assert edge_server(["bench", "scanned", "--quick", "--json", str(tmp_path / "s.json")]) == 0
+    rows = json.loads((tmp_path / "s.json").read_text())["scanned"]["rows"]
+    ours, whole, true = rows["detector"], rows["whole images"], rows["true masks"]
+    assert ours["iou"] > 0.9 and ours["whole"] == 0
+    assert ours["precise"] > 2 * whole["precise"], "of a mesh of whole images, most is bench and wall"
+    assert ours["chamfer_mm"] < 0.5 * whole["chamfer_mm"]
+    assert ours["chamfer_mm"] < 1.5 * true["chamfer_mm"]
+    assert "| true masks | 1.00 |" in capsys.readouterr().out

@@ -1,0 +1,101 @@
+"""The shipped detector of the tile, on views it was not trained on: near, cut off, far away, and none."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.camera_rig import on_sphere
+from camera_node.synthetic.scene import make_scene
+from edge_server.config import read_config
+from edge_server.foreground import ForegroundConfig
+from edge_server.foreground.foreground import Foreground, make_foreground
+from freshfield.geometry import Pinhole
+from freshfield.scenario import load
+from tests.edge_server.foreground.pictures import iou
+
+for module in ("onnx", "onnxruntime"):
+    pytest.importorskip(module, reason="needs ONNX Runtime: pip install -e '.[embed]'")
+
+WIDE, NARROW = 75.0, 40.0
+
+
+def cut() -> Foreground:
+    return make_foreground(ForegroundConfig(detector="tile"))
+
+
+def seen(
+    distance_m: float, azimuth: float, elevation: float, fov_deg: float, bench: bool = True,
+    aim=(0.0, 0.0, 0.03), size=(128, 128),
+):  # fmt: skip
+    """(image, true mask) of the tile from somewhere."""
+    scene = make_scene("tile", {"count": 1, "bench": bench})
+    lens, pose = Pinhole.from_fov(*size, fov_deg), on_sphere(aim, distance_m, azimuth, elevation)
+    return scene.view(lens, pose).image(0.0), scene.object_mask(lens, pose)
+
+
+def mask_of(foreground: Foreground, image) -> np.ndarray:
+    rgba = foreground.apply("hand", image)[0]
+    assert rgba.shape[2] == 4, foreground.counts
+    return rgba[..., 3] == 255
+
+
+@pytest.mark.parametrize("bench", [False, True], ids=["cell", "scan"])
+def test_the_tile_is_cut_out_as_a_hand_sees_it(bench):
+    found = []
+    for elevation in (30, 52, 75):
+        for azimuth in (-165, -45, 75):
+            image, truth = seen(0.34, azimuth, elevation, WIDE, bench)
+            found.append(iou(mask_of(cut(), image), truth))
+    assert np.mean(found) > 0.9 and min(found) > 0.8, found
+
+
+def test_the_tile_is_cut_out_of_its_own_scene():
+    scene, foreground, found = make_scene("tile", {"count": 7}), cut(), []
+    for name, (lens, pose) in scene.cameras.items():
+        found.append(iou(mask_of(foreground, scene.render(name, 0.0)), scene.object_mask(lens, pose)))
+    assert np.mean(found) > 0.9 and min(found) > 0.8, found
+
+
+def test_larger_pictures_of_another_shape_are_cut_too():
+    image, truth = seen(0.8, 30, 45, 60.0, size=(320, 200))
+    assert iou(mask_of(cut(), image), truth) > 0.8
+
+
+@pytest.mark.parametrize("aim", [(0.30, 0.0, 0.03), (0.0, 0.26, 0.0), (-0.25, -0.2, 0.0)])
+def test_a_tile_that_the_edge_of_the_picture_cuts_off_is_found(aim):
+    image, truth = seen(0.55, 20, 50, NARROW, aim=aim)
+    assert truth[[0, -1]].any() or truth[:, [0, -1]].any()
+    assert iou(mask_of(cut(), image), truth) > 0.75
+
+
+@pytest.mark.parametrize("azimuth", [-60, 10, 100])
+def test_a_tile_far_away_is_found(azimuth):
+    image, truth = seen(2.0, azimuth, 45, 60.0)
+    assert truth.mean() < 0.04
+    assert iou(mask_of(cut(), image), truth) > 0.6
+
+
+def test_a_picture_without_the_tile_is_used_whole_and_this_is_said_once(caplog):
+    scene = make_scene("tile", {"count": 1, "bench": True})
+    parts = scene.world.static_parts[scene.object_parts :]
+    empty = scene.with_world(type(scene.world)(parts, (), scene.world.light, scene.world.background))
+    foreground = cut()
+    with caplog.at_level(logging.WARNING):
+        for azimuth in (-30, 60, 150):
+            image = empty.view(
+                Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)
+            ).image(0)
+            out, weight = foreground.apply("hand", image)
+            assert out is image and weight is None, "nothing is lost"
+    assert foreground.counts.not_detected == 3 == sum(vars(foreground.counts).values())
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said == "camera hand: an image is used whole: nothing was found in it (further ones: edge.json)"
+
+
+def test_the_shipped_scenario_cuts_every_picture_without_a_box_by_hand():
+    config = read_config(load("scan")).foreground
+    assert config.detector == "tile" and config.box is None and not config.boxes
+    assert set(make_foreground(config)._boxes._detector.kinds.values()) == {"tile"}
