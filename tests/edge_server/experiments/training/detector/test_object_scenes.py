@@ -54,8 +54,8 @@ def test_a_seed_makes_one_world_and_purposes_share_none(some):
 
 
 def test_masks_are_kept_with_the_pictures(tmp_path):
-    first = render("train", 1, SIDE, 0, tmp_path, 1, "tile")
-    again = render("train", 1, SIDE, 0, tmp_path, 1, "tile")
+    first = render("train", 1, SIDE, 0, tmp_path, "tile")
+    again = render("train", 1, SIDE, 0, tmp_path, "tile")
     assert first.masks.dtype == np.bool_ and first.masks.any()
     for a, b in ((first.images, again.images), (first.masks, again.masks)):
         assert np.array_equal(a, b)
