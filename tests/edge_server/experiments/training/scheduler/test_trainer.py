@@ -41,12 +41,12 @@ from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.scheduler.online.online_trainer import choose_reward
 from freshfield.files import write_csv
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
+from tests.edge_server.scheduler.learned.problems import collect
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
