@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # loaded only with a learned policy
 # Number of cameras in the explanation of a decision.
 EXPLAINED_CAMERAS = 6
 _DIM = "color:var(--mantine-color-dimmed)"
+_CELL = "padding:.1em .35em;text-align:right"
 _CARD = "background:rgba(128,140,160,.10);border-radius:6px"
 
 INTRO = (
@@ -181,10 +182,14 @@ def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
     """One row for each camera: age, frames delivered and rejected. Cameras of the last update are ticked."""
     chosen = set(selected)
     rows = "".join(_row(c, c.camera in chosen) for c in cameras)
-    cell = "padding:.1em .35em;font-weight:400;text-align:right"
+    return _table(("camera", "age", "used", "delivered", "rejected"), rows)
+
+
+def _table(columns: Sequence[str], rows: str) -> str:
+    """Rows of HTML under the names of their columns; the first column is on the left."""
     head = "".join(
-        f'<th style="{cell}{";text-align:left" if i == 0 else ""}">{name}</th>'
-        for i, name in enumerate(("camera", "age", "used", "delivered", "rejected"))
+        f'<th style="{_CELL};font-weight:400{"" if i else ";text-align:left"}">{name}</th>'
+        for i, name in enumerate(columns)
     )
     return (
         '<div style="padding:0 .6em .5em"><table style="width:100%;border-collapse:collapse;font-size:.78em;'
@@ -195,16 +200,15 @@ def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
 
 def _row(camera: CameraView, used: bool) -> str:
     color = css(HELD_OUT if camera.held_out else age_color(camera.age_ms))
-    cell = "padding:.1em .35em;text-align:right"
     age = "no frame yet" if camera.age_ms is None else f"{number(camera.age_ms)} ms"
     tick = "truth" if camera.held_out else ("&#10003;" if used else "")
     rejected = f"color:{css(scale_color(1.0))}" if camera.rejected else _DIM
     return (
-        f'<tr><td style="{cell};text-align:left"><span style="color:{color}">&#9632;</span> '
+        f'<tr><td style="{_CELL};text-align:left"><span style="color:{color}">&#9632;</span> '
         f"{escape(camera.camera)}</td>"
-        f'<td style="{cell}">{age}</td><td style="{cell}">{tick}</td>'
-        f'<td style="{cell}">{camera.delivered}</td>'
-        f'<td style="{cell};{rejected}">{camera.rejected}</td></tr>'
+        f'<td style="{_CELL}">{age}</td><td style="{_CELL}">{tick}</td>'
+        f'<td style="{_CELL}">{camera.delivered}</td>'
+        f'<td style="{_CELL};{rejected}">{camera.rejected}</td></tr>'
     )
 
 
@@ -283,31 +287,23 @@ def channel_state(channel: dict[str, Any] | None) -> str:
 
 def policy_scores(scores: dict[str, Any]) -> str:
     """What policies reached in virtual time (``edge.scores``): a row each, with what the numbers are."""
-    cell = "padding:.1em .35em;text-align:right"
     rows = ""
     for name, row in scores["policies"].items():
         over = [] if name == "all" else row.get("psnr_db_over_all", [])
         difference = f"{over[0]:+.2f} [{over[1]:+.2f}, {over[2]:+.2f}]" if None not in over and over else ""
         values = (number(row["own_seed"]["psnr_db"], 1), number(row["own_seed"]["views"], 1), difference)
         rows += (
-            f'<tr><td style="{cell};text-align:left">{escape(name)}</td>'
-            + "".join(f'<td style="{cell}">{value}</td>' for value in values)
+            f'<tr><td style="{_CELL};text-align:left">{escape(name)}</td>'
+            + "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
             + "</tr>"
         )
-    head = "".join(
-        f'<th style="{cell};font-weight:400">{n}</th>' for n in ("policy", "dB", "views", "over all, dB")
-    )
     about = (
         f"In virtual time, not now: {scores['seconds']:g} s of this scenario and its channel's seed "
         f"{scores['seed']}, updates charged with what they take on {scores['machine']['cpu']}, "
         f"{scores['machine']['cores']} cores; PSNR of what was shown. Over all: paired over "
         f"{scores['seeds']} other seeds, 95 %."
     )
-    return (
-        f'{note(about)}<div style="padding:0 .6em .5em"><table style="width:100%;border-collapse:collapse;'
-        f'font-size:.78em;font-variant-numeric:tabular-nums"><thead style="{_DIM}"><tr>{head}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
-    )
+    return note(about) + _table(("policy", "dB", "views", "over all, dB"), rows)
 
 
 def channel_line(channel: dict[str, Any]) -> str:

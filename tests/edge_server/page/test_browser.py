@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from edge_server.page import start_page
-from edge_server.page.preview import Preview
 from edge_server.page.scene import FRUSTUM_OF_RADIUS
 from edge_server.page.viewpoint import initial_viewpoint, visitor_camera
 from freshfield.geometry import quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.preview import Preview
 
 pytestmark = pytest.mark.browser
 

@@ -21,10 +21,10 @@ from edge_server.live.update_budget import Frontier, FrontierPoint
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
-from edge_server.page.preview import BallScene, Preview
 from edge_server.page.rendering import DEPTH_ROWS, FAR_M, browser_images
 from edge_server.page.scene import thumbnail
 from freshfield.geometry import Pinhole, look_at
+from tests.edge_server.page.preview import BallScene, Preview
 from tests.edge_server.page.visitor import Visitor
 from tests.waiting import wait_until
 

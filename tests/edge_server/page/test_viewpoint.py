@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.page.preview import BallScene
 from edge_server.page.viewpoint import (
     VERTICAL_FOV_RAD,
     convergence_point,
@@ -17,6 +16,7 @@ from edge_server.page.viewpoint import (
     world_up,
 )
 from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse, so3_exp
+from tests.edge_server.page.preview import BallScene
 
 TARGET = np.array([1.0, -2.0, 0.5])
 

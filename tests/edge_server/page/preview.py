@@ -1,4 +1,4 @@
-"""A page without a deployment: ``python -m edge_server.page.preview [--port 8080]``.
+"""A toy deployment for the page.
 
 A ball circles over a floor. Cameras on an arc capture it, a toy network delays the images, and the "field" is
 the analytic scene at the mean capture time of the views that the policy selects: what a perfect field would
@@ -7,7 +7,6 @@ show. Ages, policies and scores are computed, so their relations are real; only 
 
 from __future__ import annotations
 
-import argparse
 import json
 import threading
 from dataclasses import replace
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.page import PageError, start_page
 from edge_server.scheduler import POLICIES, Epoch, Policy, make_policy
 from freshfield import payload
 from freshfield.clock import WallClock
@@ -258,30 +256,3 @@ def _arc(i: int, count: int) -> NDArray[np.float64]:
 
 def _uint8(image: Rendering) -> NDArray[np.uint8]:
     return (np.clip(image.color, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", "--page-port", type=int, default=8080)
-    parser.add_argument("--cameras", type=int, default=CAMERAS)
-    parser.add_argument("--out", type=Path, default=Path("."), help="folder for snapshots")
-    args = parser.parse_args(arguments)
-    try:
-        preview = Preview(args.out, args.cameras)
-        page = start_page(preview.state, args.host, args.port)
-    except (ValueError, PageError) as error:
-        parser.error(str(error))
-    preview.start()
-    print(f"page: {page.url}  (Ctrl-C ends it)", flush=True)
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.stop()
-        preview.stop()
-
-
-if __name__ == "__main__":
-    main()
