@@ -9,15 +9,13 @@ Held-out frames are not masked: fidelity is measured on whole images, background
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from freshfield.scenario import read_section
 
 DEFAULT, GRABCUT, BOX, OWN = "default", "grabcut", "box", "detector"
-CHOICES = ("surest", "largest")
-PROVIDERS = ("auto", "cpu", "cuda")
 Four = tuple[float, float, float, float]
 
 
@@ -31,15 +29,13 @@ class ForegroundConfig:
 
     detector: YOLO detection or segmentation ONNX (v8, v11), relative to the scenario, or ``default``, the
     small one shipped for our own scenes. box: [left, top, right, bottom] as shares of the image, instead of a
-    detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum score.
-    choose: which of several detections, surest or largest. margin: added to each side of a detected box, as a
-    share of it. segment: ``detector`` (its own masks, of a segmentation model), ``grabcut``, ``box`` (the
-    whole box), or an ONNX with one foreground map (n, 1, h, w); none: the detector's masks if it has some,
-    else grabcut.
+    detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum score;
+    of several detections the surest counts. margin: added to each side of a detected box, as a share of it.
+    segment: ``detector`` (its own masks, of a segmentation model), ``grabcut`` or ``box`` (the
+    whole box); none: the detector's masks if it has some, else grabcut.
     iterations: of grabcut. side: longest side, pixels, for grabcut; the mask is then enlarged.
-    threshold: of an ONNX's map. normalise: ONNX input, imagenet (most models) or unit (0 to 1).
     doubt: supervision weight, 0 to 1, of background pixels within the box, against 1 outside: a false hole in
-    the object contradicts all other views, an unsupervised pixel does not. provider, threads: of the models.
+    the object contradicts all other views, an unsupervised pixel does not.
     """
 
     detector: str | None = None
@@ -47,16 +43,11 @@ class ForegroundConfig:
     boxes: dict[str, Four] = field(default_factory=dict)
     kinds: list[str] = field(default_factory=list)
     confidence: float = 0.25
-    choose: str = "surest"
     margin: float = 0.05
     segment: str | None = None
     iterations: int = 3
     side: int = 160
-    threshold: float = 0.5
-    normalise: str = "imagenet"
     doubt: float = 0.0
-    provider: str = "auto"
-    threads: int = 1
 
     def __post_init__(self) -> None:
         fixed = bool(self.boxes) or self.box is not None
@@ -67,25 +58,19 @@ class ForegroundConfig:
                 raise ValueError(f"{name}: expected left, top, right, bottom within 0 to 1, got {list(box)}")
         ranges = {
             "confidence": (0.0, 1.0), "margin": (0.0, 1.0), "iterations": (1, 50), "side": (16, 4096),
-            "threshold": (0.0, 1.0), "doubt": (0.0, 1.0), "threads": (1, 256),
+            "doubt": (0.0, 1.0),
         }  # fmt: skip
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name)}")
-        for name, known in {
-            "choose": CHOICES, "provider": PROVIDERS, "normalise": ("imagenet", "unit"),
-        }.items():  # fmt: skip
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name}: expected {' or '.join(known)}, got {getattr(self, name)!r}")
+        if self.segment not in (None, OWN, GRABCUT, BOX):
+            raise ValueError(f"segment: expected {OWN} or {GRABCUT} or {BOX}, got {self.segment!r}")
 
 
 def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundConfig:
     """Read the section ``edge.foreground`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
     config = read_section(ForegroundConfig, values, f"{scenario}: edge.foreground")
-    beside: dict[str, Any] = {}
-    if config.detector not in (None, DEFAULT):
-        beside["detector"] = str(scenario.parent / str(config.detector))
-    if config.segment not in (None, OWN, GRABCUT, BOX):
-        beside["segment"] = str(scenario.parent / config.segment)
-    return ForegroundConfig(**{**vars(config), **beside})
+    if config.detector in (None, DEFAULT):
+        return config
+    return replace(config, detector=str(scenario.parent / str(config.detector)))

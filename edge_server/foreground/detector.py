@@ -43,10 +43,10 @@ class Detector:
     """A YOLO detection or segmentation model. path: its ONNX file, or ``default`` for the shipped one.
     ForegroundError: the file is missing or unusable."""
 
-    def __init__(self, path: str, provider: str = "auto", threads: int = 1) -> None:
+    def __init__(self, path: str) -> None:
         file = model_path(path)
         self.name = file.name
-        self._session = open_model(file, provider, threads)
+        self._session = open_model(file)
         image = self._session.get_inputs()[0]
         if len(self._session.get_inputs()) != 1 or len(image.shape) != 4 or image.type not in _TYPES:
             raise ForegroundError(f"{file}: expected a model of images (n, 3, height, width)")
@@ -75,11 +75,7 @@ class Detector:
         coefficients = prototypes[0].shape[1] if self.gives_masks else 0
         rows = decode(out, confidence, self.name, coefficients)
         h, w = whole.shape[:2]
-        # From the letterboxed input back to the image.
-        scale = min(self.height / h, self.width / w)
-        left, top = (
-            (side - max(1, round(n * scale))) // 2 for side, n in ((self.width, w), (self.height, h))
-        )
+        scale, _, (left, top) = self._placed((h, w))
         found = []
         for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
@@ -87,13 +83,18 @@ class Detector:
             found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
+    def _placed(self, shape: tuple[int, int]) -> tuple[float, tuple[int, int], tuple[int, int]]:
+        """Scale of an image in the letterboxed input, and its size and left upper corner there."""
+        h, w = shape
+        scale = min(self.height / h, self.width / w)
+        size = max(1, round(w * scale)), max(1, round(h * scale))
+        return scale, size, ((self.width - size[0]) // 2, (self.height - size[1]) // 2)
+
     def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """The weighted sum of prototypes (n, h, w), which cover the model's input, where it is positive, as a
         mask of the image's ``shape``."""
         h, w = shape
-        scale = min(self.height / h, self.width / w)
-        size = max(1, round(w * scale)), max(1, round(h * scale))
-        left, top = (self.width - size[0]) // 2, (self.height - size[1]) // 2
+        _, size, (left, top) = self._placed(shape)
         logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
         logits = np.nan_to_num(logits, nan=-1.0)
         whole = cv2.resize(logits, (self.width, self.height), interpolation=cv2.INTER_LINEAR)
@@ -136,14 +137,14 @@ def decode(
     return [tuple(float(v) for v in rows[k]) for k in sorted(int(i) for i in kept)]
 
 
-def open_model(file: Path, provider: str, threads: int) -> Any:
+def open_model(file: Path) -> Any:
     """Open the ONNX model in ``file``. Raises ForegroundError."""
     try:
         if file.stat().st_size > MAX_FILE_BYTES:
             raise ForegroundError(f"{file}: larger than {MAX_FILE_BYTES >> 20} MB")
         data = file.read_bytes()
         parse_model(data, file)
-        return open_session(data, provider, threads, str(file))[0]
+        return open_session(data, "auto", 1, str(file))[0]
     except OSError as error:
         raise ForegroundError(
             f"{file}: cannot be read: {error.strerror}; name a model in ONNX format"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
 from edge_server.foreground import BOX, DEFAULT, OWN, ForegroundConfig, ForegroundError
-from edge_server.foreground.segment import Box, Segmenter, WholeBox, make_segmenter
+from edge_server.foreground.segment import Box, Segmenter, make_segmenter, whole_box
 
 Image = NDArray[np.uint8]
 Weight = NDArray[np.float32]
@@ -78,9 +78,9 @@ class Foreground:
         if box is None:
             return "empty_box"
         if self.config.segment in (None, OWN) and found.mask is not None:
-            mask = found.mask() & WholeBox().mask(image, box)
+            mask = found.mask() & whole_box(image, box)
         else:
-            mask = self._segmenter.mask(np.ascontiguousarray(image[..., :3]), box)
+            mask = self._segmenter(np.ascontiguousarray(image[..., :3]), box)
         if not mask.any():
             return "empty_mask"
         return "full_mask" if mask.all() else (mask, box)
@@ -109,7 +109,7 @@ class Boxes:
         if config.detector is not None:
             from edge_server.foreground.detector import Detector
 
-            self._detector = Detector(config.detector, config.provider, config.threads)
+            self._detector = Detector(config.detector)
             known = set(self._detector.kinds.values())
             if known and (unknown := set(config.kinds) - known):
                 raise ForegroundError(
@@ -134,8 +134,6 @@ class Boxes:
         found = [d for d in self._detector.detect(image, c.confidence) if not c.kinds or d.kind in c.kinds]
         if not found:
             return None
-        if c.choose == "largest":
-            found.sort(key=lambda d: (d.box[0] - d.box[2]) * (d.box[3] - d.box[1]))
         x0, y0, x1, y1 = found[0].box
         dx, dy = c.margin * (x1 - x0), c.margin * (y1 - y0)
         return Found((x0 - dx, y0 - dy, x1 + dx, y1 + dy), found[0].mask)

@@ -3,6 +3,8 @@ whole and is counted, and nothing raises."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 
 from edge_server.foreground import ForegroundConfig, ForegroundError
 from edge_server.foreground.foreground import Foreground, Found, clipped, make_foreground
-from edge_server.foreground.segment import GrabCut
+from edge_server.foreground.segment import grabcut
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -26,16 +28,15 @@ class At:
         return None if self.box is None else Found(self.box)
 
 
-class Says:
+def says(answer):
     """A segmentation that always says the same, or fails."""
 
-    def __init__(self, mask):
-        self.answer = mask
-
-    def mask(self, image, box):
-        if self.answer is None:
+    def segment(image, box):
+        if answer is None:
             raise ForegroundError("broken")
-        return np.full(image.shape[:2], self.answer)
+        return np.full(image.shape[:2], answer)
+
+    return segment
 
 
 def cut(box, segmenter) -> Foreground:
@@ -58,7 +59,7 @@ def cut(box, segmenter) -> Foreground:
     ],
 )
 def test_what_cannot_be_cut_passes_whole_and_is_counted(box, answer, counted):
-    foreground = cut(box, Says(answer))
+    foreground = cut(box, says(answer))
     assert foreground.apply("cam00", NOISE)[0] is NOISE
     assert {name: n for name, n in vars(foreground.counts).items() if n} == {counted: 1}
 
@@ -76,7 +77,7 @@ def test_grabcut_with_any_box_on_any_picture(box, shape, kind, side):
         image = np.random.default_rng(1).integers(0, 256, (*shape, 3), dtype=np.uint8)
     elif kind == "half":
         image[: shape[0] // 2] = 200
-    foreground = cut(box, GrabCut(1, side))
+    foreground = cut(box, partial(grabcut, iterations=1, side=side))
     out, _ = foreground.apply("cam00", image)
     assert sum(vars(foreground.counts).values()) == 1
     assert foreground.counts.failed == 0

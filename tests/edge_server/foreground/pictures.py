@@ -79,17 +79,14 @@ def save_orange_detector(
                 further=further)  # fmt: skip
 
 
-def save_orange_segmenter(path: Path, logits: bool = False) -> Path:
-    """An ONNX that maps red minus blue to a share of foreground, or to logits."""
+def save_segmenter(path: Path) -> Path:
+    """An ONNX that maps red minus blue to a share of foreground: no YOLO head."""
     from onnx import helper
 
     from tests.edge_server.embed.graphs import save
 
-    gain = 20.0 if logits else 1.0
-    weight = (gain * np.array([1.0, 0.0, -1.0], np.float32)).reshape(1, 3, 1, 1)
-    nodes = [helper.make_node("Conv", ["images", "weight"], ["map" if logits else "raw"])]
-    if not logits:
-        nodes.append(helper.make_node("Sigmoid", ["raw"], ["map"]))
+    weight = np.array([1.0, 0.0, -1.0], np.float32).reshape(1, 3, 1, 1)
+    nodes = [helper.make_node("Conv", ["images", "weight"], ["map"])]
     return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), {"weight": weight}, opset=13)
 
 

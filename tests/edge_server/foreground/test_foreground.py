@@ -19,7 +19,7 @@ from tests.edge_server.foreground.pictures import (
     save_endless_loop,
     save_memory_bomb,
     save_orange_detector,
-    save_orange_segmenter,
+    save_segmenter,
 )
 from tests.work import MOST_MS, work_ms
 
@@ -128,15 +128,12 @@ def test_a_yolo_head_is_decoded_through_the_letterbox(tmp_path, transposed):
     assert abs((x0 + x1) / 2 - 72) <= 16 and abs((y0 + y1) / 2 - 48) <= 16
 
 
-def test_detector_and_model_together(tmp_path):
+def test_detector_and_grabcut_together(tmp_path):
     needs_onnx()
     detector = save_orange_detector(tmp_path / "orange.onnx")
     picture, truth = disc(96, 128, (48, 72), 14)
-    for logits in (False, True):
-        model = save_orange_segmenter(tmp_path / "segment.onnx", logits)
-        config = ForegroundConfig(detector=str(detector), kinds=["orange"], segment=str(model))
-        cut = make_foreground(config)
-        assert iou(cut.apply("cam00", picture)[0][..., 3] == 255, truth) > 0.85
+    cut = make_foreground(ForegroundConfig(detector=str(detector), kinds=["orange"], margin=0.2))
+    assert iou(cut.apply("cam00", picture)[0][..., 3] == 255, truth) > 0.85
     blue = np.full_like(picture, (40, 70, 160))
     assert cut.apply("cam00", blue)[0] is blue
     assert vars(cut.counts) == {
@@ -203,7 +200,7 @@ def test_a_real_yolo_finds_the_people_of_a_real_video():
         ({"box": [0, 0, 2, 1]}, "within 0 to 1"),
         ({"box": [0, 0, 1]}, "expected a list of 4 values"),
         ({"box": [0, 0, 1, 1], "side": 3}, "side: expected 16 to 4096"),
-        ({"box": [0, 0, 1, 1], "choose": "best"}, "choose: expected surest or largest"),
+        ({"box": [0, 0, 1, 1], "segment": "u2net.onnx"}, "segment: expected detector or grabcut or box"),
         ({"box": [0, 0, 1, 1], "colour": 1}, "colour"),
     ],
 )
@@ -216,16 +213,12 @@ def test_wrong_sections_are_refused_in_one_line(section, part):
 def test_a_model_that_loops_for_ever_is_refused(tmp_path):
     needs_onnx()
     model = save_endless_loop(tmp_path / "loop.onnx")
-    for config in (
-        ForegroundConfig(box=(0, 0, 1, 1), segment=str(model)),
-        ForegroundConfig(detector=str(model)),
-    ):
 
-        def refuse(config=config):
-            with pytest.raises(ForegroundError, match=r"loop\.onnx: holds Loop, which no network"):
-                make_foreground(config)
+    def refuse():
+        with pytest.raises(ForegroundError, match=r"loop\.onnx: holds Loop, which no network"):
+            make_foreground(ForegroundConfig(detector=str(model)))
 
-        assert work_ms(refuse) < MOST_MS
+    assert work_ms(refuse) < MOST_MS
 
 
 @pytest.mark.parametrize("kind", ["Expand", "Tile", "ConstantOfShape", "Range", "Conv"])
@@ -234,7 +227,7 @@ def test_a_model_that_takes_terabytes_is_refused(tmp_path, kind):
     Tile to 4 GB in words of its own."""
     needs_onnx()
     model = save_memory_bomb(tmp_path / "bomb.onnx", kind)
-    config = ForegroundConfig(box=(0, 0, 1, 1), segment=str(model))
+    config = ForegroundConfig(detector=str(model))
 
     def refuse():
         with pytest.raises(ForegroundError, match=r"bomb\.onnx: ONNX Runtime .* (may take|more than) 4"):
@@ -246,14 +239,13 @@ def test_a_model_that_takes_terabytes_is_refused(tmp_path, kind):
 def test_wrong_models_are_refused_in_one_line(tmp_path):
     needs_onnx()
     (tmp_path / "text.onnx").write_text("no model")
-    segmenter = save_orange_segmenter(tmp_path / "segment.onnx")
+    segmenter = save_segmenter(tmp_path / "segment.onnx")
     detector = save_orange_detector(tmp_path / "orange.onnx")
     for config, part in (
         (ForegroundConfig(detector=str(tmp_path / "none.onnx")), "none.onnx: cannot be read"),
         (ForegroundConfig(detector=str(tmp_path / "text.onnx")), "text.onnx: not an ONNX file"),
         (ForegroundConfig(detector=str(segmenter)), "not the boxes and scores"),
         (ForegroundConfig(detector=str(detector), kinds=["dog"]), "knows no dog; it knows apple"),
-        (ForegroundConfig(box=(0, 0, 1, 1), segment=str(tmp_path / "text.onnx")), "not an ONNX file"),
     ):
         with pytest.raises(ForegroundError, match=part) as caught:
             make_foreground(config)
