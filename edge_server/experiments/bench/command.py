@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from edge_server.experiments.bench.run import BenchError, BenchRun
-from edge_server.experiments.common.arguments import at_least, command_parser, parse_options
+from edge_server.experiments.common.arguments import command_parser, parse_options
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.fields.registry import field_names, make_field
@@ -25,7 +25,7 @@ Measure this machine. Figures are medians; outside_cores says how many cores oth
 
   edge-server bench                       # all parts but those marked below, hours
   edge-server bench field --quick
-  edge-server bench track --scene room --field ngp --update-s 0.5
+  edge-server bench track --scene room --field ngp
   edge-server bench field track options --json docs/results/field.json
   edge-server bench ingest --json ingest.json
 
@@ -35,12 +35,11 @@ drift      the same for 300 updates of room: whether a field wears out
 options    what each optional part of a representation costs in time and gains in dB
 limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
 ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
-fidelity   what scoring one image costs
 decide     what a decision of a learnt policy takes, embeddings aside, with 18 and with 200 cameras
 embed      ms to embed a frame, beside ONNX Runtime alone, by the shipped detectors or --model FILE; needs
            the extra embed; not part of all
-foreground masks of lego against its alpha: IoU and ms by options, what detectors find (--model FILE: another
-           one), and dB that a field gains; needs FRESHFIELD_DATA; not part of all
+foreground masks of lego against its alpha: IoU and ms by options, and dB that a field gains; needs
+           FRESHFIELD_DATA; not part of all
 peer       seconds to 20 and 25 dB on lego and kitchen, beside ngp in plain torch and, where installed
            (docs/fields.md), nerfstudio's nerfacto and OpenSplat; needs FRESHFIELD_DATA; not part of all
 shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
@@ -54,19 +53,18 @@ With --json FILE figures are written scene by scene as they are measured; at the
 with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
 """
 
-PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
+PARTS = ("field", "track", "drift", "options", "limits", "ingest", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
 MORE = ("embed", "foreground", "peer", "shown", "growth", "surface")
 # Parts that store each figure as it comes, and skip what is known.
 _RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
-_MODULES = {"growth": "shown.growth"}  # where a part is in no module of its own name
+_MODULES = {"growth": "shown.growth", "drift": "track"}  # where a part is in no module of its own name
 _FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
 # Flags of some parts only.
 _ONLY_OF = {
     "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
     "only": ("options",), "scene": (*_FOLLOWING, "shown"),
-    "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
-    "option": _FOLLOWING, "model": ("embed", "foreground"),
+    "option": _FOLLOWING, "model": ("embed",),
 }  # fmt: skip
 
 
@@ -134,33 +132,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
-    add("--model", type=Path, metavar="FILE", help="of embed, foreground: a YOLO ONNX [the shipped ones]")
+    add("--model", type=Path, metavar="FILE", help="of embed: a YOLO ONNX [the shipped ones]")
     add("--scene", action="append", default=[], metavar="NAME",
         help=f"of track, drift: {', '.join(_FOLLOWED)} [track: both; drift: room]; of shown: a row of its "
         "table, or any scenario of a synthetic world [all rows]")  # fmt: skip
     track = parser.add_argument_group("of track and drift")
     add = track.add_argument
-    add(
-        "--updates",
-        type=at_least(1),
-        metavar="N",
-        help="consecutive updates [100, drift 300; --quick: 16, drift 32]",
-    )
-    add("--update-s", type=_seconds, metavar="S,...", help="seconds of an update, a run each [1,0.25]")
-    add("--steps", type=at_least(1), metavar="N", help="steps of an update instead: repeats bit for bit")
-    add("--samples", type=at_least(1), metavar="N", help="frames with a fresh fit [8; --quick: 3]")
     add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
     return parser
-
-
-def _seconds(text: str) -> tuple[float, ...]:
-    try:
-        found = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        found = ()
-    if not found or not all(0.0 < s < 3600.0 for s in found):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected seconds with commas between, as 1,0.25")
-    return found
 
 
 def _known(path: Path, quick: bool) -> dict[str, Any]:
@@ -194,10 +173,10 @@ def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: d
         return
     with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
         run = BenchRun(
-            args.quick, Path(folder), args.lpips, tuple(args.field), store, tuple(args.scene), args.updates,
-            args.update_s, args.steps, args.samples, args.option or None, tuple(args.only), args.model,
+            args.quick, Path(folder), args.lpips, tuple(args.field), store, tuple(args.scene), args.option,
+            tuple(args.only), args.model,
         )  # fmt: skip
-        figures[part] = module.measure(run)
+        figures[part] = getattr(module, "measure_drift" if part == "drift" else "measure")(run)
 
 
 def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
@@ -261,7 +240,3 @@ def _shown(value: Any) -> str:
     if not isinstance(value, float):
         return f"{value}"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:,.3g}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,6 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,12 @@ from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, data_file
-from edge_server.experiments.common.tables import markdown_table, number
+from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
-from edge_server.foreground import BOX, DEFAULT, GRABCUT, ForegroundConfig, ForegroundError, Four
+from edge_server.foreground import BOX, GRABCUT, ForegroundConfig, Four
 from edge_server.foreground.foreground import Foreground, make_foreground
 from freshfield.geometry import world_rays
 from freshfield.machine_load import LoadMeter
@@ -41,11 +40,8 @@ Mask = NDArray[np.bool_]
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """``masks``: IoU and milliseconds of each way to cut, by background. ``detectors``: what they find of the
-    object. ``field``: PSNR on the object's pixels of held-out views after the same steps.
-
-    Raises BenchError.
-    """
+    """``masks``: IoU and milliseconds of each way to cut, by background. ``field``: PSNR on the object's
+    pixels of held-out views after the same steps. Raises BenchError."""
     # Full size for masks, half for the field.
     large, small = _views(1.0), _views(2.0)
     some = large[:: 25 if run.quick else 10]
@@ -54,8 +50,6 @@ def measure(run: BenchRun) -> dict[str, Any]:
     for ground, compose in _BACKGROUNDS.items():
         figures["masks"][ground] = _masks(some, compose)
         print(f"  masks on {ground}: measured", flush=True)
-    models = [DEFAULT] if run.model is None else [DEFAULT, str(run.model)]
-    figures["detectors"] = {Path(m).name: _detections(some, m) for m in models}
     figures["field"] = _fields(small, steps=100 if run.quick else 500, seeds=1 if run.quick else 2)
     figures["outside_cores"] = load.outside_cores()
     return figures
@@ -142,46 +136,6 @@ def _iou(a: Mask, b: Mask) -> float:
     return float((a & b).sum() / max(int((a | b).sum()), 1))
 
 
-def _detections(views: Sequence[View], model: str) -> dict[str, Any]:
-    """What a detector finds on white and on clutter: images with a detection, IoU of its box with the true
-    one, the kinds it took the object for, and median milliseconds."""
-    try:
-        from edge_server.foreground.detector import Detector
-
-        detector = Detector(model)
-    except (ForegroundError, ModuleNotFoundError) as error:
-        return {"missing": str(error)}
-    found: dict[str, Any] = {}
-    for ground, compose in _BACKGROUNDS.items():
-        ious, kinds, spent_ms = [], [], []
-        for view in views:
-            image = compose(view)
-            begun = time.perf_counter()
-            detected = detector.detect(image, 0.25)
-            spent_ms.append(1e3 * (time.perf_counter() - begun))
-            if detected:
-                kinds.append(detected[0].kind)
-                ious.append(_box_iou(detected[0].box, true_box(view, 0.0), image.shape))
-        found[ground] = {
-            "detected": len(ious),
-            "of": len(views),
-            "iou": statistics.fmean(ious) if ious else None,
-            "kinds": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-            "ms": statistics.median(spent_ms),
-        }
-    return found
-
-
-def _box_iou(pixels: Four, shares: Four, shape: tuple[int, ...]) -> float:
-    h, w = shape[:2]
-    other = (shares[0] * w, shares[1] * h, shares[2] * w, shares[3] * h)
-    both = max(0.0, min(pixels[2], other[2]) - max(pixels[0], other[0])) * max(
-        0.0, min(pixels[3], other[3]) - max(pixels[1], other[1])
-    )
-    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (pixels, other)]
-    return both / max(sum(areas) - both, 1e-9)
-
-
 def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
     """By what was fitted: PSNR on the object's pixels of the views held out (every eighth), mean and seeds'
     spread; IoU of the masks it was fitted with; seconds of fitting."""
@@ -235,7 +189,7 @@ def _with_alpha(seen: View, view: View) -> View:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Three tables: masks, detectors, field."""
+    """Two tables: masks, field."""
     h, w = figures["size"]
     about = (
         f"lego at {w} x {h}, {figures['views']} views, box known to {100 * BOX_MARGIN:g} % of a side; "
@@ -247,15 +201,6 @@ def table(figures: dict[str, Any]) -> str:
                                               f"{m[name]['ms']:.1f}")))
         for name in grounds[0]
     ]  # fmt: skip
-    detectors: list[tuple[Any, ...]] = []
-    for name, by_ground in figures["detectors"].items():
-        if "missing" in by_ground:
-            detectors.append((name, "-", by_ground["missing"], "-", "-", "-"))
-            continue
-        for ground, row in by_ground.items():
-            kinds = ", ".join(f"{kind} {n}" for kind, n in row["kinds"].items()) or "-"
-            share = f"{row['detected']} of {row['of']}"
-            detectors.append((name, ground, share, number(row["iou"]), kinds, f"{row['ms']:.1f}"))
     field = figures["field"]
     base = field["rows"]["whole"]["object_db"]
     fits = [
@@ -274,7 +219,6 @@ def table(figures: dict[str, Any]) -> str:
         markdown_table(
             ("segmentation", "IoU on white (worst)", "ms", "IoU on clutter (worst)", "ms"), masks
         ),
-        markdown_table(("detector", "on", "detected", "box IoU", "taken for", "ms"), detectors),
         of_fits,
         markdown_table(("fitted to", "mask IoU", "dB", "spread", "against whole", "fit s"), fits),
     ))  # fmt: skip

@@ -34,8 +34,7 @@ class BenchRun:
     lpips: folder of LPIPS weights; None: that of the environment.
     fields: the representations to measure; none: all there are.
     store: results of this part, those of an earlier run among them.
-    scenes, updates, update_s, steps, samples, options: of track and drift, see the command; None: the
-        part's own.
+    scenes, options: of track and drift, see the command; none: the part's own.
     only: names of options to try; none: all.
     model: a YOLO ONNX file instead of the shipped ones.
     """
@@ -46,11 +45,7 @@ class BenchRun:
     fields: tuple[str, ...] = ()
     store: ResultStore = field(default_factory=ResultStore)
     scenes: tuple[str, ...] = ()
-    updates: int | None = None
-    update_s: tuple[float, ...] | None = None
-    steps: int | None = None
-    samples: int | None = None
-    options: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     only: tuple[str, ...] = ()
     model: Path | None = None
 

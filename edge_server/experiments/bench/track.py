@@ -2,10 +2,8 @@
 
 A field that has converged on the first frame gets a short update with all training views of the next frame,
 and so on; each update is scored on the held-out camera at its frame. At some frames a new field of the same
-representation is fitted to the same views for fifteen seconds (or fifteen times the steps of an update): its
-score is the reference of the follower. Between those frames it is interpolated.
-
-Updates take a number of seconds, or of steps (``--steps``), which repeats bit for bit.
+representation is fitted to the same views for fifteen seconds: its score is the reference of the follower.
+Between those frames it is interpolated.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ from edge_server.fields.registry import field_names, make_field
 from freshfield.machine_load import LoadMeter
 
 NEAR_DB = 0.5
-FRESH_TIMES = 15  # a fresh fit takes so many times an update of one second, or of ``--steps``
+FRESH_S = 15.0  # a fresh fit
 _METRICS = {"whole": "psnr_db", "moving": "psnr_moving_db"}
 SCENES = ("room", "kitchen")
 
@@ -52,14 +50,12 @@ class Workload:
     """How much is measured.
 
     update_s: seconds of an update, each tried in a run of its own.
-    steps: their number instead.
     samples: frames at which a fresh field is fitted, among them the first one, where the follower starts.
     options: settings of the field.
     """
 
     updates: int = 100
     update_s: tuple[float, ...] = (1.0, 0.25)
-    steps: int | None = None
     samples: int = 8
     cameras: int = 19
     size: int = 128
@@ -67,30 +63,19 @@ class Workload:
     fps: float = 15.0
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def budgets(self) -> dict[str, Budget]:
-        """The budget of an update in each run, by the run's name."""
-        if self.steps is not None:
-            return {f"{self.steps}_steps": Budget(steps=self.steps)}
-        return {f"{s:g}_s": Budget(seconds=s) for s in self.update_s}
-
-    def fresh(self) -> Budget:
-        """The budget of a fresh fit."""
-        if self.steps is not None:
-            return Budget(steps=FRESH_TIMES * self.steps)
-        return Budget(seconds=float(FRESH_TIMES))
-
     def sampled(self) -> list[int]:
         """The frames of the fresh fits, evenly spread from the first to the last."""
         return sorted({round(f) for f in np.linspace(0, self.updates, max(2, self.samples))})
 
-    def seconds_or_steps(self) -> float:
-        """Seconds, or steps, of all fits of one representation on one scene."""
-        updates = sum(map(_amount, self.budgets().values())) * self.updates
-        return updates + _amount(self.fresh()) * len(self.sampled())
+    def seconds(self) -> float:
+        """Of all fits of one representation on one scene."""
+        return sum(self.update_s) * self.updates + FRESH_S * len(self.sampled())
 
 
 FULL = Workload()
 QUICK = Workload(updates=16, samples=3)
+# Of ``drift``: whether the quality of a field that follows a moving scene decreases.
+DRIFT, QUICK_DRIFT = Workload(updates=300), Workload(updates=32, update_s=(0.25,), samples=3)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
@@ -98,13 +83,21 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
     Recorded scenes need FRESHFIELD_DATA. BenchError: a scene that was asked for cannot be had.
     """
-    asked = {name: getattr(run, name) for name in ("updates", "update_s", "steps", "samples", "options")}
-    given = {name: value for name, value in asked.items() if value is not None}
-    workload, names = replace(QUICK if run.quick else FULL, **given), run.fields or field_names()
+    return _measured(run, QUICK if run.quick else FULL, SCENES)
+
+
+def measure_drift(run: BenchRun) -> dict[str, Any]:
+    """As ``measure``, with more updates, and of ``room`` alone unless scenes are asked for."""
+    return _measured(run, QUICK_DRIFT if run.quick else DRIFT, SCENES[:1])
+
+
+def _measured(run: BenchRun, workload: Workload, scenes: Sequence[str]) -> dict[str, Any]:
+    workload = replace(workload, options=run.options)
+    names = run.fields or field_names()
     store, settings = run.store, {n: result_settings(workload, n, workload.options) for n in names}
-    sequences = dict(_sequences(workload, run.scenes))
+    sequences = dict(_sequences(workload, run.scenes or scenes, asked=bool(run.scenes)))
     todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
-    progress = Progress(workload.seconds_or_steps() * len(todo))
+    progress = Progress(workload.seconds() * len(todo))
     for scene, sequence in sequences.items():
         of_first = partial(mean_baselines, sequence.training(0), sequence.truth(0))
         store.get(scene, "baseline", compute=of_first)
@@ -115,8 +108,10 @@ def measure(run: BenchRun) -> dict[str, Any]:
     return store.results
 
 
-def _sequences(workload: Workload, scenes: Sequence[str]) -> Iterable[tuple[str, MultiviewSequence]]:
-    for scene in scenes or SCENES:
+def _sequences(
+    workload: Workload, scenes: Sequence[str], asked: bool
+) -> Iterable[tuple[str, MultiviewSequence]]:
+    for scene in scenes:
         if scene == "room":
             w = workload
             made = synthetic_sequence(scene, w.cameras, w.size, w.fps, speed_m_per_s=w.speed_m_per_s)
@@ -126,7 +121,7 @@ def _sequences(workload: Workload, scenes: Sequence[str]) -> Iterable[tuple[str,
         try:
             yield scene, replace(recorded_sequence(data_file(path), holdout), name=scene)
         except DatasetError as error:
-            if scenes:
+            if asked:
                 raise BenchError(f"{scene}: {error}") from None
             print(f"  {scene} left out: {error}", flush=True)
 
@@ -142,7 +137,7 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
         key = sequence.key(frame)
         if key not in known:
             field = make_field(name, workload.options)
-            report = field.fit(sequence.training(frame), workload.fresh())
+            report = field.fit(sequence.training(frame), Budget(seconds=FRESH_S))
             start = start or field  # the first frame comes first
             score = _row(sequence.score(field, frame, scorer))
             known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
@@ -151,29 +146,30 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
         stayed = _row(sequence.score(start, frame, scorer))
         stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
         figures["fresh"][str(frame)] = {**known[key], **stale}
-        progress.advance(_amount(workload.fresh()))
+        progress.advance(FRESH_S)
         progress.report(f"{name} {sequence.name}", f"fresh at frame {frame}", _score_text(known[key]))
     assert start is not None
     warm = start.state()
-    for run, budget in workload.budgets().items():
+    for seconds in workload.update_s:
         start.load_state(warm)
+        run = f"{seconds:g}_s"
         figures[run] = _run(
-            start, sequence, workload, budget, figures["fresh"], scorer, progress, f"{name} {run}"
+            start, sequence, workload, seconds, figures["fresh"], scorer, progress, f"{name} {run}"
         )
     return {**figures, "outside_cores": load.outside_cores()}
 
 
 def _run(
-    field: Field, sequence: MultiviewSequence, workload: Workload, budget: Budget,
+    field: Field, sequence: MultiviewSequence, workload: Workload, seconds: float,
     fresh: Mapping[str, Mapping[str, Any]], scorer: Scorer, progress: Progress, label: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Updates of one length, one frame after the other."""
     rows: list[dict[str, Any]] = []
     for frame in range(1, workload.updates + 1):
-        report = field.fit(sequence.training(frame), budget)
+        report = field.fit(sequence.training(frame), Budget(seconds=seconds))
         score = _row(sequence.score(field, frame, scorer))
         rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
-        progress.advance(_amount(budget))
+        progress.advance(seconds)
         if frame % max(1, workload.updates // 10) == 0:
             at = f"update {frame} of {workload.updates}"
             progress.report(f"{label} {sequence.name}", at, _score_text(score))
@@ -223,10 +219,6 @@ def gaps(
 
 def _score_text(score: Mapping[str, Any]) -> str:
     return f"PSNR {_db(score['psnr_db'])} dB, moving {_db(score['psnr_moving_db'])} dB"
-
-
-def _amount(budget: Budget) -> float:
-    return float(budget.steps or budget.seconds or 0.0)
 
 
 def _row(score: Score) -> dict[str, Any]:
@@ -316,7 +308,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def _length(run: str, found: Mapping[str, Any]) -> str:
-    steps = "" if run.endswith("steps") or found["steps"] is None else f" ({found['steps']:.0f} steps)"
+    steps = "" if found["steps"] is None else f" ({found['steps']:.0f} steps)"
     return run.replace("_", " ") + steps
 
 

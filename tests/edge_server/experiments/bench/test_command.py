@@ -8,12 +8,17 @@ from itertools import product
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.experiments.bench import decide, ingest
 from edge_server.experiments.bench import field as bench_field
-from edge_server.experiments.bench import ingest
 from edge_server.experiments.bench.ingest import CAMERAS, TARGET_P99_MS
 from edge_server.experiments.bench.peer import race
 from edge_server.fields.ngp import settings
 from tests.conftest import data_dir
+
+
+@pytest.fixture
+def few_cameras(monkeypatch):
+    monkeypatch.setattr(decide, "CAMERAS", (3,))
 
 
 def bench(part: str, path, *words: str) -> dict:
@@ -23,11 +28,12 @@ def bench(part: str, path, *words: str) -> dict:
     return found[part]
 
 
-def test_fidelity(tmp_path, capsys):
-    found = bench("fidelity", tmp_path / "bench.json")
-    for size in ("128", "256"):
-        assert 0.0 < found[size]["psnr_ms"] < found[size]["score_ms"]
-    assert "256.ssim_ms" in capsys.readouterr().out
+def test_decide(tmp_path, capsys, few_cameras):
+    found = bench("decide", tmp_path / "bench.json")
+    for action in ("select", "wait"):
+        of = found[f"{action}, 3 cameras"]
+        assert 0.0 < of["network_ms_p50"] < of["decision_ms_p50"]
+    assert "select, 3 cameras.decision_ms_p99" in capsys.readouterr().out
 
 
 def test_embed(tmp_path, capsys, monkeypatch):
@@ -86,7 +92,7 @@ def _curve(name, still, planned_s, seeds, lpips):
     return {"seeds": seeds, "series": series, "seconds_to_db": to_db, "best_db": 25.0, "outside_cores": 0.25}
 
 
-def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, asked):
+def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, asked, few_cameras):
     rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
              "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
     starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
@@ -109,19 +115,20 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, ask
     assert text.count("\n## ") == 1
 
     # A second part beside it, and another representation: what is known stays, nothing is measured twice.
-    words = ["fidelity", "--quick", "--json", str(path), "--resume"]
+    words = ["decide", "--quick", "--json", str(path), "--resume"]
     assert edge_server(["bench", "field", *words, "--field", "ngp,tensorf"]) == 0
     more = json.loads(path.read_text())
     assert asked == ["ngp", "ngp", "tensorf", "tensorf"]
     assert more["field"]["tile"]["ngp"] == found["tile"]["ngp"] and "tensorf" in more["field"]["room"]
     text = path.with_suffix(".md").read_text()
     assert more["runs"] == 2 and "Measured in 2 runs" in text
-    assert "## field" in text and "## fidelity" in text
-    assert f"| 128.psnr_ms | {more['fidelity']['128']['psnr_ms']:.3g} |" in text
+    assert "## field" in text and "## decide" in text
+    ms = more["decide"]["wait, 3 cameras"]["state_ms_p50"]
+    assert f"| wait, 3 cameras.state_ms_p50 | {ms:.3g} |" in text
     # A part that is one figure is skipped as a whole.
-    before = more["fidelity"]
+    before = more["decide"]
     assert edge_server(["bench", *words]) == 0
-    assert json.loads(path.read_text())["fidelity"] == before
+    assert json.loads(path.read_text())["decide"] == before
 
 
 @pytest.mark.slow
@@ -145,12 +152,12 @@ def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch, asked)
     assert asked == [name for name in everything if not name.startswith("start")]
 
 
-def test_a_part_that_cannot_be_measured_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+def test_a_part_that_cannot_be_measured_does_not_stop_the_others(tmp_path, monkeypatch, capsys, few_cameras):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     path = tmp_path / "bench.json"
-    assert edge_server(["bench", "peer", "fidelity", "--quick", "--json", str(path)]) == 1
+    assert edge_server(["bench", "peer", "decide", "--quick", "--json", str(path)]) == 1
     assert "edge-server bench peer: set FRESHFIELD_DATA" in capsys.readouterr().err
-    assert "## fidelity" in path.with_suffix(".md").read_text()
+    assert "## decide" in path.with_suffix(".md").read_text()
     with pytest.raises(SystemExit):
         edge_server(["bench", "speed"])
     assert "no part is called speed; there are: field, track" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,39 +59,39 @@ def bench(path: Path, *words: str) -> int:
 
 
 def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(track, "QUICK", TINY)
-    runs = []
-    for name in ("a", "b"):
-        path = tmp_path / name / "bench.json"
-        assert bench(path, "--field", "ngp", "--steps", "2", *SMALL_WORDS) == 0
-        runs.append(json.loads(path.read_text())["track"]["room"])
-    found, again = (run["ngp"] for run in runs)
-    run = found["2_steps"]
-    assert run["series"]["frame"] == [1, 2, 3] and run["series"]["steps"] == [2, 2, 2]
-    assert sorted(found["fresh"]) == ["0", "3"] and found["fresh"]["3"]["steps"] == 30
-    # Steps repeat bit for bit, whatever the machine does meanwhile.
+    monkeypatch.setattr(track, "QUICK", replace(TINY, update_s=(0.1,)))
+    monkeypatch.setattr(track, "FRESH_S", 0.5)
+    path = tmp_path / "bench.json"
+    assert bench(path, "--field", "ngp", *SMALL_WORDS) == 0
+    found = json.loads(path.read_text())["track"]["room"]["ngp"]
+    run = found["0.1_s"]
+    assert run["series"]["frame"] == [1, 2, 3] and max(run["series"]["steps"]) >= 1
+    assert sorted(found["fresh"]) == ["0", "3"] and found["fresh"]["3"]["steps"] >= 1
     for metric in ("psnr_db", "psnr_moving_db"):
-        assert run["series"][metric] == again["2_steps"]["series"][metric]
         assert len(set(run["series"][metric])) == 3  # every update was scored on its own
     assert run["whole"]["mean_db"] == pytest.approx(np.mean(run["series"]["psnr_db"]))
 
-    path = tmp_path / "a" / "bench.json"
     assert (path.parent / "track.png").read_bytes()[:4] == b"\x89PNG"
     text = path.with_suffix(".md").read_text()
     assert "![track](track.png)" in text
     row = next(line for line in text.splitlines() if line.startswith("| room | ngp |"))
     cells = [cell.strip() for cell in row.split("|")[1:-1]]
     whole, moving = run["whole"], run["moving"]
-    assert cells[2:5] == ["2 steps", "3", f"{whole['mean_db']:.2f} ({moving['mean_db']:.2f})"]
+    assert cells[2:5] == [
+        f"0.1 s ({run['steps']:.0f} steps)",
+        "3",
+        f"{whole['mean_db']:.2f} ({moving['mean_db']:.2f})",
+    ]
     assert cells[5] == f"{whole['fresh_mean_db']:.2f} ({moving['fresh_mean_db']:.2f})"
     assert cells[7] == f"{100 * whole['share_near']:.0f} % ({100 * moving['share_near']:.0f} %)"
     assert cells[8] == f"{whole['median_db']:.2f} ({moving['median_db']:.2f})"
     assert row in capsys.readouterr().out
 
 
-def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, flat):
+def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, monkeypatch, flat):
     """Interpolation is exact at the sampled frames, and every frame is sampled here."""
-    assert bench(tmp_path / "bench.json", "--field", "ngp", "--updates", "4", "--samples", "5") == 0
+    monkeypatch.setattr(track, "QUICK", replace(track.QUICK, updates=4, samples=5))
+    assert bench(tmp_path / "bench.json", "--field", "ngp") == 0
     found = json.loads((tmp_path / "bench.json").read_text())["track"]["room"]["ngp"]
     assert set(found) >= {"fresh", "1_s", "0.25_s"}
     for kind in ("whole", "moving"):
@@ -104,15 +105,13 @@ def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, flat):
 
 def test_drift_is_the_same_at_length_and_kept_apart(tmp_path, flat):
     path = tmp_path / "bench.json"
-    assert bench(path, "--field", "ngp", "--updates", "4") == 0
+    assert bench(path, "--field", "ngp") == 0
     words = ["bench", "drift", "--quick", "--resume", "--json", str(path), "--field", "ngp"]
     assert edge_server(words) == 0
     found = json.loads(path.read_text())
-    assert found["track"]["room"]["ngp"]["1_s"]["updates"] == 4
+    assert found["track"]["room"]["ngp"]["1_s"]["updates"] == 3
     assert list(found["drift"]) == ["room"] and found["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 32
     assert "![drift](drift.png)" in path.with_suffix(".md").read_text()
-    assert edge_server([*words, "--updates", "5"]) == 0
-    assert json.loads(path.read_text())["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 5
 
 
 def test_gaps_are_against_the_interpolated_fresh_fits():
@@ -134,7 +133,7 @@ def test_gaps_are_against_the_interpolated_fresh_fits():
     assert gaps(frames, tracked, {})["share_near"] is None
 
 
-def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, capsys):
+def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, monkeypatch, capsys):
     path = tmp_path / "bench.json"
     words = ("--field", "ngp", "--field", "tensorf")
     flat.interrupt = 2 + 2 * 3 + 2 + 2  # the second update of tensorf's first run
@@ -153,7 +152,8 @@ def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, caps
     assert whole["ngp"] == rows["ngp"] and whole["tensorf"]["0.25_s"]["series"]["frame"] == [1, 2, 3]
 
     # Other settings are other figures.
-    assert bench(path, *words, "--resume", "--updates", "2") == 0
+    monkeypatch.setattr(track, "QUICK", replace(TINY, updates=2))
+    assert bench(path, *words, "--resume") == 0
     assert json.loads(path.read_text())["track"]["room"]["ngp"]["1_s"]["updates"] == 2
 
 
@@ -193,8 +193,7 @@ def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
     assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--updates", "0"], ["--update-s", "1,x"], ["--scene", "attic"]])
-def test_wrong_words_are_refused(words, flat, capsys):
+def test_an_unknown_scene_is_refused(flat, capsys):
     with pytest.raises(SystemExit):
-        edge_server(["bench", "track", "--quick", *words])
-    assert words[0] in capsys.readouterr().err
+        edge_server(["bench", "track", "--quick", "--scene", "attic"])
+    assert "--scene" in capsys.readouterr().err
