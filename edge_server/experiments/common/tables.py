@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,3 +40,18 @@ def mean_or_none(values: Iterable[float | None]) -> float | None:
     """The mean of the values that are known; None where none is."""
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known else None
+
+
+def over_seeds(
+    rows: Iterable[Mapping[str, Any]], keys: Sequence[str], names: Sequence[str],
+    average: Callable[[Iterable[float | None]], float | None],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Rows with the same values of ``keys`` as one: these values, how many ``seeds`` there were, and the
+    average of each of ``names``."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [
+        {**dict(zip(keys, values)), "seeds": len(of), **{n: average(row[n] for row in of) for n in names}}
+        for values, of in groups.items()
+    ]

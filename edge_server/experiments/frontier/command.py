@@ -27,7 +27,7 @@ from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
-from edge_server.scheduler import make_policy
+from edge_server.scheduler import make_policy, parse_policy
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
 
@@ -50,7 +50,7 @@ A scenario with a deadline_ms chooses the effort and the time of its updates fro
 names (frontier: OUT/frontier.json), else of one that was measured once and is shipped.
 
 Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command goes on where it stopped;
-with other settings, points are measured anew. --fresh measures everything anew.
+with other settings, points are measured anew.
 """
 
 
@@ -61,7 +61,6 @@ Row = dict[str, Any]
 class Sweep:
     """What is measured.
 
-    single_options: whether options alone are tried, too, in figure 1.
     planned_s: seconds of fitting from scratch.
     update_s: seconds an update takes.
     run_s: virtual seconds of a moving run, or six updates where those take longer.
@@ -69,7 +68,6 @@ class Sweep:
     """
 
     seeds: int
-    single_options: bool
     planned_s: tuple[float, ...]
     speeds: tuple[float, ...]
     update_s: tuple[float, ...]
@@ -82,7 +80,6 @@ class Sweep:
 
 QUICK = Sweep(
     seeds=1,
-    single_options=False,
     planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
@@ -94,7 +91,6 @@ QUICK = Sweep(
 )
 FULL = Sweep(
     seeds=3,
-    single_options=True,
     planned_s=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0),
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
@@ -111,7 +107,6 @@ LAYERS_S = 0.02  # the shortest update of layers, which scenarios with layers ha
 # the cost of a step with as many and as large views as the runs have.
 SHIPPED = replace(
     FULL,
-    single_options=False,
     planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
     update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
     run_s=8.0,
@@ -148,18 +143,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, metavar="N", help="the first one [%(default)s]")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--points", type=Path, metavar="FILE", help="figure 2 there, too: what deadline_ms chooses from")
-    add("--fresh", action="store_true", help="forget the points that OUT holds")
     add("--out", type=Path, default=Path("runs/frontier"), metavar="DIR", help="[%(default)s]")
     return parser
 
 
 def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
-    name, _, value = args.policy.partition(":")
-    try:
-        number = float(value) if value else None
-    except ValueError:
-        raise ValueError(f"--policy {args.policy}: {value!r} is not a number") from None
-    policy = make_policy(name, number, np.random.default_rng(0))
+    name, value = parse_policy(args.policy)
+    policy = make_policy(name, value, np.random.default_rng(0))
     sweep = replace(sweep, moving=replace(sweep.moving, policy=name, policy_value=policy.value))
     if args.seeds is not None:
         if args.seeds < 1:
@@ -169,14 +159,12 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     if unknown := set(fields) - set(field_names()):
         raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     options = parse_options(args.option)
-    levels = [
-        level for field in fields for level in effort_sweep.efforts(field, options, sweep.single_options)
-    ]
+    levels = [level for field in fields for level in effort_sweep.efforts(field, options)]
     for level in levels:
         make_field(level.field, level.options)  # refuses wrong options now, not between two measurements
     still = open_still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
     args.out.mkdir(parents=True, exist_ok=True)
-    file = FrontierFile(args.out / "frontier.json", args.fresh)
+    file = FrontierFile(args.out / "frontier.json")
     lpips, missing = open_lpips(args.lpips)
     return Frontier(
         args.out, file, sweep, still, args.scene, fields, levels, lpips, missing, args.seed, args.points
@@ -186,10 +174,10 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
 class FrontierFile:
     """frontier.json: every finished point with the settings it was measured with, written as it goes."""
 
-    def __init__(self, path: Path, fresh: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.data: Row = {"points": {}}
-        if path.is_file() and not fresh:
+        if path.is_file():
             try:
                 self.data["points"] = dict(json.loads(path.read_text())["points"])
             except (ValueError, KeyError, TypeError):
@@ -276,7 +264,7 @@ class Frontier:
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
-                "figure": 1, "scene": self.still.describe(), **_settings(effort), "divided": effort.divided,
+                "figure": 1, "scene": self.still.describe(), **_settings(effort),
                 "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
             measure = partial(effort_sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
@@ -291,7 +279,7 @@ class Frontier:
 
     @property
     def _live(self) -> list[effort_sweep.Effort]:
-        return [e for e in self.levels if e.live and e.name in self.sweep.efforts]
+        return [e for e in self.levels if e.name in self.sweep.efforts]
 
     def _charged(self) -> dict[str, Compute]:
         """Cost of an update of each effort in virtual time: measured on this machine with as many images as
@@ -324,7 +312,8 @@ class Frontier:
         count = sum(len(times[effort.name]) for effort, _, _ in runs)
         for effort, speed, seed in runs:
             # Made for the first new point only: a resumed sweep makes only what it still needs.
-            start = cache(partial(_warm_start, sweep, effort, speed, seed))
+            of = (sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
+            start = cache(partial(update_time.WarmStart, *of))
             compute = charged[effort.label]
             for update_s in times[effort.name]:
                 seconds, layers = max(sweep.run_s, 6.0 * update_s), effort.name == "layers"
@@ -359,10 +348,6 @@ def _settings(effort: effort_sweep.Effort) -> Row:
     return {"field": effort.field, "options": effort.options, "defaults": digest}
 
 
-def _warm_start(sweep: Sweep, effort: effort_sweep.Effort, speed: float, seed: int) -> update_time.WarmStart:
-    return update_time.WarmStart(sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
-
-
 def _moving_run(start: Callable[[], update_time.WarmStart], *how: Any) -> Row:
     return start().run(*how)
 
@@ -379,7 +364,3 @@ def _known(new: bool) -> str:
 
 def _db(value: float | None) -> str:
     return "   -   " if value is None else f"{value:5.2f} dB"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
+from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.frontier.update_time import best
 from edge_server.report.style import CYCLE, INK, figure
 from freshfield.files import write_csv
@@ -33,36 +34,26 @@ def write_output(out: Path, data: Row) -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """Effort levels by seconds: PSNR, SSIM, LPIPS; a star marks the Pareto front."""
-    lines = [f"{'effort':22} {'seconds':>8} {'steps':>6} {'ms/step':>8} {'PSNR':>7} {'SSIM':>6} {'LPIPS':>6}"]
-    for row in rows:
-        lines.append(
-            f"{row['effort']:22} {row['seconds']:8.2f} {row['steps']:6.0f} {row['ms_per_step']:8.2f} "
-            f"{row['psnr_db']:7.2f} {_n(row['ssim'])} {_n(row['lpips'])} {'*' if row['on_front'] else ''}"
-        )
-    return "\n".join([*lines, "* on the Pareto front: nothing measured is both faster and more accurate"])
+    digits = {"seconds": 2, "steps": 0, "ms_per_step": 2, "psnr_db": 2, "ssim": 3, "lpips": 3}
+    cells = [
+        (row["effort"], *(number(row[name], n) for name, n in digits.items()), "*" if row["on_front"] else "")
+        for row in rows
+    ]
+    head = ("effort", "seconds", "steps", "ms a step", "PSNR, dB", "SSIM", "LPIPS", "")
+    front = "* on the Pareto front: nothing measured is both faster and more accurate"
+    return f"{markdown_table(head, cells)}\n{front}"
 
 
 def updates_table(rows: Sequence[Row]) -> str:
     """What is shown by speed and seconds an update takes, and what was published."""
-    names = ("shown", "moving", "publ.", "moving")
-    lines = [
-        f"{'field, effort':16} {'speed':>8} {'update':>8} {'steps':>6} {'age':>9} "
-        + " ".join(f"{n:>7}" for n in names)
-    ]
-    for row in rows:
-        numbers = [row[k] for k in ("shown_psnr_db", "shown_psnr_moving_db", "psnr_db", "psnr_moving_db")]
-        lines.append(
-            f"{_label(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
-            f"{row['shown_age_ms']:6.0f} ms "
-            + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
-        )
-    return "\n".join(
-        [
-            *lines,
-            "shown: at random instants, the newest publication carried on; age: of its views then",
-            "publ.: at publication",
-        ]
-    )
+    digits = {
+        "speed_m_per_s": 1, "update_s": 2, "steps": 0, "shown_age_ms": 0, "shown_psnr_db": 2,
+        "shown_psnr_moving_db": 2, "psnr_db": 2, "psnr_moving_db": 2,
+    }  # fmt: skip
+    cells = [(_label(row), *(number(row[name], n) for name, n in digits.items())) for row in rows]
+    head = "field, effort|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
+    about = "shown: at random instants, the newest publication carried on; age: of its views then"
+    return f"{markdown_table(head.split('|'), cells)}\n{about}"
 
 
 def conclusion(rows: Sequence[Row]) -> str:
@@ -99,10 +90,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
                     label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
                 )  # fmt: skip
             if key == "psnr_db":
-                ax.plot(
-                    [r["seconds"] for r in front], [r[key] for r in front], "o", markersize=9, mfc="none",
-                    color=INK, label="Pareto front",
-                )  # fmt: skip
+                _encircle(ax, [r["seconds"] for r in front], [r[key] for r in front], "Pareto front")
             name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
             ax.set_ylabel(f"{name}, {'lower' if key == 'lpips' else 'higher'} is better")
         axes[0, 0].set_title(f"What accuracy costs in time: {data['scene']}")
@@ -128,28 +116,14 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
                     group = sorted((r for r in here if (r["field"], r["effort"]) == who),
                                    key=lambda r: r["update_s"])  # fmt: skip
                     x = [r["update_s"] for r in group]
-                    ax.plot(
-                        x,
-                        [r[f"shown_{key}"] for r in group],
-                        marker=".",
-                        linewidth=1.2,
-                        label=" ".join(who),
-                        **look,
-                    )
+                    shown = [r[f"shown_{key}"] for r in group]
+                    ax.plot(x, shown, marker=".", linewidth=1.2, label=" ".join(who), **look)
                     if who == main:
                         ax.plot(x, [r[key] for r in group], ":", color=look["color"], linewidth=1.0,
                                 label=f"{' '.join(main)},\nat publication")  # fmt: skip
                 top = best(here, f"shown_{key}")
                 if top is not None:
-                    ax.plot(
-                        [top["update_s"]],
-                        [top[f"shown_{key}"]],
-                        "o",
-                        markersize=10,
-                        mfc="none",
-                        color=INK,
-                        label="best",
-                    )
+                    _encircle(ax, [top["update_s"]], [top[f"shown_{key}"]], "best")
         for ax, speed in zip(axes[0], speeds):
             ax.set_title(f"{speed:g} m/s")
         for ax in axes[-1]:
@@ -158,6 +132,10 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
             ax.tick_params(axis="x", labelrotation=90)
         fig.suptitle("More is not always better: the world moves while the field is fitted")
         fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
+
+
+def _encircle(axes: Axes, x: Sequence[float], y: Sequence[float], label: str) -> None:
+    axes.plot(x, y, "o", markersize=9, mfc="none", color=INK, label=label)
 
 
 def _line_styles(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
@@ -184,7 +162,3 @@ def _flat(rows: Sequence[Row]) -> list[Row]:
 
 def _label(row: Row) -> str:
     return f"{row['field']} {row['effort']}"
-
-
-def _n(value: float | None) -> str:
-    return "     -" if value is None else f"{value:6.3f}"

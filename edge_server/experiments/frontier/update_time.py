@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.capture import Camera
-from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
@@ -219,26 +220,20 @@ def best(rows: list[dict[str, Any]], metric: str = "shown_psnr_moving_db") -> di
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the same field, effort, speed and planned update time as the mean of their seeds, with the
     standard error of the two PSNRs shown (None for a single seed)."""
-    groups: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
-    for row in rows:
-        key = (row["field"], row["effort"], row["speed_m_per_s"], row["planned_update_s"])
-        groups.setdefault(key, []).append(row)
-    means = []
-    for (field, effort, speed, planned_s), group in groups.items():
-        row = {
-            "field": field, "effort": effort, "options": group[0]["options"], "speed_m_per_s": speed,
-            "planned_update_s": planned_s, "seeds": len(group),
-        }  # fmt: skip
-        for name in (
-            "update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, "shown_age_ms", *SHOWN_METRICS
-        ):  # fmt: skip
-            row[name] = mean_or_none([r[name] for r in group])
-        for name in SHOWN_METRICS[:2]:
-            known = [r[name] for r in group if r[name] is not None]
-            many = len(known) > 1
-            row[f"{name}_error"] = float(np.std(known, ddof=1) / np.sqrt(len(known))) if many else None
-        means.append(row)
+    keys = ("field", "effort", "speed_m_per_s", "planned_update_s")
+    names = ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, "shown_age_ms", *SHOWN_METRICS)
+    means = over_seeds(rows, keys, names, mean_or_none)
+    errors = over_seeds(rows, keys, SHOWN_METRICS[:2], _standard_error)
+    options = {tuple(row[key] for key in keys): row["options"] for row in rows}
+    for row, error in zip(means, errors):
+        row["options"] = options[tuple(row[key] for key in keys)]
+        row |= {f"{name}_error": error[name] for name in SHOWN_METRICS[:2]}
     return means
+
+
+def _standard_error(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.std(known, ddof=1) / np.sqrt(len(known))) if len(known) > 1 else None
 
 
 def _view(camera: Camera, at_ns: int = 0) -> View:

@@ -123,21 +123,6 @@ def test_the_conclusion_names_the_best_time_of_each_speed():
     assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
 
 
-def test_images_of_half_the_size_keep_what_a_camera_sees():
-    still = synthetic_still("tile", cameras=3, size=32)
-    (small, *_) = effort_sweep.downscaled(still.training, 2.0)
-    view = still.training[0]
-    assert small.image.shape == (16, 16, 3) and small.intrinsics.fx == view.intrinsics.fx / 2
-    assert np.allclose(small.image, view.image.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), atol=1.0)
-    see_through = np.zeros((4, 4, 4), np.uint8)
-    see_through[:2, :, :] = (200, 100, 50, 255)
-    see_through[2:, :, :3] = 255  # what a transparent pixel is coloured must not bleed
-    lens = view.intrinsics.scaled(4 / 32)
-    (small,) = effort_sweep.downscaled([replace(view, image=see_through, intrinsics=lens)], 4.0)
-    assert small.image.tolist() == [[[200, 100, 50, 128]]]
-    assert effort_sweep.downscaled(still.training, 1.0) == still.training
-
-
 @pytest.fixture
 def tiny_sweep(monkeypatch):
     sweep = replace(
@@ -156,9 +141,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())
-    assert set(data["ms_per_step"]) == {
-        e.label for e in effort_sweep.efforts("ngp", {}, single_options=False)
-    }
+    assert set(data["ms_per_step"]) == {e.label for e in effort_sweep.efforts("ngp", {})}
     assert all(ms > 0 for ms in data["ms_per_step"].values())
     with (tmp_path / "updates.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
@@ -178,7 +161,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
 def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
     still, (effort, *_) = (
         synthetic_still("tile", cameras=3, size=16),
-        effort_sweep.efforts("voxel", {}, single_options=False),
+        effort_sweep.efforts("voxel", {}),
     )
     sweep = replace(command.QUICK, planned_s=(0.5,))
     measured = []
