@@ -31,14 +31,12 @@ class Interval:
     count: int
 
     def __str__(self) -> str:
-        if self.count < 2:
-            return f"{self.mean:.2f}"
-        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        return self.text(2)
 
     def text(self, digits: int) -> str:
-        """``mean [low, high]`` with so many decimals."""
+        """``mean [low, high]`` with so many decimals; of a single value the mean alone."""
         mean, low, high = (number(v, digits) for v in (self.mean, self.low, self.high))
-        return f"{mean} [{low}, {high}]"
+        return mean if np.isnan(self.low) else f"{mean} [{low}, {high}]"
 
     def rounded(self, digits: int) -> list[float | None]:
         """Mean, low and high as JSON values, None for NaN and infinity."""

@@ -25,36 +25,48 @@ from edge_server.fields.registry import field_names
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
-# name -> (module, class)
+# name -> (module, class, one line of help)
 STUDIES = {
-    "metrics": ("metric_distortions", "Metrics"),
-    "mat": ("age.max_age", "Mat"),
-    "mat-delay": ("age.max_age_by_delay", "MatDelay"),
-    "lambda": ("age.age_weight", "Weighing"),
-    "omega": ("age.omega", "Omega"),
-    "images": ("age.image_count", "Images"),
-    "representations": ("age.representations", "Representations"),
-    "phase": ("age.trade_map", "Phase"),
-    "viewpoints": ("viewpoints", "Viewpoints"),
-    "preferences": ("preferences", "Preferences"),
-    "ppo-select": ("learning.ppo_select", "PpoSelect"),
-    "ppo-wait": ("learning.ppo_wait", "PpoWait"),
-    "ablation": ("learning.state_ablation", "Ablation"),
-    "weights": ("learning.reward_weights", "Weights"),
-    "drift": ("learning.channel_drift", "Drift"),
-    "transfer": ("learning.transfer", "Transfer"),
-    "semantics": ("learning.semantics", "Semantics"),
-    "reward-cost": ("learning.reward_cost", "RewardCost"),
-}
+    "metrics": ("metric_distortions", "Metrics",
+                "figure 3.6: what PSNR, SSIM and LPIPS say of three artefacts"),
+    "mat": ("age.max_age", "Mat", "figures 5.6, 5.7: fidelity against the maximum age of used views"),
+    "mat-delay": ("age.max_age_by_delay", "MatDelay",
+                  "figure 5.8: the best maximum age against the mean delay"),
+    "lambda": ("age.age_weight", "Weighing", "equation 5.8: the weight of timeliness"),
+    "omega": ("age.omega", "Omega",
+              "figures 6.3, 6.4: threshold and wait, two traffic states, with and without flush"),
+    "images": ("age.image_count", "Images", "figures 6.5, 6.6: LPIPS and age against the number of images"),
+    "representations": ("age.representations", "Representations",
+                        "figure 6.7: the same trade with other representations"),
+    "phase": ("age.trade_map", "Phase",
+              "where the trade exists: speed x delay x memory x compute, and what mask and freshen gain"),
+    "viewpoints": ("viewpoints", "Viewpoints",
+                   "tables 4.1, 4.3, figures 4.7, 4.8: which views to take of an object that stands still"),
+    "preferences": ("preferences", "Preferences",
+                    "figure 4.6, tables 4.2, 4.3: what simulated experts' preferences teach"),
+    "ppo-select": ("learning.ppo_select", "PpoSelect",
+                   "figure 5.9: a scheduler that learns which views to use, against everything else"),
+    "ppo-wait": ("learning.ppo_wait", "PpoWait",
+                 "figure 6.8: one that learns how long to wait, or how old is too old, by traffic"),
+    "ablation": ("learning.state_ablation", "Ablation",
+                 "what ages, poses and semantics in the state are worth to what is learnt"),
+    "weights": ("learning.reward_weights", "Weights",
+                "what is learnt by other weights of the reward, judged by all of them"),
+    "drift": ("learning.channel_drift", "Drift",
+              "the channel changes during use: fixed, learnt, and still learning"),
+    "transfer": ("learning.transfer", "Transfer", "learnt on one scene and channel, used on another"),
+    "semantics": ("learning.semantics", "Semantics",
+                  "where it helps to look at the pictures, and what it costs where it does not"),
+    "reward-cost": ("learning.reward_cost", "RewardCost",
+                    "what is learnt against the time it takes, by the effort of a fit and the embedding"),
+}  # fmt: skip
 # Studies that consist of cases: --case selects some of them.
 CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
 # Studies that train: they take long and are not part of "all".
-LEARNING = (
-    "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
-)  # fmt: skip
+LEARNING = tuple(name for name, (module, *_) in STUDIES.items() if module.startswith("learning."))
 # Studies of captures: they run in this process, and are not part of "all" either.
 CAPTURING = ("viewpoints", "preferences")
-DESCRIPTION = """\
+DESCRIPTION = f"""\
 The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
 with 95 % intervals over seeds, and whether it holds.
 
@@ -63,26 +75,7 @@ with 95 % intervals over seeds, and whether it holds.
   edge-server study omega --seeds 20 --jobs 8 --scene kitchen --data ~/data
   edge-server study phase --ray auto
 
-  metrics           figure 3.6: what PSNR, SSIM and LPIPS say of three artefacts
-  mat               figures 5.6, 5.7: fidelity against the maximum age of used views
-  mat-delay         figure 5.8: the best maximum age against the mean delay
-  lambda            equation 5.8: the weight of timeliness
-  omega             figures 6.3, 6.4: threshold and wait, two traffic states, with and without flush
-  images            figures 6.5, 6.6: LPIPS and age against the number of images
-  representations   figure 6.7: the same trade with other representations
-  phase             where the trade exists: speed x delay x memory x compute, and what mask and freshen gain
-  viewpoints        tables 4.1, 4.3, figures 4.7, 4.8: which views to take of an object that stands still
-  preferences       figure 4.6, tables 4.2, 4.3: what simulated experts' preferences teach
-
-  ppo-select        figure 5.9: a scheduler that learns which views to use, against everything else
-  ppo-wait          figure 6.8: one that learns how long to wait, or how old is too old, by traffic
-  ablation          what ages, poses and semantics in the state are worth to what is learnt
-  weights           what is learnt by other weights of the reward, judged by all of them
-  drift             the channel changes during use: fixed, learnt, and still learning
-  transfer          learnt on one scene and channel, used on another
-  semantics         where it helps to look at the pictures, and what it costs where it does not
-  reward-cost       what is learnt against the time it takes, by the effort of a fit and the embedding
-
+{"".join(f"  {name:17} {line}{chr(10)}" for name, (_, _, line) in STUDIES.items())}
 Studies of what learns, ppo-select and below, take half an hour to an hour each with --quick on two cores,
 with one training an arm; without it, with three and more episodes, most of a day and more. In between:
 
@@ -118,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make_study(name: str) -> Any:
     """The study of that name; its module is imported only now."""
-    module, cls = STUDIES[name]
+    module, cls, _ = STUDIES[name]
     return getattr(importlib.import_module(f"edge_server.experiments.studies.{module}"), cls)()
 
 

@@ -57,7 +57,9 @@ def draw_metrics(
                     style = (":", "--", "-.")[k % 3]
                     at.axhline(level.mean, color=GREY, linestyle=style, linewidth=1.2, label=label)
             last = metric == shown[-1]
-            label_lines(at, METRICS[metric][0], axis if last else None, title if metric == shown[0] else None)
+            label_lines(
+                at, METRICS[metric].label, axis if last else None, title if metric == shown[0] else None
+            )
 
 
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:

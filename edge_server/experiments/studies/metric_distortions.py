@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from camera_node.synthetic import make_scene
 from edge_server.experiments.common.statistics import Interval, all_of, interval, paired
 from edge_server.experiments.studies.drawing import draw_images
-from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool, number
+from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict, number
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
@@ -62,12 +62,9 @@ def _with_psnr(reference: Unit, case: str, wanted_db: float) -> Unit:
     return distorted(reference, case, high)
 
 
-class Metrics:
+class Metrics(Study):
     name = "metrics"
     title = "What the three metrics say of three artefacts (figure 3.6)"
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        return []
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         lpips, missing = open_lpips(request.folders.lpips)
@@ -106,7 +103,7 @@ class Metrics:
         gaps = [_gap(b, a) for a, b in pairwise(order)]
         text = ", ".join(f"{interval(values).mean:.3f}" for values in order)
         claim = "brightness shift < ghosting < blur (figure 3.6's table)."
-        rising = by_bool(all_of(gap.above(0.0) for gap in gaps))
+        rising = all_of(gap.above(0.0) for gap in gaps)
         return [*verdicts, Verdict("LPIPS", claim, text + ".", rising, min(gaps, key=lambda gap: gap.mean))]
 
     def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
@@ -114,7 +111,7 @@ class Metrics:
         gaps = [
             _gap(v[metric], mine) if lowest else _gap(mine, v[metric]) for c, v in scores.items() if c != case
         ]
-        answer = by_bool(all_of(gap.above(0.0) for gap in gaps))
+        answer = all_of(gap.above(0.0) for gap in gaps)
         text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
         return Verdict(
             metric.upper(),

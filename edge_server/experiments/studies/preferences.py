@@ -12,7 +12,7 @@ from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import Row
 from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Workload, plan
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
@@ -38,13 +38,9 @@ _UPDATES = {True: 30, False: 80}  # of PPO
 _POOL = {True: 60, False: 120}  # reconstructions; a third of them is kept for unseen pairs
 
 
-class Preferences:
+class Preferences(Study):
     name = "preferences"
     title = "What preferences of simulated experts teach (figure 4.6, tables 4.2, 4.3)"
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        """None: its trials are captures, not deployments."""
-        return []
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         work = QUICK if request.quick else FULL
@@ -191,14 +187,14 @@ def judge_answers(rows: list[Row]) -> list[Verdict]:
         verdicts.append(Verdict(
             f"simulated expert, {taste}, 10 % wrong",
             f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
-            f"{share.text(3)} of it, on unseen pairs.", by_bool(share.above(0.9)), share,
+            f"{share.text(3)} of it, on unseen pairs.", share.above(0.9), share,
         ))  # fmt: skip
     unsure = [not r["knows"] for r in rows if r["habit"] == "contradicting" and r["answers"] == ASKED[-1]]
     sure = [r["knows"] for r in rows if r["habit"] == "careful" and r["answers"] == ASKED[-1]]
     verdicts.append(Verdict(
         "simulated experts, contradicting", "the model says that it does not know.",
         f"it says so in {sum(unsure)} of {len(unsure)} cases; of careful experts it says that it knows in "
-        f"{sum(sure)} of {len(sure)}.", by_bool(sum(unsure) >= 0.9 * len(unsure)),
+        f"{sum(sure)} of {len(sure)}.", sum(unsure) >= 0.9 * len(unsure),
     ))  # fmt: skip
     return verdicts
 
@@ -211,7 +207,7 @@ def judge_captures(captures: list[Row]) -> list[Verdict]:
             way = paired(_of(captures, "path_m", arm=arm), _of(captures, "path_m", arm=other))
             verdicts.append(Verdict(
                 f"{arm}, {JUDGED} views", f"better than {other} (table 4.3).",
-                f"{gain.text(2)} dB, with a path {way.text(2)} m longer.", by_bool(gain.above(0.0)), gain,
+                f"{gain.text(2)} dB, with a path {way.text(2)} m longer.", gain.above(0.0), gain,
             ))  # fmt: skip
     return verdicts
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.statistics import Interval, interval, paired
@@ -17,18 +17,27 @@ from edge_server.scheduler.learned.rewards import f_w
 from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
-# metric -> (label of an axis, lower is better, digits)
-METRICS: dict[str, tuple[str, bool, int]] = {
-    "psnr_db": ("PSNR (dB)", False, 2),
-    "psnr_moving_db": ("PSNR, moving pixels (dB)", False, 2),
-    "ssim": ("SSIM", False, 3),
-    "lpips": ("LPIPS", True, 3),
-    "aaoi_ms": ("mean age of used views (ms)", True, 1),
-    "f_w": ("F_w (6.37)", True, 3),
-}
-# Smallest differences that support a claim, in PSNR and in the other metrics.
+
+
+class Metric(NamedTuple):
+    """label: of an axis. lower: whether lower is better. digits: of its figures. least: smallest difference
+    that supports a claim."""
+
+    label: str
+    lower: bool
+    digits: int
+    least: float
+
+
 LEAST_DB = 0.1
-LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
+METRICS = {
+    "psnr_db": Metric("PSNR (dB)", False, 2, LEAST_DB),
+    "psnr_moving_db": Metric("PSNR, moving pixels (dB)", False, 2, LEAST_DB),
+    "ssim": Metric("SSIM", False, 3, 0.002),
+    "lpips": Metric("LPIPS", True, 3, 0.002),
+    "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
+    "f_w": Metric("F_w (6.37)", True, 3, 0.01),
+}
 
 Curve = dict[float, dict[int, float | None]]
 # Recorded scenes and their file below the data folder.
@@ -67,10 +76,6 @@ class StudyRequest:
             )
         return [case for case in cases if any(word in case for word in self.cases)]
 
-    def training_episodes(self, episodes: Mapping[bool, int]) -> int:
-        """Number of episodes of one training. episodes: the study's default, keyed by ``quick``."""
-        return self.episodes or episodes[self.quick]
-
     def command(self, study: str) -> str:
         """The command that repeats this request, without folders and processes, which change nothing."""
         words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
@@ -85,24 +90,79 @@ class StudyRequest:
         """Seeds of a point: the requested number, else that of a quick or full pass."""
         return range(self.seeds or (quick if self.quick else full))
 
+    def scenes_here(self, default: Sequence[str]) -> list[str]:
+        """The requested scenes, else ``default``, without recorded ones that are not in the data folder."""
+        wanted, data = list(self.scenes or default), self.folders.data
+        found = []
+        for scene in wanted:
+            file = RECORDED.get(scene)
+            if file is None or (data is not None and (data / file).exists()):
+                found.append(scene)
+            else:
+                print(
+                    f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)"
+                )
+        if not found:
+            raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
+        return found
+
+    def trial(self, scene: str, **more: Any) -> Trial:
+        """The usual trial of a scene, with the image size and the steps of the self. more: of ``Trial``."""
+        sized: Row = {"size": 64, "steps": 150} if self.quick else {"size": 128, "steps": 400}
+        if scene in RECORDED:
+            scale = 2.0 if self.quick else 1.0
+            sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
+        return Trial(scene=scene, **{"field": self.field, **sized, **more})
+
+    def sweep(
+        self, scene: str, seeds: Iterable[int], conditions: Sequence[tuple[Row, Row]], x: str,
+        values: Mapping[str, Sequence[float]], ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
+    ) -> list[Point]:  # fmt: skip
+        """For every seed: use-all and each value of each policy in every condition, and points without delay.
+
+        conditions, ideals: (labels in the table, settings of the trial) of each.
+        x: label that holds the value.
+        values: policy -> its values.
+        """
+        found = []
+        for seed in seeds:
+            for labels, settings in conditions:
+                base, labels = self.trial(scene, seed=seed, **settings), {"scene": scene, **labels}
+                found.append(Point({**labels, "policy": "all"}, base))
+                found += [
+                    Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
+                    for policy, some in values.items() for value in some
+                ]  # fmt: skip
+            for labels, settings in ideals:
+                ideal = self.trial(scene, seed=seed, channel={"preset": "ideal"}, **settings)
+                found.append(Point({"scene": scene, **labels, "policy": "no delay"}, ideal))
+        return found
+
 
 @dataclass(frozen=True)
 class Verdict:
     """The thesis's claim, the result here, and whether the claim holds.
 
     about: scene and setting.
+    holds: None where it is undecided.
     interval: of the difference that the claim is about; None where it is about several, or a single value.
     """
 
     about: str
     claim: str
     found: str
-    verdict: str
+    holds: bool | None
     interval: Interval | None = None
+
+    @property
+    def verdict(self) -> str:
+        return UNDECIDED if self.holds is None else HOLDS if self.holds else DOES_NOT_HOLD
 
     def mapping(self) -> Row:
         """As JSON values; the interval as [mean, low, high]."""
-        return {**vars(self), "interval": None if self.interval is None else self.interval.rounded(4)}
+        interval = None if self.interval is None else self.interval.rounded(4)
+        texts = {name: getattr(self, name) for name in ("about", "claim", "found", "verdict")}
+        return {**texts, "interval": interval}
 
     def line(self) -> str:
         return f"[{self.verdict}] {self.about}: {self.claim} Found: {self.found}"
@@ -161,18 +221,53 @@ class Table:
             for key, rows in groups.items()
         ]
 
+    def no_delay_gain(self, metric: str, **labels: Any) -> str:
+        """Describe how much better no delay is than using all views: the limit of any scheduler's gain."""
+        kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
+        use_all = self.values(metric, policy="all", **labels)
+        limit = self.values(metric, policy="no delay", **kept)
+        _, lower, digits, least = METRICS[metric]
+        gap = paired(use_all, limit) if lower else paired(limit, use_all)
+        if metric == "aaoi_ms":
+            return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
+        nothing = " (nothing to win)" if gap.above(least) is False else ""
+        return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
 
-class Study(Protocol):
+
+class Study:
     """One study. name: of the command. title: one line for people."""
 
     name: str
     title: str
 
-    def points(self, request: StudyRequest) -> list[Point]: ...
+    def points(self, request: StudyRequest) -> list[Point]:
+        """Independent trials; none of a study that makes its own."""
+        return []
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         """Draw the figures into ``request.out`` and judge the claims."""
-        ...
+        raise NotImplementedError
+
+
+class SceneStudy(Study):
+    """A study that has the same points in each scene, and judges one scene after the other.
+
+    scenes: where none are asked for.
+    """
+
+    scenes: tuple[str, ...] = ("room",)
+
+    def points(self, request: StudyRequest) -> list[Point]:
+        return [p for scene in request.scenes_here(self.scenes) for p in self.of_scene(request, scene)]
+
+    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+        return [v for scene in table.distinct("scene") for v in self.judge(request, table, scene)]
+
+    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
+        raise NotImplementedError
+
+    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
+        raise NotImplementedError
 
 
 def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
@@ -193,70 +288,3 @@ def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdi
     }  # fmt: skip
     write_json(request.out / f"{study.name}.json", found)
     return verdicts
-
-
-def no_delay_gain(table: Table, metric: str, **labels: Any) -> str:
-    """Describe how much better no delay is than using all views: the limit of any scheduler's gain."""
-    kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
-    use_all = table.values(metric, policy="all", **labels)
-    limit = table.values(metric, policy="no delay", **kept)
-    _, lower, digits = METRICS[metric]
-    gap = paired(use_all, limit) if lower else paired(limit, use_all)
-    if metric == "aaoi_ms":
-        return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
-    nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
-    return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
-
-
-def by_bool(answer: bool | None) -> str:
-    """The verdict for true, false and unknown (None)."""
-    return UNDECIDED if answer is None else HOLDS if answer else DOES_NOT_HOLD
-
-
-def scenes_of(request: StudyRequest, default: Sequence[str]) -> list[str]:
-    """The requested scenes, else ``default``, without recorded ones that are not below the data folder."""
-    wanted, data = list(request.scenes or default), request.folders.data
-    found = []
-    for scene in wanted:
-        file = RECORDED.get(scene)
-        if file is None or (data is not None and (data / file).exists()):
-            found.append(scene)
-        else:
-            print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
-    if not found:
-        raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
-    return found
-
-
-def trial_of(request: StudyRequest, scene: str, **more: Any) -> Trial:
-    """The usual trial of a scene, with the image size and the steps of the request. more: of ``Trial``."""
-    sized: Row = {"size": 64, "steps": 150} if request.quick else {"size": 128, "steps": 400}
-    if scene in RECORDED:
-        scale = 2.0 if request.quick else 1.0
-        sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
-    return Trial(scene=scene, **{"field": request.field, **sized, **more})
-
-
-def sweep(
-    request: StudyRequest, scene: str, seeds: Iterable[int], conditions: Sequence[tuple[Row, Row]], x: str,
-    values: Mapping[str, Sequence[float]], ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
-) -> list[Point]:  # fmt: skip
-    """For every seed: use-all and each value of each policy in every condition, and points without delay.
-
-    conditions, ideals: (labels in the table, settings of the trial) of each.
-    x: label that holds the value.
-    values: policy -> its values.
-    """
-    found = []
-    for seed in seeds:
-        for labels, settings in conditions:
-            base, labels = trial_of(request, scene, seed=seed, **settings), {"scene": scene, **labels}
-            found.append(Point({**labels, "policy": "all"}, base))
-            found += [
-                Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
-                for policy, some in values.items() for value in some
-            ]  # fmt: skip
-        for labels, settings in ideals:
-            ideal = trial_of(request, scene, seed=seed, channel={"preset": "ideal"}, **settings)
-            found.append(Point({"scene": scene, **labels, "policy": "no delay"}, ideal))
-    return found

@@ -17,12 +17,10 @@ from edge_server.experiments.studies.drawing import Image, draw_curve, draw_imag
 from edge_server.experiments.studies.study import (
     METRICS,
     Curve,
-    Point,
+    Study,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
-    scenes_of,
 )
 from edge_server.experiments.studies.trial import SCENARIOS, Row
 from edge_server.experiments.viewpoints.drawing import draw_plan
@@ -61,13 +59,9 @@ FULL = Workload((3, 5, 8, 10, 13, 15, 20), 128, 400, 100)
 QUICK = Workload((3, 5, 8, 13), 64, 200, 60)
 
 
-class Viewpoints:
+class Viewpoints(Study):
     name = "viewpoints"
     title = "Where to look next: quality and path against the number of views (tables 4.1, 4.3)"
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        """None: its trials are captures, not deployments."""
-        return []
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         work = QUICK if request.quick else FULL
@@ -78,7 +72,7 @@ class Viewpoints:
         rows: list[Row] = []
         verdicts: list[Verdict] = []
         parts = ["# " + self.title, ""]
-        for scene in scenes_of(request, ("tile",) if request.quick else ("tile", "kitchen")):
+        for scene in request.scenes_here(("tile",) if request.quick else ("tile", "kitchen")):
             stage = open_stage(SCENARIOS[scene], work.candidates, work.size, request.folders.data)
             scorer = Scorer(lpips, background=stage.background)
             counts = tuple(c for c in work.counts if c <= int(stage.candidates.reachable.sum()))
@@ -151,20 +145,20 @@ def judge(scene: str, rows: list[Row], counts: tuple[int, ...]) -> list[Verdict]
         gain = paired(of[counts[-1]], of[counts[0]])
         verdicts.append(Verdict(
             f"{scene}, {arm}", "more views are better (table 4.1: 20.2 dB with 5 to 22.7 dB with 20).",
-            f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.", by_bool(gain.above(0.0)), gain,
+            f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.", gain.above(0.0), gain,
         ))  # fmt: skip
     chance, way = curve(rows, "random", "psnr_db")[JUDGED], curve(rows, "random", "path_m")[JUDGED]
     for arm in list(ARMS)[1:]:
         gain = paired(curve(rows, arm, "psnr_db")[JUDGED], chance)
         verdicts.append(Verdict(
             f"{scene}, {arm}, {JUDGED} views", "better than random views (table 4.3: FisherRF 4.8 dB).",
-            f"{gain.text(2)} dB.", by_bool(gain.above(0.0)), gain,
+            f"{gain.text(2)} dB.", gain.above(0.0), gain,
         ))  # fmt: skip
     shorter = paired(curve(rows, "FisherRF", "path_m")[JUDGED], way)
     verdicts.append(Verdict(
         f"{scene}, FisherRF, {JUDGED} views, path",
         "shorter than a random one (table 4.3: 2.61 m, 3.28 m).",
-        f"{shorter.text(2)} m longer.", by_bool(negated(shorter.above(0.0))), shorter,
+        f"{shorter.text(2)} m longer.", negated(shorter.above(0.0)), shorter,
     ))  # fmt: skip
     return verdicts
 
@@ -207,7 +201,7 @@ def draw(path: Path, rows: list[Row], scene: str) -> None:
             for k, arm in enumerate(ARMS):
                 draw_curve(at, curve(rows, arm, metric), arm, k)
             last = metric == "path_m"
-            label = "path (m)" if last else METRICS[metric][0]
+            label = "path (m)" if last else METRICS[metric].label
             label_lines(at, label, "views" if last else None, scene if metric == metrics[0] else None)
 
 

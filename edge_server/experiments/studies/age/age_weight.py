@@ -12,13 +12,10 @@ from edge_server.experiments.studies.study import (
     Curve,
     Point,
     Row,
+    SceneStudy,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
-    no_delay_gain,
-    scenes_of,
-    sweep,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
@@ -33,50 +30,46 @@ POLICIES = ("threshold", "wait")
 CLAIM = "a larger lambda buys freshness: the best omega falls (5.8)."
 
 
-class Weighing:
+class Weighing(SceneStudy):
     name = "lambda"
     title = "The weight of timeliness in the objective (equation 5.8)"
 
-    def points(self, request: StudyRequest) -> list[Point]:
+    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
         # The thresholds are the trials of ``mat`` and known where that study has been run.
         settings = {"channel": {"preset": "ch5", "discipline": "drop-new"}}
         omegas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS,
                   "wait": QUICK_WAITS if request.quick else WAITS}  # fmt: skip
-        return [
-            point for scene in scenes_of(request, ("room",))
-            for point in sweep(request, scene, request.repeats(10, 40), [({}, settings)], "omega_ms", omegas)
-        ]  # fmt: skip
+        return request.sweep(scene, request.repeats(10, 40), [({}, settings)], "omega_ms", omegas)
 
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        for row in table.rows:
+    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
+        for row in table.where(scene=scene):
             row["used_age_sum_ms"] = row["aaoi_ms"] * row["views"]
         verdicts = []
-        for scene in table.distinct("scene"):
-            best: dict[tuple[str, str], list[float]] = {}
-            for (metric, where), policy, (label, column) in product(PIXELS, POLICIES, SUMS.items()):
-                curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
-                if not all(curves.values()):
-                    continue
-                found = [optimum(curve, True).x for curve in curves.values()]
-                best[f"{policy}, {where}", label] = found
-                _, move = move_of_optimum(curves, lower_is_better=True)
-                by_lambda = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
-                text = (
-                    f"best omega in ms by lambda {by_lambda}; it moves by {move} ms; "
-                    f"{no_delay_gain(table, metric, scene=scene)}."
-                )
-                about = f"{scene}, {policy}, {where}, ages of {label}"
-                verdicts.append(Verdict(about, CLAIM, text, by_bool(_falls(move)), move))
-            with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
-                at = axes[0, 0]
-                for k, ((policy, label), xs) in enumerate(best.items()):
-                    at.plot(
-                        range(len(LAMBDAS)), xs, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
-                        linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
-                    )  # fmt: skip
-                at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
-                per = "lambda (per 0.01 of squared error and second of age)"
-                label_lines(at, "best omega (ms)", per, scene)
+        best: dict[tuple[str, str], list[float]] = {}
+        for (metric, where), policy, (label, column) in product(PIXELS, POLICIES, SUMS.items()):
+            curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
+            if not all(curves.values()):
+                continue
+            found = [optimum(curve, True).x for curve in curves.values()]
+            best[f"{policy}, {where}", label] = found
+            _, move = move_of_optimum(curves, lower_is_better=True)
+            by_lambda = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
+            text = (
+                f"best omega in ms by lambda {by_lambda}; it moves by {move} ms; "
+                f"{table.no_delay_gain(metric, scene=scene)}."
+            )
+            about = f"{scene}, {policy}, {where}, ages of {label}"
+            verdicts.append(Verdict(about, CLAIM, text, _falls(move), move))
+        with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            at = axes[0, 0]
+            for k, ((policy, label), xs) in enumerate(best.items()):
+                at.plot(
+                    range(len(LAMBDAS)), xs, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
+                    linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
+                )  # fmt: skip
+            at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
+            per = "lambda (per 0.01 of squared error and second of age)"
+            label_lines(at, "best omega (ms)", per, scene)
         return verdicts
 
 

@@ -7,15 +7,11 @@ from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
     METRICS,
     Point,
+    SceneStudy,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
-    no_delay_gain,
     number,
-    scenes_of,
-    sweep,
-    trial_of,
 )
 
 COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
@@ -28,43 +24,41 @@ SCENES = {
 _METRICS = ("lpips", "psnr_db", "psnr_moving_db", "ssim", "aaoi_ms")
 
 
-class Images:
+class Images(SceneStudy):
     name = "images"
     title = "Perceptual distance and age against the number of images (figures 6.5, 6.6)"
 
-    def points(self, request: StudyRequest) -> list[Point]:
-        found = []
-        for scene in scenes_of(request, tuple(SCENES)):
-            of = {"field": SCENES[scene][0] if scene in SCENES and not request.quick else "splat"}
-            settings = {"channel": {"preset": "ch5"}, **of}
-            cameras = len(trial_of(request, scene, seed=0, **settings).scenario().training)
-            counts = [float(c) for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]
-            seeds, freshest = request.repeats(6, 40), {"freshest-k": counts}
-            found += sweep(request, scene, seeds, [(of, settings)], "images", freshest, [(of, of)])
-        return found
+    scenes = tuple(SCENES)
 
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
+        of = {"field": SCENES[scene][0] if scene in SCENES and not request.quick else "splat"}
+        settings = {"channel": {"preset": "ch5"}, **of}
+        cameras = len(request.trial(scene, seed=0, **settings).scenario().training)
+        counts = [float(c) for c in (QUICK_COUNTS if request.quick else COUNTS) if c <= cameras]
+        seeds, freshest = request.repeats(6, 40), {"freshest-k": counts}
+        return request.sweep(scene, seeds, [(of, settings)], "images", freshest, [(of, of)])
+
+    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
         verdicts = []
-        for scene in table.distinct("scene"):
-            field = table.where(scene=scene)[0]["field"]
-            _, way, thesis = SCENES.get(scene, ("", "", "the same"))
-            draw_metrics(
-                request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
-                [(field, {"scene": scene})], f"{scene}, cameras {way}",
-            )  # fmt: skip
-            for metric in ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms"):
-                curve = table.curve("images", metric, scene=scene)
-                if not curve:
-                    continue
-                name, _, digits = METRICS[metric]
-                xs, rises = list(curve), metric != "lpips"
-                change = paired(curve[xs[-1]], curve[xs[0]])
-                first, last = (number(interval(curve[x].values()).mean, digits) for x in (xs[0], xs[-1]))
-                claim = f"more images: {'higher' if rises else 'lower'} (thesis: {thesis})."
-                text = (
-                    f"from {xs[0]:g} to {xs[-1]:g} images {first} to {last}, "
-                    f"change {change.text(digits)}; {no_delay_gain(table, metric, scene=scene)}."
-                )
-                answer = change.above(0.0) if rises else negated(change.above(0.0))
-                verdicts.append(Verdict(f"{scene}, {name}", claim, text, by_bool(answer), change))
+        field = table.where(scene=scene)[0]["field"]
+        _, way, thesis = SCENES.get(scene, ("", "", "the same"))
+        draw_metrics(
+            request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
+            [(field, {"scene": scene})], f"{scene}, cameras {way}",
+        )  # fmt: skip
+        for metric in ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms"):
+            curve = table.curve("images", metric, scene=scene)
+            if not curve:
+                continue
+            name, _, digits, _ = METRICS[metric]
+            xs, rises = list(curve), metric != "lpips"
+            change = paired(curve[xs[-1]], curve[xs[0]])
+            first, last = (number(interval(curve[x].values()).mean, digits) for x in (xs[0], xs[-1]))
+            claim = f"more images: {'higher' if rises else 'lower'} (thesis: {thesis})."
+            text = (
+                f"from {xs[0]:g} to {xs[-1]:g} images {first} to {last}, "
+                f"change {change.text(digits)}; {table.no_delay_gain(metric, scene=scene)}."
+            )
+            answer = change.above(0.0) if rises else negated(change.above(0.0))
+            verdicts.append(Verdict(f"{scene}, {name}", claim, text, answer, change))
         return verdicts

@@ -5,17 +5,13 @@ from __future__ import annotations
 from edge_server.experiments.common.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import (
-    LEAST,
     METRICS,
     Curve,
     Point,
+    SceneStudy,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
-    no_delay_gain,
-    scenes_of,
-    sweep,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
@@ -32,11 +28,11 @@ def _curve(table: Table, scene: str, metric: str, delay: float) -> Curve:
     return table.curve("gamma_ms", metric, scene=scene, delay_ms=delay, policy="threshold")
 
 
-class MatDelay:
+class MatDelay(SceneStudy):
     name = "mat-delay"
     title = "The best maximum age against the mean delay (figure 5.8)"
 
-    def points(self, request: StudyRequest) -> list[Point]:
+    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
         every = {"every_ms": 1500.0}
         delays = [
             ({"delay_ms": ms},
@@ -44,40 +40,35 @@ class MatDelay:
             for ms in (QUICK_DELAYS_MS if request.quick else DELAYS_MS)
         ]  # fmt: skip
         gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
-        seeds = request.repeats(8, 40)
-        return [
-            point for scene in scenes_of(request, ("room",))
-            for point in sweep(request, scene, seeds, delays, "gamma_ms", gammas, [({}, every)])
-        ]  # fmt: skip
+        return request.sweep(scene, request.repeats(8, 40), delays, "gamma_ms", gammas, [({}, every)])
 
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
         verdicts = []
-        for scene in table.distinct("scene"):
-            best: dict[str, dict[float, Optimum]] = {}
-            for metric in _METRICS:
-                curves = {delay: _curve(table, scene, metric, delay) for delay in table.distinct("delay_ms")}
-                curves = {delay: curve for delay, curve in curves.items() if curve}
-                best[metric] = {delay: optimum(curve, METRICS[metric][1]) for delay, curve in curves.items()}
-                if len(curves) > 1:
-                    verdicts.append(self._judge(table, scene, metric, curves, best[metric]))
-            self._draw(request, table, scene, best)
+        best: dict[str, dict[float, Optimum]] = {}
+        for metric in _METRICS:
+            curves = {delay: _curve(table, scene, metric, delay) for delay in table.distinct("delay_ms")}
+            curves = {delay: curve for delay, curve in curves.items() if curve}
+            best[metric] = {delay: optimum(curve, METRICS[metric].lower) for delay, curve in curves.items()}
+            if len(curves) > 1:
+                verdicts.append(self._judge(table, scene, metric, curves, best[metric]))
+        self._draw(request, table, scene, best)
         return verdicts
 
     def _judge(
         self, table: Table, scene: str, metric: str, curves: dict[float, Curve], best: dict[float, Optimum]
     ) -> Verdict:
-        slope, _ = move_of_optimum(curves, METRICS[metric][1])
-        without = [f"{d:g}" for d, o in best.items() if o.interior(LEAST[metric]) is not True]
+        slope, _ = move_of_optimum(curves, METRICS[metric].lower)
+        without = [f"{d:g}" for d, o in best.items() if o.interior(METRICS[metric].least) is not True]
         text = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
         # Fidelity that only rises or only falls has its best at the same end of the grid at every delay, so
         # the slope is zero.
         none = f"; that it falls on both sides is not shown at {', '.join(without)} ms" if without else ""
         return Verdict(
-            f"{scene}, {METRICS[metric][0]}",
+            f"{scene}, {METRICS[metric].label}",
             CLAIM,
             f"by mean delay {text}{none}; {slope} ms of threshold a ms of delay; "
-            f"{no_delay_gain(table, metric, scene=scene, delay_ms=max(best))} at {max(best):g} ms.",
-            by_bool(slope.above(0.0)),
+            f"{table.no_delay_gain(metric, scene=scene, delay_ms=max(best))} at {max(best):g} ms.",
+            slope.above(0.0),
             slope,
         )
 
@@ -91,8 +82,8 @@ class MatDelay:
                 ys = [o.x for o in found.values()]
                 spread = [[o.x - o.low for o in found.values()], [o.high - o.x for o in found.values()]]
                 top.errorbar(xs, ys, spread, marker="o", markersize=4, capsize=2, color=CYCLE[k],
-                             label=METRICS[metric][0])  # fmt: skip
+                             label=METRICS[metric].label)  # fmt: skip
             label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
             for k, delay in enumerate(table.distinct("delay_ms")):
                 draw_curve(bottom, _curve(table, scene, "psnr_moving_db", delay), f"{delay:g} ms", k)
-            label_lines(bottom, METRICS["psnr_moving_db"][0], "threshold (ms)")
+            label_lines(bottom, METRICS["psnr_moving_db"].label, "threshold (ms)")

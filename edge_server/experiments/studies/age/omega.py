@@ -14,18 +14,13 @@ from edge_server.experiments.common.statistics import (
 )
 from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
 from edge_server.experiments.studies.study import (
-    LEAST,
     METRICS,
     RECORDED,
     Point,
+    SceneStudy,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
-    no_delay_gain,
-    scenes_of,
-    sweep,
-    trial_of,
 )
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -39,62 +34,60 @@ _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "f_w")
 _NEAR = {"psnr_db": 0.3, "psnr_moving_db": 0.3, "ssim": 0.01, "lpips": 0.01, "f_w": 0.05}
 
 
-class Omega:
+class Omega(SceneStudy):
     name = "omega"
     title = "Threshold and wait against omega in two traffic states (figures 6.3, 6.4)"
 
-    def points(self, request: StudyRequest) -> list[Point]:
-        found = []
-        for scene in scenes_of(request, ("room", "kitchen")):
-            ours = scene not in RECORDED
-            states = [
-                ({"state": state}, {"channel": {"preset": preset}, "every_ms": 2400.0})
-                for state, (preset, _, _) in STATES.items() if ours or not request.quick or state != "low"
-            ]  # fmt: skip
-            omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
-            seeds = request.repeats(6 if ours else 3, 40)
-            found += sweep(request, scene, seeds, states, "omega_ms", omegas, [({"state": "-"}, {})])
-        return found
+    scenes = ("room", "kitchen")
 
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
+    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
+        ours = scene not in RECORDED
+        states = [
+            ({"state": state}, {"channel": {"preset": preset}, "every_ms": 2400.0})
+            for state, (preset, _, _) in STATES.items() if ours or not request.quick or state != "low"
+        ]  # fmt: skip
+        omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
+        seeds = request.repeats(6 if ours else 3, 40)
+        return request.sweep(scene, seeds, states, "omega_ms", omegas, [({"state": "-"}, {})])
+
+    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
         verdicts = []
-        for scene in table.distinct("scene"):
-            states = [s for s in STATES if table.where(scene=scene, state=s)]
-            for state in states:
-                draw_metrics(
-                    request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
-                    [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
-                    f"{scene}, {state} traffic: from scratch, scored at the present",
-                    [("use all", {"scene": scene, "state": state, "policy": "all"}),
-                     ("no delay", {"scene": scene, "policy": "no delay"})],
-                )  # fmt: skip
-                for metric in _METRICS:
-                    verdicts += self._threshold(table, scene, state, metric)
-                    for policy in POLICIES[1:]:
-                        verdicts += self._wait(table, scene, state, metric, policy)
-        self._draw_instants(request, table)
+        states = [s for s in STATES if table.where(scene=scene, state=s)]
+        for state in states:
+            draw_metrics(
+                request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
+                [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
+                f"{scene}, {state} traffic: from scratch, scored at the present",
+                [("use all", {"scene": scene, "state": state, "policy": "all"}),
+                 ("no delay", {"scene": scene, "policy": "no delay"})],
+            )  # fmt: skip
+            for metric in _METRICS:
+                verdicts += self._threshold(table, scene, state, metric)
+                for policy in POLICIES[1:]:
+                    verdicts += self._wait(table, scene, state, metric, policy)
+        self._draw_instants(request, scene)
         return verdicts
 
     def _threshold(self, table: Table, scene: str, state: str, metric: str) -> list[Verdict]:
         curve = table.curve("omega_ms", metric, scene=scene, state=state, policy="threshold")
         if not curve:
             return []
-        name, lower, digits = METRICS[metric]
+        name, lower, digits, least = METRICS[metric]
         best = optimum(curve, lower)
         text = (
             f"best at {best.x:g} ms{best.spread}, {best.over_last.text(digits)} better than the largest "
-            f"omega; {no_delay_gain(table, metric, scene=scene, state=state)}."
+            f"omega; {table.no_delay_gain(metric, scene=scene, state=state)}."
         )
         claim = f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1)."
         about = f"{scene}, {state} traffic, threshold, {name}"
-        return [Verdict(about, claim, text, by_bool(best.interior(LEAST[metric])), best.over_last)]
+        return [Verdict(about, claim, text, best.interior(least), best.over_last)]
 
     def _wait(self, table: Table, scene: str, state: str, metric: str, policy: str) -> list[Verdict]:
         labels = {"scene": scene, "state": state}
         curve = table.curve("omega_ms", metric, policy=policy, **labels)
         if not curve:
             return []
-        name, lower, digits = METRICS[metric]
+        name, lower, digits, least = METRICS[metric]
         sign = -1.0 if lower else 1.0
         best = optimum(curve, lower)
         means = {x: interval(v.values()).mean for x, v in curve.items()}
@@ -104,7 +97,7 @@ class Omega:
         about = f"{scene}, {state} traffic, {policy}, {name}"
         if metric == "f_w":
             claim = "has an optimum inside once freshness counts (6.5.2)."
-            answer = best.interior(LEAST[metric])
+            answer = best.interior(least)
         else:
             claim = (
                 f"waiting longer never makes it worse by more than {_NEAR[metric]:g} "
@@ -119,25 +112,24 @@ class Omega:
         )
         ahead = "better than threshold, each at its own best omega (6.5.2)."
         return [
-            Verdict(about, claim, text, by_bool(answer), loss),
-            Verdict(about, ahead, f"difference {over.text(digits)}.", by_bool(better), over),
+            Verdict(about, claim, text, answer, loss),
+            Verdict(about, ahead, f"difference {over.text(digits)}.", better, over),
         ]
 
-    def _draw_instants(self, request: StudyRequest, table: Table) -> None:
+    def _draw_instants(self, request: StudyRequest, scene: str) -> None:
         """Figure 6.4: one decision under both policies at three omegas."""
         common: dict[str, Any] = {"channel": {"preset": "ch6-high"}, "lpips": False, "every_ms": 2400.0}
-        for s in table.distinct("scene"):
-            rows = [
-                (f"{s}, {p}", [trial_of(request, s, seed=3, policy=p, value=v, **common) for v in SHOWN])
-                for p in ("threshold", "wait")
-            ]
-            draw_trials(request.out / f"omega-pictures-{s}.png", request, rows)
+        rows = [
+            (f"{scene}, {p}", [request.trial(scene, seed=3, policy=p, value=v, **common) for v in SHOWN])
+            for p in ("threshold", "wait")
+        ]
+        draw_trials(request.out / f"omega-pictures-{scene}.png", request, rows)
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:
     """Best of ``policy`` minus best of threshold, paired by seed, each at the omega that is best for the
     other half of the seeds (see ``Optimum``)."""
-    lower = METRICS[metric][1]
+    lower = METRICS[metric].lower
     ours, theirs = (
         at_its_best(table.curve("omega_ms", metric, policy=name, **labels), lower)
         for name in (policy, "threshold")

@@ -27,13 +27,11 @@ from edge_server.experiments.studies.study import (
     LEAST_DB,
     RECORDED,
     Point,
+    Study,
     StudyRequest,
     Table,
     Verdict,
-    by_bool,
     number,
-    scenes_of,
-    trial_of,
 )
 from edge_server.report.style import figure
 
@@ -70,7 +68,7 @@ class Cell:
         return f"{self.scene}{speed}, mean delay {self.delay_ms:g} ms, {self.memory}, compute {self.compute}"
 
 
-class Phase:
+class Phase(Study):
     name = "phase"
     title = "Where the trade between age and fidelity exists"
 
@@ -93,7 +91,7 @@ class Phase:
 
     def _cells(self, request: StudyRequest) -> Iterator[Cell]:
         quick = request.quick
-        for scene in scenes_of(request, ("room", "kitchen")):
+        for scene in request.scenes_here(("room", "kitchen")):
             ours = scene not in RECORDED
             speeds: tuple[float | None, ...] = (None,)
             if ours:
@@ -116,7 +114,7 @@ class Phase:
         more: dict[str, Any] = {"every_ms": 1500.0}
         if cell.scene not in RECORDED:
             more["speed_m_per_s"] = cell.speed_m_per_s
-        base = trial_of(request, cell.scene, seed=seed, channel=channel, lpips=False, **more)
+        base = request.trial(cell.scene, seed=seed, channel=channel, lpips=False, **more)
         if cell.memory == "warm":
             base = dataclasses.replace(
                 base, scratch=False, settle=2, decisions=3, first_steps=2 * base.steps, steps=base.steps // 3
@@ -157,7 +155,7 @@ class Phase:
         about = f"{cell.text}; {name}"
         found = [
             Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
-                    "; ".join(text) + " dB.", by_bool(any_of(g.above(LEAST_DB) for g in gains)),
+                    "; ".join(text) + " dB.", any_of(g.above(LEAST_DB) for g in gains),
                     max(gains, key=lambda g: g.mean))
         ]  # fmt: skip
         for policy in OWN:
@@ -169,7 +167,7 @@ class Phase:
                 f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
                 f"{over[0]} above the best threshold, {over[1]} above the best wait "
                 f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
-                by_bool(all_of(o.above(0.0) for o in over)), min(over, key=lambda o: o.mean),
+                all_of(o.above(0.0) for o in over), min(over, key=lambda o: o.mean),
             ))  # fmt: skip
         return found
 

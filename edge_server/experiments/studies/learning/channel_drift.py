@@ -23,15 +23,13 @@ from edge_server.experiments.training.scheduler.choices import choose, named
 from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.evaluation import PerSeed
 from edge_server.experiments.training.scheduler.report import smoothed
-from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, seeds
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward
-from edge_server.scheduler.learned.state import StateLayout
 from edge_server.scheduler.online.online_policy import OnlinePolicy, OnlineSettings
 
 EPISODES = {True: 40, False: 600}
@@ -67,16 +65,13 @@ class Change:
         """The settings of decisions before and after the change."""
         return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
 
-    def config(self, trainer: StudyTrainer, episodes: int, training: int) -> TrainingConfig:
+    def config(self, trainer: StudyTrainer, training: int) -> TrainingConfig:
         """What is trained, before and after the change."""
-        parts = StateLayout(("age", "pose"))
         if self.price:
             reward = dataclasses.replace(trainer.reward("set"), views=-self.price)
-            return TrainingConfig(Spec("select", parts), reward, episodes, seed=training)
+            return trainer.config("select", reward, EPISODES, seed=training)
         reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
-        return TrainingConfig(
-            Spec("threshold", parts, OMEGAS_MS["threshold"]), reward, episodes, tries=3, seed=training
-        )
+        return trainer.config("threshold", reward, EPISODES, tries=3, seed=training)
 
 
 def changes() -> dict[str, Change]:
@@ -118,7 +113,7 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
     """Rewards of every decision by policy, scored by the reporting cameras. All policies decide at the same
     instants."""
     before, after = change.settings()
-    config = change.config(trainer, trainer.request.training_episodes(EPISODES), training)
+    config = change.config(trainer, training)
     reward, priced = config.reward, "priced-" * bool(change.price)
     home = trainer.train_one(f"drift-before-{priced}{training}", before, config)
     there = trainer.train_one(f"drift-{name.replace(' ', '-')}-{training}", after, config)

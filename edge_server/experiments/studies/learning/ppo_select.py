@@ -19,10 +19,9 @@ from edge_server.experiments.studies.learning.setup import (
     named_runs,
     paired_difference,
     room,
-    runs_of,
     simple_policies,
 )
-from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.choices import Maker
 from edge_server.experiments.training.scheduler.evaluation import (
     BASELINE_POLICIES,
@@ -32,11 +31,8 @@ from edge_server.experiments.training.scheduler.evaluation import (
     PerSeed,
     rows,
 )
-from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
+from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.state import StateLayout
 
 # The thesis's gain (5.6.2) over its first hundred episodes, which it counts as random.
 THESIS_PERCENT = 16.7
@@ -72,11 +68,9 @@ class PpoSelect(TrainingStudy):
             held_out = VIEWPOINTS[viewpoints]
             field = FIELDS[scratch]
             setting = room("ch5", held_out=held_out, scratch=scratch)
-            reward, spec = trainer.reward("set", on), Spec("select", StateLayout(("age", "pose")))
-            reward = dataclasses.replace(reward, views=-price)
+            reward = dataclasses.replace(trainer.reward("set", on), views=-price)
             name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
-            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
-            trained = trainer.train_repeats(name, setting, config)
+            trained = trainer.train_repeats(name, setting, trainer.config("select", reward, EPISODES))
             mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
             evaluation = trainer.evaluate(setting, {**_baselines(setting), **mine}, reward, count)
             labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
@@ -106,7 +100,7 @@ def _nearest(setting: Setting, k: int) -> Maker:
 
 def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
     """The verdicts on the thesis's claims and on ours."""
-    mine, random = runs_of(evaluation, "learnt"), evaluation.rewards("random")
+    mine, random = evaluation.runs("learnt"), evaluation.rewards("random")
     best, best_name = evaluation.best_fixed("threshold")
     best_values = evaluation.best_values("threshold")
     over_named = paired_difference(mine, evaluation.rewards(best_name))
@@ -114,7 +108,7 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
         better(about, f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes "
                "(5.6.2).", mine, random, f"over a uniformly random set: {percent(mean_of(mine), random)}; "),
         better(about, "better than every fixed threshold (5.6.2).", mine, best,
-               f"the best is {best_name}, over which it has {span(over_named)} "
+               f"the best is {best_name}, over which it has {over_named.text(4)} "
                "where that is known from the very seeds it is tested on; over the best as the other half of "
                "the seeds chose it, "),
         *(better(about, f"better than {name}.", mine, evaluation.rewards(name))
@@ -123,9 +117,9 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
         _share(about, evaluation, mine, best),
         Verdict(about, "the best threshold differs between decisions: who knew it beforehand would win.",
                 f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
-                f"{span(best_values['gain'])} over the best fixed one, as another fit has it; "
+                f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; "
                 "whether the state tells it is another question.",
-                by_bool(best_values["gain"].above(0.0)), best_values["gain"]),
+                best_values["gain"].above(0.0), best_values["gain"]),
     ]  # fmt: skip
 
 
@@ -145,7 +139,7 @@ def _viewpoint(about: str, evaluation: Evaluation, mine: Runs) -> Verdict:
 
 def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
     """Verdicts on the trained policies, judged by the cameras that rewarded them."""
-    mine, (best, name) = runs_of(evaluation, "learnt"), evaluation.best_fixed("threshold")
+    mine, (best, name) = evaluation.runs("learnt"), evaluation.best_fixed("threshold")
     random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
     return [
@@ -167,12 +161,12 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
     alone = " (the intervals are over seeds alone, not over trainings)" if len(mine) > 1 else ""
     return Verdict(
         about, "most of what could be won is won: (r - random) / (hindsight - random) above a half.",
-        f"{span(share, 2)} of the way to hindsight ({top:.4f}, the best of all that was tried at each "
+        f"{share.text(2)} of the way to hindsight ({top:.4f}, the best of all that was tried at each "
         "decision, chosen by one fit and measured by another); the best fixed threshold has "
-        f"{span(theirs, 2)}{alone}.",
+        f"{theirs.text(2)}{alone}.",
         # Where the limit is no better than random there is no share; half of the way is still defined, and so
         # is an interval over trainings.
-        by_bool(above.above(0.0)),
+        above.above(0.0),
         above,
     )  # fmt: skip
 
@@ -182,9 +176,9 @@ def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
     fits, carried_out = (sum(row[n] for row in one.rows) for n in ("fits", "carried_out"))
     if one.jobs != 2:
         text = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
-        return Verdict(about, "training is quick on 2 cores.", text, by_bool(None))
+        return Verdict(about, "training is quick on 2 cores.", text, None)
     if carried_out < fits / 2:  # most fits are known from another training: their time is not measured
-        return Verdict(about, "training is quick.", "most of its fits were known already.", by_bool(None))
+        return Verdict(about, "training is quick.", "most of its fits were known already.", None)
     a_fit, a_decision = one.seconds / carried_out, fits / sum(row["decisions"] for row in one.rows)
     minutes = a_fit * a_decision * 2400 / 60.0
     return Verdict(
@@ -194,5 +188,5 @@ def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
         f"{carried_out} field fits, {a_decision:g} a decision, took {one.seconds:.0f} s with {one.jobs} "
         f"processes: {minutes:.1f} minutes for 600 episodes, {minutes / a_decision:.1f} with one fit a "
         "decision, as the machine was.",
-        by_bool(minutes <= WANTED_MINUTES),
+        minutes <= WANTED_MINUTES,
     )  # fmt: skip

@@ -12,20 +12,16 @@ from edge_server.experiments.studies.learning.setup import (
     TrainingStudy,
     better,
     mean_of,
-    named_runs,
     no_worse,
     paired_difference,
     room,
-    runs_of,
     simple_policies,
 )
-from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
-from edge_server.experiments.training.scheduler.report import percent, quartiles, span
-from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, seeds
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Action, Spec
-from edge_server.scheduler.learned.state import StateLayout
+from edge_server.experiments.training.scheduler.report import percent, quartiles
+from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.scheduler.learned.learner_spec import Action
 
 KINDS: tuple[Action, ...] = ("wait", "threshold")
 # The thesis's weight of a millisecond of age, and a fifth of it: with the thesis's (6.5) one young view beats
@@ -56,10 +52,12 @@ class PpoWait(TrainingStudy):
             reward = dataclasses.replace(trainer.reward("corrected", pixels), age=age)
             candidates: dict[str, Candidate] = {}
             for kind in KINDS:
-                spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
-                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
-                trained = trainer.train_repeats(f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, config)
-                candidates |= {**simple_policies(kind), **named_runs(f"learnt-{kind}", trained)}
+                name, config = (
+                    f"{self.name}-{channel}{age:g}{mark}-{kind}",
+                    trainer.config(kind, reward, EPISODES, tries=3),
+                )
+                candidates |= simple_policies(kind)
+                candidates |= trainer.actors(f"learnt-{kind}", name, setting, config)
             count = len(request.repeats(16, 100))
             evaluation = trainer.evaluate(setting, candidates, reward, count)
             moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
@@ -77,15 +75,15 @@ def named(channel: str, age: float, pixels: str) -> str:
 def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
     """The verdicts of a case on the thesis's claims and on ours."""
     found = []
-    trained = {kind: runs_of(evaluation, f"learnt-{kind}") for kind in KINDS}
+    trained = {kind: evaluation.runs(f"learnt-{kind}") for kind in KINDS}
     for kind in KINDS:
         about, mine = f"room, {case}, {kind}", trained[kind]
         best, name = evaluation.best_fixed(kind)
         best_values = evaluation.best_values(kind)
         same = paired_difference(mine, evaluation.rewards(name))
         text = (
-            f"the best is {name}, over which it has {span(same)} where that is known from the very seeds it "
-            "is tested on; over the best as the other half of the seeds chose it, "
+            f"the best is {name}, over which it has {same.text(4)} where that is known from the very seeds "
+            "it is tested on; over the best as the other half of the seeds chose it, "
         )
         if channel != "ch6":
             claim = "better than its best fixed omega, where a traffic state lasts long enough to be used."
@@ -100,9 +98,9 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
         found.append(
             Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
                     f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
-                    f"{span(best_values['gain'])} over the best fixed one, as another fit has it; learnt "
-                    f"{span(crossed(mine))}.",
-                    by_bool(best_values["gain"].above(0.0)), best_values["gain"])
+                    f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; learnt "
+                    f"{crossed(mine).text(4)}.",
+                    best_values["gain"].above(0.0), best_values["gain"])
         )  # fmt: skip
     wait, threshold = trained["wait"], trained["threshold"]
     found.append(
@@ -116,6 +114,6 @@ def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
     """Whether there is anything to learn. gain: of ``by_ages``."""
     return Verdict(
         f"room, {case}, {kind}", "the ages tell which omega is best: there is something to learn.",
-        f"a rule fitted to the rewards of every omega at every decision of the other seeds wins {span(gain)} "
-        f"over the best fixed one, over {gain.count} seeds.", by_bool(gain.above(0.0)), gain,
+        f"a rule fitted to the rewards of every omega at every decision of the other seeds wins "
+        f"{gain.text(4)} over the best fixed one, over {gain.count} seeds.", gain.above(0.0), gain,
     )  # fmt: skip

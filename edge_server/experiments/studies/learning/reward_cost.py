@@ -17,24 +17,20 @@ from edge_server.experiments.studies.learning.setup import (
     named_runs,
     paired_difference,
     room,
-    runs_of,
     simple_policies,
 )
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
-from edge_server.experiments.studies.study import StudyRequest, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import (
     Candidate,
     Evaluation,
     baseline_policies,
     rows,
 )
-from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import layout_of
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, stage_file
+from edge_server.experiments.training.scheduler.trainer import Row, stage_file
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.state import StateLayout
 
 EPISODES = {True: 60, False: 600}
 # Optimiser steps of a fit that rewards in training; fits of JUDGED_STEPS judge the trained policies.
@@ -62,8 +58,7 @@ def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdi
     """Reward against the time of training, by the steps of a fit."""
     budgets = QUICK_BUDGETS if request.quick else BUDGETS
     reward = trainer.reward("set")
-    spec = Spec("select", StateLayout(("age", "pose")))
-    config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
+    config = trainer.config("select", reward, EPISODES)
     config = dataclasses.replace(config, stages=stages(config.batches))
     trained = {steps: trainer.train_repeats(f"reward-cost-{steps}", room("ch5", steps=steps), config)
               for steps in budgets}  # fmt: skip
@@ -100,9 +95,9 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
     """
     about = f"room, ch5, judged by fits of {JUDGED_STEPS} steps"
     cheap, dear = min(spent), max(spent)
-    curves = {steps: [runs_of(evaluation, _stage_name(steps, stage)) for stage in stages] for steps in spent}
+    curves = {steps: [evaluation.runs(_stage_name(steps, stage)) for stage in stages] for steps in spent}
     text = "; ".join(
-        f"{steps} steps a fit " + ", ".join(f"{span(crossed(runs))} after {at:.1f} s"
+        f"{steps} steps a fit " + ", ".join(f"{crossed(runs).text(4)} after {at:.1f} s"
                                             for runs, at in zip(curves[steps], spent[steps]))
         for steps in spent
     )  # fmt: skip
@@ -110,8 +105,8 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
     same_count = Verdict(
         about,
         "for the same number of decisions a cheap reward teaches as much as a dear one (no worse by 0.01).",
-        f"{cheap} less {dear} steps: {span(same)}; {text}.",
-        by_bool(same.above(-0.01)),
+        f"{cheap} less {dear} steps: {same.text(4)}; {text}.",
+        same.above(-0.01),
         same,
     )
     claim = f"in the same time {cheap} steps a fit teach more than {dear}."
@@ -146,11 +141,10 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
         setting = dataclasses.replace(usual, scenario=dataclasses.replace(usual.scenario, edge=edge))
         layout = layout_of(setting, PARTS if dim else PARTS[1:])
         reward = priced(trainer, "moving")
-        config = TrainingConfig(Spec("select", layout), reward, request.training_episodes(EPISODES_BY_DIM))
-        trained = trainer.train_repeats(f"reward-cost-d{dim}", setting, config)
+        config = trainer.config("select", reward, EPISODES_BY_DIM, layout)
         candidates: dict[str, Candidate] = {
             **baseline_policies((), (), ("random",)),
-            **named_runs(name, trained),
+            **trainer.actors(name, f"reward-cost-d{dim}", setting, config),
         }
         evaluations[name] = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
     _draw_dims(request, evaluations)
@@ -160,7 +154,7 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
 
 def judge_dims(evaluations: dict[str, Evaluation]) -> list[Verdict]:
     """The verdicts whether each embedding is better than none, ``d = 0``."""
-    runs = {name: runs_of(evaluation, name) for name, evaluation in evaluations.items()}
+    runs = {name: evaluation.runs(name) for name, evaluation in evaluations.items()}
     return [better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
             for name, values in runs.items() if name != "d = 0"]  # fmt: skip
 
@@ -170,7 +164,7 @@ def _draw(
 ) -> None:
     with figure(request.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
         for k, (steps, seconds) in enumerate(spent.items()):
-            means = [crossed(runs_of(evaluation, _stage_name(steps, stage))).mean for stage in stages]
+            means = [crossed(evaluation.runs(_stage_name(steps, stage))).mean for stage in stages]
             axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
                             label=f"{steps} steps a fit")  # fmt: skip
         label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time",
@@ -180,7 +174,7 @@ def _draw(
 def _draw_dims(request: StudyRequest, evaluations: dict[str, Evaluation]) -> None:
     """Draw the gain over no embedding against the width of the embedding: paired differences and their
     intervals."""
-    runs = [runs_of(evaluation, name) for name, evaluation in evaluations.items()]
+    runs = [evaluation.runs(name) for name, evaluation in evaluations.items()]
     found = [paired_difference(mine, runs[0]) for mine in runs[1:]]
     off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
     with figure(request.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):

@@ -16,20 +16,16 @@ from edge_server.experiments.studies.learning.setup import (
     better,
     embeddings_missing,
     mean_of,
-    named_runs,
     no_worse,
-    runs_of,
     simple_policies,
 )
 from edge_server.experiments.studies.learning.visibility import SeesMotion, VisibleMotion, embedding_areas
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
-from edge_server.experiments.studies.study import StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.studies.study import StudyRequest, Table, Verdict
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES, Evaluation, rows
-from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import layout_of, seeds
-from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig
+from edge_server.experiments.training.scheduler.trainer import Row
 from edge_server.report.style import CYCLE, figure, label_lines
-from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 300, False: 1200}
 # scene -> (speed, pixels of the PSNR). A person walks on one of four sides of the workshop, or stands there.
@@ -62,10 +58,9 @@ class Semantics(TrainingStudy):
             reward = priced(trainer, on)
             candidates = simple_policies("threshold", BASELINE_POLICIES)
             for name, parts in (("with", PARTS), ("without", PARTS[1:])):
-                spec = Spec("select", layout_of(setting, parts))
-                config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
+                config = trainer.config("select", reward, EPISODES, layout_of(setting, parts))
                 run_name = f"{self.name}-{scene.replace(' ', '-')}-{name}"
-                candidates |= named_runs(name, trainer.train_repeats(run_name, setting, config))
+                candidates |= trainer.actors(name, run_name, setting, config)
             count = len(request.repeats(10, 100))
             visible = VisibleMotion(setting)
             if speed:
@@ -84,11 +79,11 @@ class Semantics(TrainingStudy):
 def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
     """Verdicts: policies with semantics are better than those without or, where nothing moves, no worse; and
     both are better than the best policy without learning."""
-    about, seeing, blind = f"tower, ch5, {scene}", runs_of(evaluation, "with"), runs_of(evaluation, "without")
+    about, seeing, blind = f"tower, ch5, {scene}", evaluation.runs("with"), evaluation.runs("without")
     text = ""
     for name, runs in (("with", seeing), ("without", blind)):
         views, won = evaluation.term(f"{name}-0", "views").mean, evaluation.share(mean_of(runs))
-        text += f"{name}: {views:.1f} views, {span(won, 2)} of the way from random to hindsight; "
+        text += f"{name}: {views:.1f} views, {won.text(2)} of the way from random to hindsight; "
     if moves:
         claim = "semantics help where something important moves."
         found = [better(about, claim, seeing, blind, text)]
@@ -115,9 +110,9 @@ def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[
     return [
         Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
                 f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
-                f"to; {camera:.2f} from which camera it is.", by_bool(embedding > camera)),
+                f"to; {camera:.2f} from which camera it is.", embedding > camera),
         better(about, "who knows which cameras see what moves does better than what is learnt blindly.",
-               evaluation.rewards(best), runs_of(evaluation, "without"),
+               evaluation.rewards(best), evaluation.runs("without"),
                f"{best}, the best number of them known from the very seeds; "),
     ]  # fmt: skip
 

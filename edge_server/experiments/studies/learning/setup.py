@@ -19,7 +19,7 @@ import numpy as np
 from camera_node.config import WorldConfig, source_config
 from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import Interval, crossed, interval
-from edge_server.experiments.studies.study import Point, StudyRequest, Table, Verdict, by_bool
+from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
@@ -29,14 +29,16 @@ from edge_server.experiments.training.scheduler.evaluation import (
     baseline_policies,
     evaluate_policies,
 )
-from edge_server.experiments.training.scheduler.report import draw_curve, span
+from edge_server.experiments.training.scheduler.report import draw_curve
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, read_log, train
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.scheduler import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.learner_spec import Action, Spec
 from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.state import StateLayout
 from freshfield.files import write_csv, write_json
 
 FIELD = "splat"
@@ -48,21 +50,16 @@ REPORT = ("cam05", "cam08")
 # Repeated trainings, by whether it is a quick pass; their spread is part of the interval.
 RUNS = {True: 1, False: 3}
 
+AGE_AND_POSE = StateLayout(("age", "pose"))
+
 Runs = Sequence[PerSeed]
 """Rewards by seed of each of several trainings that differ in their random seed only."""
 Parts = Iterator[tuple[list[Verdict], list[Row]]]
 """Verdicts and rows of the table, of one case of a study after the other."""
 
 
-class TrainingStudy:
+class TrainingStudy(Study):
     """Base of the studies that train policies; they have no independent trials."""
-
-    name: str
-    title: str
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        """An empty list."""
-        return []
 
     def report(self, request: StudyRequest, table: Table | None) -> list[Verdict]:
         """Train, evaluate, write OUT/NAME.csv and return the verdicts. table: not used."""
@@ -199,6 +196,19 @@ class StudyTrainer:
             for run in range(RUNS[self.request.quick])
         ]
 
+    def config(
+        self, action: Action, reward: Reward, episodes: Mapping[bool, int],
+        layout: StateLayout = AGE_AND_POSE, **more: Any,
+    ) -> TrainingConfig:  # fmt: skip
+        """The usual training of a learner that decides ``action``. episodes: by whether it is a quick pass.
+        more: of ``TrainingConfig``."""
+        spec = Spec(action, layout, OMEGAS_MS.get(action, ()))
+        return TrainingConfig(spec, reward, self.request.episodes or episodes[self.request.quick], **more)
+
+    def actors(self, label: str, name: str, setting: Setting, config: TrainingConfig) -> dict[str, Actor]:
+        """The actors of repeated trainings as candidates ``LABEL-0``, ``LABEL-1``, ..."""
+        return named_runs(label, self.train_repeats(name, setting, config))
+
     def evaluate(
         self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
@@ -230,7 +240,7 @@ def embeddings_missing() -> str | None:
 def fixed_of(evaluation: Evaluation, kind: str) -> str:
     """Name and reward of the best fixed policy of a kind, as text."""
     values, name = evaluation.best_fixed(kind)
-    return f"{name} {span(interval(values.values()))}"
+    return f"{name} {interval(values.values()).text(4)}"
 
 
 def mean_of(runs: Runs) -> PerSeed:
@@ -249,12 +259,6 @@ def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str,
         f"{name}-{run}": one.actor if isinstance(one, TrainedPolicy) else one
         for run, one in enumerate(trained)
     }
-
-
-def runs_of(evaluation: Evaluation, name: str) -> Runs:
-    """Rewards of each of the trainings that ``named_runs`` calls ``name``."""
-    of = [n for n in evaluation.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
-    return [evaluation.rewards(n) for n in of]
 
 
 def paired_difference(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
@@ -280,7 +284,7 @@ def _describe_difference(found: Interval, runs: int) -> str:
     """The difference as text, with what its interval is over."""
     trainings = f"{runs} trainings and " if runs > 1 else ""
     alone = "" if runs > 1 else " of a single training"
-    return f"difference {span(found)} over {trainings}{found.count} seeds{alone}"
+    return f"difference {found.text(4)} over {trainings}{found.count} seeds{alone}"
 
 
 def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, found: str = "") -> Verdict:
@@ -288,8 +292,8 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
     difference = paired_difference(mine, other)
     text = _describe_difference(difference, len(_runs(mine)))
     if difference.low == difference.high == 0.0:
-        return Verdict(about, claim, f"{found}{text}: it does the very same.", by_bool(False), difference)
-    return Verdict(about, claim, f"{found}{text}.", by_bool(difference.above(0.0)), difference)
+        return Verdict(about, claim, f"{found}{text}: it does the very same.", False, difference)
+    return Verdict(about, claim, f"{found}{text}.", difference.above(0.0), difference)
 
 
 def no_worse(
@@ -302,10 +306,10 @@ def no_worse(
     difference, base = paired_difference(mine, other), crossed(_runs(other))
     text = f"{_describe_difference(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
     if base.low <= 0.0 <= base.high:
-        return Verdict(about, claim, f"{text}no percentage: too near zero.", by_bool(None), difference)
+        return Verdict(about, claim, f"{text}no percentage: too near zero.", None, difference)
     text += f"{100 * difference.mean / abs(base.mean):+.2f} %"
     limit = paired_difference(evaluation.rewards(HINDSIGHT), evaluation.rewards("random"))
     if limit.above(0.0):
         text += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
-    answer = by_bool(difference.above(-share * abs(base.mean)))
+    answer = difference.above(-share * abs(base.mean))
     return Verdict(about, claim, f"{text}.", answer, difference)

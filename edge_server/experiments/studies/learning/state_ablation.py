@@ -12,16 +12,12 @@ from edge_server.experiments.studies.learning.setup import (
     better,
     embeddings_missing,
     fixed_of,
-    named_runs,
     room,
-    runs_of,
     simple_policies,
 )
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
 from edge_server.experiments.training.scheduler.setting import layout_of
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 100, False: 600}
 # name -> parts of the state
@@ -45,10 +41,8 @@ class Ablation(TrainingStudy):
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
         reward, candidates = trainer.reward("set", "moving"), simple_policies("threshold")
         for name, used in variants.items():
-            spec = Spec("select", layout_of(setting, used))
-            config = TrainingConfig(spec, reward, request.training_episodes(EPISODES))
-            trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
-            candidates |= named_runs(f"learnt {name}", trained)
+            config = trainer.config("select", reward, EPISODES, layout_of(setting, used))
+            candidates |= trainer.actors(f"learnt {name}", f"{self.name}-{name}", setting, config)
         evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(10, 100)))
         yield judge(evaluation, list(variants)), rows(evaluation)
 
@@ -56,7 +50,7 @@ class Ablation(TrainingStudy):
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
     """Verdicts on the policies trained with each variant of the state."""
     about = "room, ch5, moving, four viewpoints"
-    trained = {n: runs_of(evaluation, f"learnt {n}") for n in variants}
+    trained = {n: evaluation.runs(f"learnt {n}") for n in variants}
     best, text = evaluation.best_fixed("threshold")[0], fixed_of(evaluation, "threshold")
     found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
                     f"against {text}; ") for name, runs in trained.items()]  # fmt: skip

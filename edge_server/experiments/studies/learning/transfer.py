@@ -13,15 +13,11 @@ from edge_server.experiments.studies.learning.setup import (
     named_runs,
     no_worse,
     room,
-    runs_of,
     simple_policies,
 )
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Evaluation, rows
-from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig
-from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.state import StateLayout
+from edge_server.experiments.training.scheduler.setting import Setting
 
 EPISODES = {True: 40, False: 600}
 HOME = "room, swing"
@@ -40,10 +36,9 @@ class Transfer(TrainingStudy):
     title = "Trained on one scene and channel, used on another"
 
     def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
-        spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
         reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
         places = settings(request.quick)
-        config = TrainingConfig(spec, reward, request.training_episodes(EPISODES), tries=3)
+        config = trainer.config("wait", reward, EPISODES, tries=3)
         trained = {}
         for place, setting in places.items():
             name = f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}"
@@ -60,7 +55,7 @@ class Transfer(TrainingStudy):
 
 def judge(place: str, evaluation: Evaluation) -> list[Verdict]:
     """Verdicts on the policies trained at ``HOME``, used at a place, against those trained there."""
-    home, here = runs_of(evaluation, "learnt at home"), runs_of(evaluation, "learnt here")
+    home, here = evaluation.runs("learnt at home"), evaluation.runs("learnt here")
     best, text = evaluation.best_fixed("wait")[0], fixed_of(evaluation, "wait")
     found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,
                     f"against {text}; ")]  # fmt: skip

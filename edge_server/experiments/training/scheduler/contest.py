@@ -72,13 +72,9 @@ def contest(
         say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}")
     runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
             for who in (REFERENCE, LEARNT)}  # fmt: skip
-    for who, of in runs.items():
-        for m in _SHOWN:
-            values = {name: dict(zip(seeds, [run[m] for run in r])) for name, r in runs.items()}
-            found[who][m] = interval(values[who].values()).rounded(4)
-            found[who][f"{m}_over_{REFERENCE}"] = paired(values[who], values[REFERENCE]).rounded(4)
-        if who == LEARNT:
-            found[who]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in of])
+    for who, of in _means(runs, seeds, _SHOWN).items():
+        found[who] |= of
+    found[LEARNT]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in runs[LEARNT]])
     say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
     return {
         "scenario": setting.scenario.name, "seed": setting.scenario.seed, "seeds": len(seeds),
@@ -100,6 +96,19 @@ def _runs(
         return [store.results[keys[seed]] for seed in seeds]
 
 
+def _means(
+    runs: Mapping[str, list[dict[str, Any]]], seeds: range, names: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Of each policy the means of ``names``, and of what it shows minus what the first one does, paired."""
+    first, found = next(iter(runs)), {}
+    for who, of in runs.items():
+        found[who] = {m: interval(run[m] for run in of).rounded(4) for m in names}
+        for m in _SHOWN:
+            mine, base = (dict(zip(seeds, [run[m] for run in r])) for r in (of, runs[first]))
+            found[who][f"{m}_over_{first}"] = paired(mine, base).rounded(4)
+    return found
+
+
 def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
     """Mean omega in each state of the channel, with the interval over the runs that were in it."""
     states = sorted({state for run in runs for state in run})
@@ -118,13 +127,7 @@ def compare(
     for seed in seeds:  # of one motion after the other: its pictures are rendered once
         for name in names:
             runs[name] += _runs(setting, pool, range(seed, seed + 1), _named(name), "", known)
-    found: dict[str, dict[str, Any]] = {}
-    for name, of in runs.items():
-        found[name] = {m: interval(run[m] for run in of).rounded(4) for m in (*_SHOWN, "views", "aaoi_ms")}
-        for m in _SHOWN:
-            mine, first = (dict(zip(seeds, [run[m] for run in r])) for r in (of, runs[names[0]]))
-            found[name][f"{m}_over_{names[0]}"] = paired(mine, first).rounded(4)
-    return found
+    return _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
 
 
 def _named(name: str) -> Judged:

@@ -62,6 +62,11 @@ class Evaluation:
         """Reward of every decision, mean of its fits; None where a term is missing."""
         return {at: _mean([self.value(o) for o in self._fits(name, at)]) for at in self.outcomes[name]}
 
+    def runs(self, name: str) -> list[PerSeed]:
+        """Rewards of each of the repeated trainings ``NAME-0``, ``NAME-1``, ..."""
+        of = [n for n in self.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
+        return [self.rewards(n) for n in of]
+
     def seeds(self, name: str) -> tuple[int, int]:
         """Number of seeds, and of those with a value."""
         found = self.rewards(name)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.statistics import Interval, interval, paired
+from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation, PerSeed
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
@@ -80,13 +80,13 @@ def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:
     drawn, known = evaluation.seeds(trained)
     lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
     return [
-        f"reward {span(interval(mine.values()))} on {known} unseen seeds{lacking}",
-        f"over random {span(paired(mine, random))}, over the best fixed {fixed} ({name}) "
-        f"{span(paired(mine, best))}",
-        f"share of what could be won: {span(evaluation.share(mine), 2)}; the best fixed {fixed} has "
-        f"{span(evaluation.share(best), 2)}",
+        f"reward {interval(mine.values()).text(4)} on {known} unseen seeds{lacking}",
+        f"over random {paired(mine, random).text(4)}, over the best fixed {fixed} ({name}) "
+        f"{paired(mine, best).text(4)}",
+        f"share of what could be won: {evaluation.share(mine).text(2)}; the best fixed {fixed} has "
+        f"{evaluation.share(best).text(2)}",
         f"the best {fixed} of a decision is {quartiles(best_values)}; to know it would be worth "
-        f"{span(best_values['gain'])} over the best fixed one",
+        f"{best_values['gain'].text(4)} over the best fixed one",
     ]
 
 
@@ -103,13 +103,6 @@ def percent(values: PerSeed, base: PerSeed) -> str:
     if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
         return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"
     return f"{100.0 * (a.mean - b.mean) / abs(b.mean):+.1f} %"
-
-
-def span(i: Interval, digits: int = 4) -> str:
-    """``mean [low, high]``."""
-    if i.count < 2 or np.isnan(i.low):
-        return f"{i.mean:.{digits}f}"
-    return f"{i.mean:.{digits}f} [{i.low:.{digits}f}, {i.high:.{digits}f}]"
 
 
 def _numbers(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:

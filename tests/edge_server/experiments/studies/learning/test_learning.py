@@ -273,8 +273,8 @@ def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
 
 
 def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
-    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders())) as trainer:
-        configs = {name: change.config(trainer, 7, 2) for name, change in channel_drift.changes().items()}
+    with setup.StudyTrainer(StudyRequest(True, tmp_path, Folders(), episodes=7)) as trainer:
+        configs = {name: change.config(trainer, 2) for name, change in channel_drift.changes().items()}
     priced = [name for name, config in configs.items() if config.reward.views < 0]
     assert [configs[name].spec.action for name in priced] == ["select"]
     assert {config.spec.action for name, config in configs.items() if name not in priced} == {"threshold"}
