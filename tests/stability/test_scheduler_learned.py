@@ -10,9 +10,16 @@ import pytest
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Batch, Diagnostics, Learner
-from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.state import State, StateLayout
-from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, regret, state, teach
+from tests.edge_server.scheduler.learned.problems import (
+    OMEGAS_MS,
+    FreshOnes,
+    Waits,
+    collect,
+    regret,
+    state,
+    teach,
+)
 
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=4)
 SPECS = [Spec("select", LAYOUT), Spec("wait", LAYOUT, OMEGAS_MS)]

@@ -7,8 +7,7 @@
     distributions.py    log-probabilities that hold at the edges, non-empty sets
     ppo.py              single-step PPO (5.23, algorithm 1), contextual-bandit PPO (6.42, algorithm 2)
     rewards.py          (5.19) and (6.36)-(6.38), term by term
-    problem.py          the bandit problem: draw a round, get the reward of an action
-    gym_environment.py  the same for gymnasium
+    gym_environment.py  draw a round, get the reward of an action: for gymnasium
     actor.py            a trained actor, in numpy
     bandit.py           a checkpoint as a policy, live and in virtual time
     explain.py          attributes a decision to parts of the state, cameras and image regions

@@ -10,18 +10,39 @@ MultiBinary(N) for ``select``, otherwise Discrete(K). Needs the extra ``gym`` (p
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.problem import Problem, Round
+from edge_server.scheduler.learned.state import State
 
 try:
     import gymnasium
 except ImportError as error:
     raise ImportError("the gymnasium environment needs gymnasium: pip install 'freshfield[gym]'") from error
+
+
+class Round(Protocol):
+    """One instant at which to decide. ``reward`` may be called repeatedly: every action starts from the same
+    field, so that actions can be compared."""
+
+    @property
+    def state(self) -> State: ...
+
+    def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
+        """The reward (NaN where there is none) and its terms. action: (N,) bool, the cameras used, or the
+        index of an omega."""
+        ...
+
+
+class Problem(Protocol):
+    """A source of rounds."""
+
+    def draw(self, seed: int) -> Round:
+        """The round of ``seed``: the same seed, the same instant."""
+        ...
 
 
 class BanditEnvironment(gymnasium.Env):

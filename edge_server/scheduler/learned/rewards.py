@@ -84,23 +84,15 @@ class Reward:
         if self.distance_is not in ("lpips", "perceptual"):
             raise ValueError(f"reward {self.name}: distance_is lpips or perceptual, not {self.distance_is!r}")
 
-    def of(self, score: Scored, aaoi_ms: float | None = None, perceptual: float | None = None) -> RewardTerms:
-        """The reward of a score.
-
-        aaoi_ms: mean age of the used views at the present. perceptual: the stand-in distance. None takes the
-        score's own, where it has one (a publication does). A metric that is None or not finite is missing.
-        """
-        if aaoi_ms is None:
-            aaoi_ms = getattr(score, "aaoi_ms", None)
-        if perceptual is None:
-            perceptual = getattr(score, "perceptual", None)
+    def of(self, score: Scored) -> RewardTerms:
+        """The reward of a score; the mean age of the used views, their number and the stand-in distance count
+        where it has them (a publication does). A metric that is None or not finite is missing."""
         psnr_db = score.psnr_db if self.fidelity == "whole" else score.psnr_moving_db
-        distance = score.lpips if self.distance_is == "lpips" else perceptual
         found = {
             "psnr" if self.fidelity == "whole" else "psnr_moving": (self.psnr, psnr_db),
             "ssim": (self.ssim, score.ssim),
-            self.distance_is: (self.distance, distance),
-            "age": (self.age, aaoi_ms),
+            self.distance_is: (self.distance, getattr(score, self.distance_is, None)),
+            "age": (self.age, getattr(score, "aaoi_ms", None)),
             "views": (self.views, getattr(score, "views", None)),
         }
         terms = {
@@ -133,20 +125,12 @@ def f_w(row: Mapping[str, Any]) -> float | None:
     return W_P * psnr + W_S * ssim + W_L * lpips + W_T * age
 
 
-def make_reward(
-    name: str = "corrected",
-    fidelity: Literal["whole", "moving"] = "whole",
-    distance_is: Literal["lpips", "perceptual"] = "lpips",
-    **weights: float,
-) -> Reward:
-    """The preset ``name``, with ``weights`` (by the names in ``TERMS``) in place of its own. ValueError for
-    an unknown name lists the known ones."""
+def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:
+    """The preset ``name`` with ``fidelity`` and other fields in place of its own. ValueError for an unknown
+    name lists the known ones."""
     if name not in REWARDS:
         raise ValueError(f"reward {name!r} is not known; choose one of {', '.join(REWARDS)}")
-    if unknown := set(weights) - set(TERMS):
-        raise ValueError(f"reward {name}: no weight is called {', '.join(unknown)}: {', '.join(TERMS)}")
-    preset = replace(REWARDS[name], fidelity=fidelity, distance_is=distance_is)
-    return replace(preset, **weights)  # type: ignore[arg-type] # names were checked above
+    return replace(REWARDS[name], fidelity=fidelity, **others)  # type: ignore[arg-type] # checked by Reward
 
 
 def without_missing_lpips(reward: Reward, lpips_missing: str | None) -> Reward:

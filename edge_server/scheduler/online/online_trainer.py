@@ -13,7 +13,7 @@ import numpy as np
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, Scored, make_reward, without_missing_lpips
 from edge_server.scheduler.online.online_policy import OnlinePolicy
-from edge_server.scheduler.registry import BANDIT, make_live_policy
+from edge_server.scheduler.registry import BANDIT, make_live_policy, parse_policy
 from freshfield.files import Lines
 
 log = logging.getLogger(__name__)
@@ -102,11 +102,9 @@ def open_online_trainer(
             f"{path}: its decisions hold for {learner.spec.hold_ms:g} ms (--hold), and what several updates "
             "share cannot be learned live: run it without learning, or train one without --hold"
         )
-    name, _, value = (fallback or training_summary(path).get("best_fixed") or _DEFAULT_FALLBACK).partition(
-        ":"
-    )
+    other = fallback or training_summary(path).get("best_fixed") or _DEFAULT_FALLBACK
     try:
-        fixed = make_live_policy(name, float(value) if value else None, rng)
+        fixed = make_live_policy(*parse_policy(other), rng)
     except ValueError as error:
         raise ValueError(f"fallback: {error}") from None
     policy = OnlinePolicy(learner, fixed, f"{BANDIT}{path}", rng)
@@ -146,4 +144,4 @@ def choose_reward(
     known = training_summary(path)
     default = "set" if action == "select" else "corrected"
     name, _, on = (given or f"{known.get('reward_name', default)}:{known.get('on', 'whole')}").partition(":")
-    return without_missing_lpips(make_reward(name, fidelity=on or "whole"), lpips_missing)  # type: ignore[arg-type]
+    return without_missing_lpips(make_reward(name, fidelity=on or "whole"), lpips_missing)

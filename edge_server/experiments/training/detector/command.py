@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.common.arguments import at_least, command_parser, run_command
+from edge_server.experiments.common.arguments import command_parser, run_command
 
 DESCRIPTION = """\
 Train the small detector whose backbone gives the default embeddings, on variations of our own scenes.
@@ -20,8 +20,8 @@ Train the small detector whose backbone gives the default embeddings, on variati
 
 Pictures and boxes are rendered (room, tower, tile with people, carts, balls and drums), the detector is
 trained, exported to ONNX in float32 and in static 8 bits, and each is measured on worlds and cameras that
-it has never seen. Ctrl-C stops after which the same command goes on; the same seed and threads give the
-same weights. In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality). Use one:
+it has never seen. Ctrl-C stops after which the same command goes on; the same seed gives the same weights.
+In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality). Use one:
 
   edge: {embedding: {model: runs/detector/detector_fp32.onnx}}
 """
@@ -62,20 +62,19 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from edge_server.report.machine import machine, versions
     from freshfield.files import write_json
 
-    worlds, epochs, held = (20, 2, 4) if args.quick else (args.worlds, args.epochs, HELD_OUT_WORLDS)
-    settings = Settings(args.seed, args.side, worlds, epochs, args.rate, args.threads)
+    settings = Settings(args.seed, worlds=20, epochs=2) if args.quick else Settings(args.seed)
     args.out.mkdir(parents=True, exist_ok=True)
-    pictures = args.out / "pictures"
-    known = render("train", worlds, args.side, args.seed, pictures, args.workers)
-    unseen = render("held-out", held, args.side, args.seed, pictures, args.workers)
+    side, pictures = settings.side, args.out / "pictures"
+    known = render("train", settings.worlds, side, args.seed, pictures)
+    unseen = render("held-out", 4 if args.quick else HELD_OUT_WORLDS, side, args.seed, pictures)
     model, log = train(known, settings, args.out / "checkpoint.pt")
     fp32, int8 = args.out / "detector_fp32.onnx", args.out / "detector_int8.onnx"
-    export.export_fp32(model, args.side, fp32, {"author": "freshfield", "seed": args.seed})
+    export.export_fp32(model, side, fp32, {"author": "freshfield", "seed": args.seed})
     spread = export.add_projection(fp32, export.pooled_features(fp32, known.images))
     step = max(1, len(known) // export.CALIBRATION_IMAGES)
     export.export_int8(fp32, known.images[::step][: export.CALIBRATION_IMAGES], int8)
     quality: dict[str, Any] = {}
-    rigs = of_own_rigs(args.side)
+    rigs = of_own_rigs(side)
     for path in (fp32, int8):
         detect = export.runner(path)
         sets = {"unseen worlds": unseen, **{f"own rig of {name}": p for name, p in rigs.items()}}
@@ -123,27 +122,6 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--out", type=Path, default=Path("runs/detector"), metavar="DIR", help="[%(default)s]")
     add("--seed", type=int, default=0, help="[%(default)s]")
-    add(
-        "--worlds", type=at_least(20), default=400, metavar="N",
-        help="to train on, 8 pictures each [%(default)s]",
-    )  # fmt: skip
-    add("--epochs", type=at_least(1), default=18, metavar="N", help="[%(default)s]")
-    add("--side", type=_side, default=128, metavar="PX", help="of the pictures [%(default)s]")
-    add("--rate", type=float, default=2e-3, help="of learning [%(default)s]")
-    add(
-        "--threads",
-        type=at_least(1),
-        default=1,
-        metavar="N",
-        help="that train; they decide the weights too [%(default)s]",
-    )
-    add("--workers", type=at_least(1), default=2, metavar="N", help="processes that render [%(default)s]")
     add("--quick", action="store_true", help="20 worlds, 2 epochs: to try it out")
     add("--json", action="store_true", help="print detector.json instead of a summary")
     return parser
-
-
-def _side(text: str) -> int:
-    if not text.isdigit() or int(text) % 16 or not 64 <= int(text) <= 640:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a multiple of 16 from 64 to 640")
-    return int(text)

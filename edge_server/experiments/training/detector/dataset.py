@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from camera_node.synthetic.scene import make_scene
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.training.detector.scenes import Boxes, own_rig, scene_of, variation
+from freshfield.machine_load import usable_cores
 
 SHARD_SHOTS = 20
 INSTANTS = 8
@@ -42,7 +43,7 @@ def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np
         yield np.ascontiguousarray(part) / np.float32(255.0)
 
 
-def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers: int) -> LabeledImages:
+def render(purpose: str, shots: int, side: int, seed: int, folder: Path) -> LabeledImages:
     """``INSTANTS`` images of each of ``shots`` variations; those already in ``folder`` are read from
     there."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +55,7 @@ def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers
     if missing:
         progress = Progress(len(missing))
         # Spawned, because torch's threads do not survive a fork.
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(usable_cores(), get_context("spawn")) as pool:
             for job, _ in zip(missing, pool.map(_render_shard, missing)):
                 progress.advance(1)
                 progress.report(f"{purpose} pictures", f"{job[2] + job[3]} of {shots} worlds", "rendered")

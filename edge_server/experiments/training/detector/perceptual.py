@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if lpips is None:
         raise FitFailed(f"real LPIPS is what is fitted to: {missing}")
     args.out.mkdir(parents=True, exist_ok=True)
-    layers = Layers(args.detector, tuple(f"model.{k}" for k in LAYERS))
-    worlds, held = (8, 3) if args.quick else (args.worlds, 20)
+    layers = Layers(MODELS / DETECTOR, tuple(f"model.{k}" for k in LAYERS))
+    worlds, held, side = (8, 3, 64) if args.quick else (80, 20, 128)
 
     def distort(dataset: LabeledImages, purpose: str) -> tuple[NDArray[np.uint8], list[str]]:
         return pairs_of(dataset.images, np.random.default_rng([args.seed, *purpose.encode()]))
@@ -103,14 +103,14 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         return np.concatenate(x), np.concatenate(y)
 
     folder = args.out / "pictures"
-    known = render("perceptual", worlds, args.side, args.seed, folder, args.workers)
+    known = render("perceptual", worlds, side, args.seed, folder)
     x, y = compare(distort(known, "perceptual")[0], "fit")
     weights, power = fit(x, y)
-    unseen = render("perceptual-held-out", held, args.side, args.seed, folder, args.workers)
+    unseen = render("perceptual-held-out", held, side, args.seed, folder)
     tests = {UNSEEN: distort(unseen, "unseen worlds")}
-    for name, dataset in of_own_rigs(args.side).items():
+    for name, dataset in of_own_rigs(side).items():
         tests[f"own rig of {name}"] = distort(dataset, name)
-    tests["field renderings"] = field_renderings(args.side, args.seed)
+    tests["field renderings"] = field_renderings(side, args.seed)
     rank, by_scene = {}, [Compared(x, y, scenes_of("perceptual", worlds, args.seed))]
     for name, (pairs, names) in tests.items():
         xt, yt = compare(pairs, name)
@@ -233,12 +233,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--detector", type=Path, default=MODELS / DETECTOR, metavar="FILE", help="[the shipped one]")
     add("--out", type=Path, default=Path("runs/perceptual"), metavar="DIR", help="[%(default)s]")
     add("--seed", type=int, default=0, help="[%(default)s]")
-    add("--worlds", type=int, default=80, metavar="N", help="to fit on, 8 pictures each [%(default)s]")
-    add("--side", type=int, default=128, metavar="PX", help="of the pictures [%(default)s]")
-    add("--workers", type=int, default=2, metavar="N", help="processes that render [%(default)s]")
-    add("--quick", action="store_true", help="8 worlds: to try it out")
+    add("--quick", action="store_true", help="8 worlds, small pictures: to try it out")
     add("--json", action="store_true", help="print perceptual.json instead of a summary")
     return parser

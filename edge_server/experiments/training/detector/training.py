@@ -77,7 +77,7 @@ def train(
             sums += (float(scored.detach()), float(boxed.detach()))
         score_loss, box_loss = (round(float(v), 5) for v in sums / per_epoch)
         if not math.isfinite(score_loss + box_loss):
-            raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite; lower the rate")
+            raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite: take another seed")
         seconds = round(time.perf_counter() - began, 1)
         log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
         _save(checkpoint, settings, parts, log)

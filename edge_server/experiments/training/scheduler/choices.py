@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint
-from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy
+from edge_server.scheduler import Epoch, Policy, make_policy, parse_policy
 from edge_server.scheduler.learned.learner_spec import Spec
 
 Maker = Callable[[np.random.Generator], Policy]
@@ -55,8 +55,8 @@ def choices(make: Maker, moments: Sequence[DecisionPoint], purpose: int = 0) -> 
 
 def named(name: str) -> Maker:
     """Maker of a policy from ``make_policy``'s name and value, such as ``threshold:120``."""
-    kind, _, value = (name, "", "") if name.startswith(BANDIT) else name.partition(":")
-    return lambda rng: make_policy(kind, float(value) if value else None, rng)
+    kind, value = parse_policy(name)
+    return lambda rng: make_policy(kind, value, rng)
 
 
 def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:

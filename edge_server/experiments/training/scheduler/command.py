@@ -193,7 +193,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
-        given, report=report, motions=not args.same_motion,
+        given, report=report,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch, decisions=args.decisions, lead_ms=LEAD_MS if args.hold else 1000.0,
         span_ms=args.hold * args.decisions or 6000.0, compute=read_config(given).compute,
@@ -295,7 +295,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--report", metavar="CAM,...",
         help="cameras that only report; none: the one that rewards [the last of several that are held out, "
         "else one of the training cameras]")  # fmt: skip
-    add("--same-motion", action="store_true", help="the scene's own motion in every episode")
     add(
         "--parts",
         default="age,pose",

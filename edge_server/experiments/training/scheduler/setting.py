@@ -149,7 +149,7 @@ def reward_of(
     network: the scenario's edge.lpips.
     distance: lpips, perceptual (its stand-in) or none.
     """
-    reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
+    reward = make_reward(name, fidelity=on)
     if distance == "none":
         return dataclasses.replace(reward, distance=0.0), None
     if distance == "perceptual":

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from edge_server.scheduler.learned.problem import collect
+from edge_server.scheduler.learned.ppo import Batch, Learner
 from edge_server.scheduler.learned.state import State, StateLayout
 
 OMEGAS_MS = (0.0, 50.0, 100.0, 150.0)
 WORTH_MS = 100.0
+
+
+def collect(learner: Learner, problem: Any, seeds: Sequence[int]) -> Batch:
+    """A batch of the learner's exploring decisions in the rounds of ``seeds``."""
+    rounds = [problem.draw(seed) for seed in seeds]
+    states = [one.state for one in rounds]
+    actions, logps = learner.act(states)
+    rewards = [one.reward(action)[0] for one, action in zip(rounds, actions)]
+    return learner.batch(states, actions, logps, rewards)
 
 
 def state(n: int, rng: np.random.Generator, d: int = 0, silent: int = 0) -> State:

@@ -16,8 +16,15 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.problem import collect
-from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, regret, state, teach
+from tests.edge_server.scheduler.learned.problems import (
+    OMEGAS_MS,
+    FreshOnes,
+    Waits,
+    collect,
+    regret,
+    state,
+    teach,
+)
 
 
 def same(a: Learner, b: Learner) -> bool:

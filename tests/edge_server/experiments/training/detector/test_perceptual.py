@@ -111,7 +111,7 @@ def test_the_command_fits_and_says_how_well(tmp_path, capsys, monkeypatch):
     pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
     monkeypatch.setattr(renderings, "STEPS", (5, 10))  # fog will do: most of the minutes are these fits
     out = tmp_path / "fit"
-    words = ["train-perceptual", "--quick", "--side", "64", "--lpips", str(data_dir("lpips"))]
+    words = ["train-perceptual", "--quick", "--lpips", str(data_dir("lpips"))]
     assert edge_server([*words, "--out", str(out)]) == 0
     assert "Spearman" in capsys.readouterr().out
     assert (out / "perceptual.npz").is_file() and (out / "perceptual.json").is_file()

@@ -118,13 +118,13 @@ def test_the_shipped_rigs_show_what_moves_in_them():
 
 @pytest.mark.slow
 def test_pictures_are_rendered_once_and_a_damaged_shard_again(tmp_path):
-    first = render("train", 2, 64, 0, tmp_path, 1)
+    first = render("train", 2, 64, 0, tmp_path)
     (shard,) = tmp_path.glob("*.npz")
     written = shard.stat().st_mtime_ns
-    again = render("train", 2, 64, 0, tmp_path, 1)
+    again = render("train", 2, 64, 0, tmp_path)
     assert shard.stat().st_mtime_ns == written, "nothing was rendered"
     shard.write_bytes(shard.read_bytes()[:500])
-    mended = render("train", 2, 64, 0, tmp_path, 1)
+    mended = render("train", 2, 64, 0, tmp_path)
     for other in (again, mended):
         assert isinstance(other, LabeledImages) and len(other) == 16
         assert (other.images == first.images).all()

@@ -41,12 +41,12 @@ from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.scheduler.online.online_trainer import choose_reward
 from freshfield.files import write_csv
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
+from tests.edge_server.scheduler.learned.problems import collect
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
@@ -430,12 +430,12 @@ def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_ask
     assert reward.distance == 0.0 and "squeeze" in missing
     assert reward_of("set", "whole", None, "alex", "none") == (make_reward("set", distance=0.0), None)
     stand_in, missing = reward_of("set", "moving", None, "alex", "perceptual")
-    assert missing is None and stand_in == make_reward("set", "moving", "perceptual")
+    assert missing is None and stand_in == make_reward("set", "moving", distance_is="perceptual")
 
 
 def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_path: Path, capsys):
     asked = "--distance perceptual --episodes 1 --batch 1 --decisions 1 --fit-steps 2 --size 24 --test 0"
-    words, out = command_line(tmp_path, f"{asked} --same-motion --scratch")
+    words, out = command_line(tmp_path, f"{asked} --scratch")
     assert main(words) == 0
     assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
     (row,) = read_log(out)
