@@ -26,7 +26,7 @@ Write what a run or a fit has made as files for other programs. RUN is its folde
 --mesh         triangles with colours: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
 --points       surface points with colours (.ply)
---colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
+--colmap       DIR/images and a model in DIR/sparse/0, as text
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 --trajectory   poses as the TUM benchmark has them; a file for each camera that moved
 
@@ -64,13 +64,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--splats", type=Path, metavar="FILE", help=".ply")
     add("--points", type=Path, metavar="FILE", help=".ply")
     add("--colmap", type=Path, metavar="DIR")
-    add("--binary", action="store_true", help="of --colmap: binary instead of text")
     add("--transforms", type=Path, metavar="DIR")
     add("--trajectory", type=Path, metavar="FILE")
     add("--count", type=int, default=20000, metavar="N", help="points of --points and others [%(default)s]")
     mesh = parser.add_argument_group("of --mesh").add_argument
     mesh("--voxel", type=float, metavar="MM", help="[what a pixel spans at the surface]")
-    mesh("--truncation", type=float, default=4.0, metavar="VOXELS", help="[%(default)g]")
     mesh(
         "--bounds", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="metres [what the cameras see]",
@@ -82,14 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     mesh("--no-carve", action="store_true", help="start from the field's depth instead of voxels fitted anew "
          "for it, if 30 pictures show a scene that ends at its box: faster, less complete")  # fmt: skip
     mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
-    mesh("--solid", type=float, default=0.8, metavar="A", help="opacity of a surface, 0 to 1 [%(default)g]")
-    mesh("--keep", type=float, default=0.02, metavar="SHARE", help="of the largest piece's area, that others "
-         "need to stay [%(default)g]")  # fmt: skip
-    mesh("--pieces", type=int, metavar="N", help="at most [all of them]")
     mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
          "far the mesh is from the true surface")  # fmt: skip
     mesh("--json", type=Path, metavar="FILE", help="size, seconds of each stage and, of --measure, distances")
-    mesh("--memory", type=float, default=2048.0, metavar="MB", help="for voxels [%(default)g]")
     return parser
 
 
@@ -143,8 +136,6 @@ class Export:
                 raise ExportError(f"--{name} {path}: expected a file that ends in {' or '.join(endings)}")
         if args.count < 1:
             raise ExportError(f"--count {args.count}: expected 1 or more")
-        if args.binary and args.colmap is None:
-            raise ExportError("--binary is for --colmap DIR")
         if args.mesh is None and (args.measure is not None or args.json is not None):
             raise ExportError("--measure and --json are for --mesh FILE")
         if args.measure is not None and self._compare is None:
@@ -161,9 +152,8 @@ class Export:
         return MeshSettings(
             method=a.method, sharpen=not a.no_sharpen,
             carve=a.mesh is not None and not a.no_carve,  # points need no more than the field has
-            voxel_m=None if a.voxel is None else 1e-3 * a.voxel, truncation=a.truncation, bounds=box,
-            watertight=a.watertight, min_weight=a.min_weight, solid=a.solid, keep_share=a.keep, most=a.pieces,
-            memory_mb=a.memory,
+            voxel_m=None if a.voxel is None else 1e-3 * a.voxel, bounds=box, watertight=a.watertight,
+            min_weight=a.min_weight,
         )  # fmt: skip
 
     def _mesh(self, path: Path) -> None:
@@ -216,7 +206,7 @@ class Export:
         from edge_server.export.colmap import write_model
         from edge_server.export.run_source import write_images
 
-        write_model(folder / "sparse" / "0", self.source.shots, self.cloud, self.args.binary)
+        write_model(folder / "sparse" / "0", self.source.shots, self.cloud)
         write_images(folder / "images", self.source.shots)
         print(f"{folder}: {len(self.source.shots)} images, {len(self.cloud.points)} points", flush=True)
 
@@ -255,7 +245,3 @@ class Export:
         if share >= 1.0 or what != name or now - at >= 1.0:
             self._said = (what, now)
             print(f"  {what:10} {100 * share:3.0f} %", flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -121,7 +121,6 @@ def render_depth_maps(
     renderer: Renderer,
     cameras: Sequence[Camera],
     solid: float = SOLID,
-    steepest_deg: float = STEEPEST_DEG,
     on_map: Callable[[int], None] | None = None,
 ) -> Iterator[DepthMap]:
     """Render depth maps for ``cameras``, one at a time. on_map: called with the count done. For a ``planar``
@@ -133,6 +132,6 @@ def render_depth_maps(
             beyond = np.where(found.opacity <= EMPTY, np.inf, 0.0)
             depth = np.where(found.opacity >= solid, found.depth, beyond).astype(np.float32)
         color = np.rint(np.clip(np.nan_to_num(found.color), 0.0, 1.0) * 255.0).astype(np.uint8)
-        yield depth_map(depth, color, pose, lens, found.opacity, steepest_deg)
+        yield depth_map(depth, color, pose, lens, found.opacity)
         if on_map is not None:
             on_map(k + 1)

@@ -216,8 +216,8 @@ def remove_degenerate(mesh: Mesh) -> Mesh:
     return _select_faces(mesh, apart & (mesh.areas_m2() > 0.0))
 
 
-def remove_small_components(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None) -> Mesh:
-    """Keep components with at least ``keep_share`` of the largest area, and only the ``most`` largest."""
+def remove_small_components(mesh: Mesh, keep_share: float = KEEP_SHARE) -> Mesh:
+    """Keep components with at least ``keep_share`` of the largest area."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -229,9 +229,7 @@ def remove_small_components(mesh: Mesh, keep_share: float = KEEP_SHARE, most: in
     _, label = connected_components(graph, directed=False)
     of_face = label[mesh.faces[:, 0]]
     area = np.bincount(of_face, weights=mesh.areas_m2())
-    order = np.argsort(-area, kind="stable")
-    kept = order[area[order] >= keep_share * area.max()][:most]
-    return _select_faces(mesh, np.isin(of_face, kept))
+    return _select_faces(mesh, (area >= keep_share * area.max())[of_face])
 
 
 def _select_faces(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:

@@ -10,8 +10,8 @@ import numpy as np
 from edge_server.fields import Renderer, View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
-from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, render_depth_maps
-from edge_server.surface.mesh import KEEP_SHARE, Mesh, extract_mesh, remove_small_components
+from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
+from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
 from edge_server.surface.refine_depth import PASSES, refine_depth
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
 from edge_server.surface.voxel_depth import STEPS, fill_depth, fit_voxels, voxel_box
@@ -26,10 +26,9 @@ Say = Callable[[str, float], None]
 @dataclass(frozen=True)
 class MeshSettings:
     """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None: the size of a pixel at the surface.
-    truncation: voxels. bounds: lower and upper corner, meters; None: from the depth maps. watertight: close
-    the surface in unobserved space. min_weight: known voxels have more weight than this (a camera at normal
-    incidence counts 1). solid, steepest_deg: pixel selection. keep_share, most: component selection.
-    memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``). carve: with
+    bounds: lower and upper corner, meters; None: from the depth maps. watertight: close the surface in
+    unobserved space. min_weight: known voxels have more weight than this (a camera at normal incidence counts
+    1). memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``). carve: with
     sharpen, in a scene bounded by its field's box with enough images: start from voxels fitted in
     ``carve_steps`` steps, and use their depth where the images are ambiguous (``voxel_depth``)."""
 
@@ -38,26 +37,16 @@ class MeshSettings:
     carve: bool = True
     carve_steps: int = STEPS
     voxel_m: float | None = None
-    truncation: float = TRUNCATION
     bounds: tuple[Corner, Corner] | None = None
     watertight: bool = False
     min_weight: float = 0.2
-    solid: float = SOLID
-    steepest_deg: float = STEEPEST_DEG
-    keep_share: float = KEEP_SHARE
-    most: int | None = None
     memory_mb: float = 2048.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise SurfaceError(f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
-        for name, low, high in (
-            ("truncation", 1.0, 100.0), ("min_weight", 0.0, 1e6), ("solid", 0.01, 1.0),
-            ("steepest_deg", 1.0, 89.9), ("keep_share", 0.0, 1.0), ("memory_mb", 1.0, 1e6),
-            ("carve_steps", 1, 1e6),
-        ):  # fmt: skip
-            if not low <= getattr(self, name) <= high:
-                raise SurfaceError(f"{name} must be in {low:g}..{high:g}, not {getattr(self, name):g}")
+        if not 0.0 <= self.min_weight <= 1e6:
+            raise SurfaceError(f"min_weight must be in 0..1e+06, not {self.min_weight:g}")
 
 
 def silent(what: str, share: float) -> None:
@@ -86,12 +75,8 @@ def make_depth_maps(
         renderer = fit_voxels(box, behind, views, settings.carve_steps, pool)
         say("carve", 1.0)
     # A translucent initial surface is sufficient for refinement.
-    solid = min(settings.solid, GUESS) if settings.sharpen else settings.solid
-    maps = list(
-        render_depth_maps(
-            renderer, cameras, solid, settings.steepest_deg, lambda done: say("depth", done / len(views))
-        )
-    )
+    solid = GUESS if settings.sharpen else SOLID
+    maps = list(render_depth_maps(renderer, cameras, solid, lambda done: say("depth", done / len(views))))
     if not settings.sharpen or len(maps) < 2:
         return maps
     # Voxel depth is accurate enough to skip the widest search, which may find a wrong match.
@@ -113,7 +98,7 @@ def mesh_from_depth_maps(
     else:
         volume = fuse_maps(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
     mesh = extract_mesh(volume, settings.min_weight, settings.watertight, lambda share: say("extract", share))
-    return remove_small_components(mesh, settings.keep_share, settings.most)
+    return remove_small_components(mesh)
 
 
 def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
@@ -122,10 +107,10 @@ def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
     if settings.bounds is not None:
         lower, upper = settings.bounds
     else:
-        lower, upper = bounding_box(maps, 2.0 * settings.truncation * voxel_m)
+        lower, upper = bounding_box(maps, 2.0 * TRUNCATION * voxel_m)
     if settings.voxel_m is None:
         voxel_m = max(voxel_m, float(np.subtract(upper, lower).max()) / FINEST)
-    return Grid(lower, upper, voxel_m, settings.truncation * voxel_m)
+    return Grid(lower, upper, voxel_m, TRUNCATION * voxel_m)
 
 
 def pixel_m(maps: Sequence[DepthMap]) -> float:
@@ -136,5 +121,5 @@ def pixel_m(maps: Sequence[DepthMap]) -> float:
         if m.seen.any()
     ]
     if not spans:
-        raise SurfaceError("no camera sees anything solid: fit the field longer, or lower --solid")
+        raise SurfaceError("no camera sees anything solid: fit the field longer")
     return float(np.median(spans))

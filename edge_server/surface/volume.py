@@ -21,7 +21,8 @@ from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDep
 
 BLOCK_BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
 MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
-TRUNCATION = 4.0  # voxels, the default
+TRUNCATION = 4.0  # voxels
+OUTLIERS = 0.002  # share of points at each end of each axis
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,16 @@ class Volume:
     through: NDArray[np.bool_]
 
 
-def bounding_box(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -> tuple[
-    tuple[float, float, float], tuple[float, float, float]
-]:  # fmt: skip
-    """Lower and upper corner, meters, of the maps' points, plus a margin. spare: share of points to ignore
-    as outliers at each end of each axis. SurfaceError: there are no points."""
+def bounding_box(
+    maps: Sequence[DepthMap], margin_m: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Lower and upper corner, meters, of the maps' points without outliers, plus a margin. SurfaceError:
+    there are no points."""
     points = [m.points()[:: max(1, m.depth.size // 20000)] for m in maps]
     every = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(every):
-        raise SurfaceError("no camera sees anything solid: fit the field longer, or lower --solid")
-    low, high = np.quantile(every, [spare, 1.0 - spare], axis=0)
+        raise SurfaceError("no camera sees anything solid: fit the field longer")
+    low, high = np.quantile(every, [OUTLIERS, 1.0 - OUTLIERS], axis=0)
     a, b = low - margin_m, high + margin_m
     return (float(a[0]), float(a[1]), float(a[2])), (float(b[0]), float(b[1]), float(b[2]))
 
@@ -108,7 +109,7 @@ def fuse_maps(
         least_m = grid.voxel_m * np.sqrt(needed_mb / memory_mb)
         raise SurfaceError(
             f"{1e3 * grid.voxel_m:g} mm voxels need {needed_mb:.0f} MB, more than the {memory_mb:.0f} "
-            f"allowed: take {1e3 * least_m:.2g} mm or more, smaller bounds, or more memory"
+            f"allowed: take {1e3 * least_m:.2g} mm or more, or smaller bounds"
         )
     table[tuple(place.T)] = np.arange(len(place), dtype=np.int32)
     blocks = _blocks(place, np.array(grid.lower), grid.band_m)

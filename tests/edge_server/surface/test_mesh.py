@@ -64,7 +64,6 @@ def test_dirt_goes_and_pieces_stay(ball):
     )
     assert len(remove_small_components(dirt).faces) == len(mesh.faces)
     assert len(remove_small_components(dirt, keep_share=0.0).faces) == len(mesh.faces) + 1
-    assert len(remove_small_components(dirt, keep_share=0.0, most=1).faces) == len(mesh.faces)
 
 
 def test_faces_without_area_go():
