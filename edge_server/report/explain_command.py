@@ -40,7 +40,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--decision", type=int, metavar="N", help="number of the update [the newest kept]")
     parser.add_argument("--camera", metavar="NAME", help="whose picture [the one with the largest share]")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="[RUN/decision-N.png]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     args = parser.parse_args(argv)
     try:
@@ -49,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         explanation = explain(decision.actor, decision.state, decision.action)
         camera = _camera(args.camera, found, explanation)
         regions = None if camera is None else _regions(found, camera, asked=args.camera is not None)
-        picture = args.picture or args.run / f"decision-{decision.number:06d}.png"
+        picture = args.run / f"decision-{decision.number:06d}.png"
         draw(explanation, picture, camera, found.images.get(camera or ""), regions)
         if args.json is not None:
             write_json(args.json, _as_json(found, explanation, camera, regions), indent=1)
@@ -178,7 +177,3 @@ def _as_json(
         "picture_of": camera,
         "regions": None if regions is None else regions.tolist(),
     }
-
-
-if __name__ == "__main__":
-    sys.exit(main())
