@@ -20,7 +20,6 @@ class Baseline:
 
     mean_colour_db: float | None
     nearest_view_db: float | None
-    nearest_camera: str | None
 
 
 def baseline(
@@ -28,12 +27,10 @@ def baseline(
 ) -> Baseline:
     """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4)."""
     if not views:
-        return Baseline(None, None, None)
-    nearest = nearest_view(views, camera_to_world)
+        return Baseline(None, None)
     return Baseline(
         mean_colour_db=mean_colour_db([v.image for v in views], truth, background),
-        nearest_view_db=view_db(nearest.image, truth, background),
-        nearest_camera=nearest.camera,
+        nearest_view_db=view_db(nearest_view(views, camera_to_world).image, truth, background),
     )
 
 

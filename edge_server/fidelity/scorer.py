@@ -16,7 +16,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -307,20 +307,8 @@ def mean_score(scores: Sequence[Score]) -> Score:
     it."""
     if not scores:
         raise ImageError("no scores to average")
-
-    def mean(values: list[float | None]) -> float | None:
-        known = [v for v in values if v is not None]
-        return float(np.mean(known)) if known else None
-
-    return replace(
-        scores[0],
-        camera=",".join(dict.fromkeys(s.camera for s in scores)),
-        psnr_db=float(np.mean([s.psnr_db for s in scores])),
-        psnr_moving_db=mean([s.psnr_moving_db for s in scores]),
-        psnr_still_db=mean([s.psnr_still_db for s in scores]),
-        ssim=mean([s.ssim for s in scores]),
-        lpips=mean([s.lpips for s in scores]),
-        perceptual=mean([s.perceptual for s in scores]),
-        truth_gap_ms=mean([s.truth_gap_ms for s in scores]),
-        moving_share=float(np.mean([s.moving_share for s in scores])),
-    )
+    means: dict[str, Any] = {}
+    for name in (*SHOWN, "perceptual", "truth_gap_ms", "moving_share"):
+        known = [v for s in scores if (v := getattr(s, name)) is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return replace(scores[0], camera=",".join(dict.fromkeys(s.camera for s in scores)), **means)

@@ -86,7 +86,7 @@ class Plan:
 
 def plan_capture(
     candidates: Candidates, selector: Selector, budget: Budget, take: Take, *, seed: int = 0,
-    travel_weight: float = 0.0, first: int | None = None, fit: Callable[[list[View]], Field] | None = None,
+    travel_weight: float = 0.0, fit: Callable[[list[View]], Field] | None = None,
 ) -> Plan:  # fmt: skip
     """Choose and take views one by one.
 
@@ -94,7 +94,6 @@ def plan_capture(
         picture is spoilt). The camera then stays where it was, and refused views do not count.
     travel_weight: how much the longest way to a candidate weighs against the largest difference between two
         values, 0 to any number; 0 chooses by value alone.
-    first: candidate to begin with; None: drawn from the seed.
     fit: for selectors that need a field.
 
     Raises ViewpointError where no candidate is reachable, or every one is refused.
@@ -106,10 +105,7 @@ def plan_capture(
         )
     rngs = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)]
     reachable = np.flatnonzero(candidates.reachable)
-    if first is None:
-        first = int(rngs[0].choice(reachable))
-    elif not candidates.reachable[first]:
-        raise ViewpointError(f"candidate {first}, to begin with, cannot be reached")
+    first = int(rngs[0].choice(reachable))
     state = CaptureState(candidates, budget.views or len(reachable), rngs[1], fit)
     stops: list[Stop] = []
     refused: list[int] = []

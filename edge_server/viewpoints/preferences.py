@@ -119,11 +119,12 @@ class PreferenceSession:
         asked = self.question
         if asked is None:
             raise ViewpointError("all questions are answered")
-        return self._with((*self.answers, Given(asked.left, asked.right, choice, self.by, asked.repeats)))
+        given = Given(asked.left, asked.right, choice, self.by, asked.repeats)
+        return replace(self, answers=(*self.answers, given))
 
     def undone(self) -> PreferenceSession:
         """The session before the last answer, whose question is asked again; itself before the first."""
-        return self._with(self.answers[:-1])
+        return replace(self, answers=self.answers[:-1])
 
     def as_json(self) -> dict[str, Any]:
         """The file of answers."""
@@ -153,7 +154,4 @@ class PreferenceSession:
                 earlier = file.answers[a.repeats] if 0 <= a.repeats < n else None
                 if earlier is None or (earlier.left, earlier.right) != (a.right, a.left):
                     raise ViewpointError(f"answer {n}: does not repeat answer {a.repeats} with sides swapped")
-        return replace(self._with(file.answers), seed=file.seed)
-
-    def _with(self, answers: tuple[Given, ...]) -> PreferenceSession:
-        return replace(self, answers=answers)
+        return replace(self, answers=file.answers, seed=file.seed)

@@ -277,7 +277,3 @@ def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
     cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

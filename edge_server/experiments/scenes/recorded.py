@@ -50,7 +50,7 @@ def split(
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """(training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views that the data set
     itself holds out. Raises DatasetError."""
-    every = _whole_number(holdout)
+    every = int(holdout) if holdout.strip().isdigit() else None
     if holdout.strip() == OWN_SPLIT:
         if not own:
             raise DatasetError(f"--holdout {OWN_SPLIT}: this data set does not say what it keeps for testing")
@@ -70,10 +70,6 @@ def split(
             f"--holdout {holdout}: all {len(views)} views are held out, none is left to train on"
         )
     return training, tuple(v for v, is_out in zip(views, out) if is_out)
-
-
-def _whole_number(text: str) -> int | None:
-    return int(text) if text.strip().isdigit() else None
 
 
 def _is_called(view: View, name: str) -> bool:

@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 import multiprocessing
-import sys
 import tempfile
 import time
 import traceback
@@ -273,7 +272,3 @@ def _numbers(text: str) -> list[int]:
     if not all(word.isdigit() for word in words):
         raise argparse.ArgumentTypeError(f"{text!r}: expected numbers of faults, such as 2,5, or none")
     return sorted({int(word) for word in words})
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.scheduler import parse_policy
 from freshfield.scenario import Scenario, parse, seed_sequence
 
 ROLES = ("node", "emulator", "edge")
@@ -68,8 +69,7 @@ def scenario_of(seed: int) -> Scenario:
               "corruption": {"probability": 0.1}, "reset": {"at_ms": [900.0]}}  # fmt: skip
     channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
     field = str(rng.choice(sorted(_SMALL)))
-    policy, _, value = str(rng.choice(POLICIES)).partition(":")
-    chosen = {"name": policy, **({"value": float(value)} if value else {})}
+    policy, value = parse_policy(str(rng.choice(POLICIES)))
     return parse(
         {
             "name": f"chaos-{seed}",
@@ -78,7 +78,8 @@ def scenario_of(seed: int) -> Scenario:
             "source": {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
                        "params": {"supersample": 1}},
             "channel": channel,
-            "edge": {"field": field, "field_options": _SMALL[field], "policy": chosen},
+            "edge": {"field": field, "field_options": _SMALL[field],
+                     "policy": {"name": policy, "value": value}},
         },
         Path(f"chaos-{seed}.yaml"),
     )  # fmt: skip

@@ -44,7 +44,7 @@ one result on one kind of processor: the digest that is printed is of every publ
 parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
-_SHOWN_EVERY_MS = 100.0  # where every publication is scored
+_SCORED_EVERY_MS = 250.0  # publications, and what is shown at random instants
 _CYCLE_MS = 250.0  # between two decisions
 # Seconds of virtual time between two lines of progress.
 _PROGRESS_EVERY_S = 1.0
@@ -59,12 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = read_config(scenario)
         settings = RunSettings(
             steps=config.steps if args.steps is None else args.steps,
-            first_steps=args.first_steps,
             compute=config.compute,
             epoch_ms=_epoch_ms(config) if args.epoch_ms is None else args.epoch_ms,
             grace_ms=config.grace_ms,
-            score_every_ms=args.score_every_ms,
-            shown_every_ms=args.score_every_ms or _SHOWN_EVERY_MS,
+            score_every_ms=_SCORED_EVERY_MS,
+            shown_every_ms=_SCORED_EVERY_MS,
         )
         metric, missing = None, None
         if config.lpips != "none":
@@ -231,12 +230,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, metavar="K", help="instead of the scenario's")
     add("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's, e.g. threshold:120")
     add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
-    add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
     add("--epoch-ms", type=float, metavar="MS",
         help=f"between decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
-    add("--score-every-ms", type=float, default=250.0, metavar="MS",
-        help="publications (0: all), and what is shown at random instants [%(default)g]")  # fmt: skip
     add_folders(parser)
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
