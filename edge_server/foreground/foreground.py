@@ -74,7 +74,7 @@ class Foreground:
         return out, weight
 
     def _say(self, camera: str, why: str) -> None:
-        """Log the first image of a camera that passes whole, for each reason."""
+        """Log a camera's first image that passes whole, for each reason; nothing where it has no name."""
         if camera and (camera, why) not in self._said:
             self._said.add((camera, why))
             log.warning("camera %s: an image is used whole: %s (further ones: edge.json)", camera, WHY[why])
