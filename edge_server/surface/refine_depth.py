@@ -35,9 +35,11 @@ from edge_server.surface.kernels.patch_match import (
 REACH = 0.18  # of the initial depth to each side that is searched
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
-CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
+CHEAP, DEAR = 0.3, 2.0  # trust falls from 1 to UNSURE between these costs of a plane
+ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
+CONTRADICTED = 0.1  # ... that more maps look through than confirm
 UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
-PLAIN = 0.002  # rise of the cost a pixel's width away, below which they tell nothing
+PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell nothing
 
 
 @dataclass(frozen=True)
@@ -172,8 +174,10 @@ def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, poo
     rise = np.zeros(shape, np.float32)
     pool.run(confirm, images, view, planes, CONFIRMED, agree, against, rise)
     compared = view.chosen[..., 0] >= 0
-    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), 0.0, 1.0)
-    sure = alike * np.minimum(0.4 + 0.2 * agree, 1.0) * ((agree > 0) & (agree >= against))
+    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), UNSURE, 1.0)
+    sure = alike * np.where(agree > 0, np.minimum(0.4 + 0.2 * agree, 1.0), ALONE)
+    sure = np.where(against > agree, CONTRADICTED * sure, sure)
+    # Images may agree by being flat; then only the field knows.
     sure = np.where(rise >= PLAIN, sure, np.minimum(sure, UNSURE))
     # What no other camera sees stays as the field has it.
     kept = np.where(compared, sure > 0.0, found.seen)

@@ -1,9 +1,9 @@
 """Mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
 
 A field is fitted to a scan of ``tile`` from 0.3 m (``scenes.tile_scan``). After each fitting time its depth
-is compared with the exact depth, and meshes are made: from the depth of the field, from depth sharpened by
-the images, and from carved voxels that are then sharpened (``surface.voxel_depth``), with truncated signed
-distances at several voxel sizes and with a fitted distance function. Row ``exact`` fuses the exact depth: the
+is compared with the exact depth, and meshes are made: from the depth of the field, and from depth sharpened by
+the images (``surface.refine_depth``), with truncated signed distances at several voxel sizes and with a fitted
+distance function. Row ``exact`` fuses the exact depth: the
 best that images of this size and these cameras allow.
 """
 
@@ -50,8 +50,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 # Depth that meshes are made from, and the settings that make it.
 DEPTHS = {
     "of the field": MeshSettings(sharpen=False),
-    "sharpened": MeshSettings(carve=False),
-    "carved": MeshSettings(),
+    "sharpened": MeshSettings(),
 }
 TARGET = (
     f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
@@ -65,7 +64,7 @@ class Workload:
 
     size: pixels a side of the images.
     fit_s: seconds of fitting after which meshes are made.
-    voxels_mm: of the sharpened and carved meshes; the others are made at the middle one.
+    voxels_mm: of the sharpened meshes; the others are made at the middle one.
     cases: of ``CASES``.
     """
 
@@ -141,7 +140,6 @@ def _case(
         for depth, wanted in (
             ("of the field", [("tsdf", middle)]),
             ("sharpened", [*every, ("sdf", middle)]),
-            ("carved", every),
         ):
             seconds: dict[str, float] = {}
             began = time.perf_counter()

@@ -31,6 +31,8 @@ WORST = np.float32(3.0)  # cost of a plane that no other image shows
 SINGLE = np.float32(0.3)  # added if only one other image shows it
 MOST_PX = 3.0  # largest distance that the geometric term counts
 LEAST_COS = 0.1  # between ray and normal
+SMOOTH = np.float32(0.06)  # weight of the distance, pixels, to what neighbors' planes say; at most SMOOTH_PX
+SMOOTH_PX = 2.0
 BETTER = np.float32(1e-4)  # a plane replaces another if it is cheaper by this
 LEAST_DEG, BEST_DEG, SPREAD_DEG, MOST_DEG = 3.0, 25.0, 15.0, 70.0  # between two images' lines of sight
 HIDDEN = 0.02  # a surface nearer by this share of the distance hides a point
@@ -313,6 +315,8 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
     height, width = planes.depth.shape
     across, down, fade = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    meets, nearness, normals = np.empty(8), np.empty(8, np.float32), np.empty((8, 3))
+    step = 1.0 / min(images.lens[view.index, 0], images.lens[view.index, 1])
     _pattern(across, down, fade)
     while True:
         row = fetch_add(counter, 1)
@@ -328,22 +332,32 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
             ny = np.float64(planes.normal[row, column, 1])
             nz = np.float64(planes.normal[row, column, 2])
             middle = np.float64(guess[row, column])
+            # Where the planes of neighbors meet the ray, and how much each counts: 0 across an edge.
+            total = np.float32(0.0)
+            for way in range(8):
+                meets[way] = nearness[way] = 0.0
+                r, c = _neighbor(planes, row, column, way)
+                if r < 0:
+                    continue
+                qx, qy = np.float64(planes.normal[r, c, 0]), np.float64(planes.normal[r, c, 1])
+                qz = np.float64(planes.normal[r, c, 2])
+                along = qx * rx + qy * ry + qz * rz
+                if not along < -LEAST_COS:
+                    continue
+                there = qx * view.rays[r, c, 0] + qy * view.rays[r, c, 1] + qz * view.rays[r, c, 2]
+                meets[way] = np.float64(planes.depth[r, c]) * there / along
+                normals[way, 0], normals[way, 1], normals[way, 2] = qx, qy, qz
+                nearness[way] = exp32(-abs(view.grey[r, c] - view.grey[row, column]) / SIMILAR)
+                total += nearness[way]
+            pixel = 1.0 / (middle * step)
             least = WORST
             # Trial 0: the pixel's own plane; 1 to 8: of neighbors; then random ones, then random changes.
             for trial in range(15 + search.wide):
                 n = np.uint64(((row * width + column) * 64 + trial) * 4)
                 qd, qx, qy, qz = d, nx, ny, nz
                 if trial >= 1 and trial <= 8:
-                    r, c = _neighbor(planes, row, column, trial - 1)
-                    if r < 0:
-                        continue
-                    qx, qy = np.float64(planes.normal[r, c, 0]), np.float64(planes.normal[r, c, 1])
-                    qz = np.float64(planes.normal[r, c, 2])
-                    along = qx * rx + qy * ry + qz * rz
-                    if not along < -LEAST_COS:
-                        continue
-                    there = qx * view.rays[r, c, 0] + qy * view.rays[r, c, 1] + qz * view.rays[r, c, 2]
-                    qd = np.float64(planes.depth[r, c]) * there / along
+                    qd = meets[trial - 1]
+                    qx, qy, qz = normals[trial - 1, 0], normals[trial - 1, 1], normals[trial - 1, 2]
                 elif trial > 8:
                     wide = trial < 9 + search.wide
                     small = 0.25 if trial >= 12 + search.wide else 1.0
@@ -367,6 +381,11 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
                 cost = plane_cost(
                     images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts, search.geometric
                 )
+                if total > np.float32(0.0):
+                    bumpy = np.float32(0.0)
+                    for way in range(8):
+                        bumpy += nearness[way] * np.float32(min(pixel * abs(qd - meets[way]), SMOOTH_PX))
+                    cost += SMOOTH * bumpy / (total + np.float32(1.0))
                 if trial == 0 or cost < least - BETTER:
                     least, d, nx, ny, nz = cost, qd, qx, qy, qz
             planes.depth[row, column], planes.cost[row, column] = d, least
