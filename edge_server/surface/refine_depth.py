@@ -30,14 +30,15 @@ from edge_server.surface.kernels.patch_match import (
     choose_sources,
     confirm,
     match,
+    offer,
 )
 
 REACH = 0.18  # of the initial depth to each side that is searched
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
-CHEAP, DEAR = 0.3, 2.0  # trust falls from 1 to UNSURE between these costs of a plane
+OFFERED = 0.6  # largest cost of a plane that is tried in other maps
+CHEAP, DEAR = 0.3, 1.6  # trust falls from 1 to UNSURE between these costs of a plane
 ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
-CONTRADICTED = 0.1  # ... that more maps look through than confirm
 UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
 PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell nothing
 
@@ -45,19 +46,21 @@ PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell n
 @dataclass(frozen=True)
 class Phase:
     """One pass over every map. choose: whether the images to compare with are chosen anew, from the current
-    planes."""
+    planes. offer: of the points of other maps that fall on a pixel, the plane of the "cheapest" or the
+    "nearest" is tried; "": none."""
 
     search: Search
     choose: bool = False
+    offer: str = ""
 
 
 PHASES = (
     Phase(Search(4, REACH, 0.02, 0.4, 0.0), choose=True),
     Phase(Search(4, REACH, 0.02, 0.4, 0.0)),
-    Phase(Search(4, REACH, 0.01, 0.3, 0.0), choose=True),
-    Phase(Search(2, REACH, 0.005, 0.2, 0.0)),
-    Phase(Search(0, REACH, 0.005, 0.2, 0.1), choose=True),
-    Phase(Search(0, REACH, 0.002, 0.1, 0.1)),
+    Phase(Search(4, REACH, 0.01, 0.3, 0.0), choose=True, offer="cheapest"),
+    Phase(Search(2, REACH, 0.005, 0.2, 0.0), offer="nearest"),
+    Phase(Search(0, REACH, 0.005, 0.2, 0.1), choose=True, offer="cheapest"),
+    Phase(Search(0, REACH, 0.002, 0.1, 0.1), choose=True, offer="nearest"),
 )
 
 
@@ -82,12 +85,13 @@ def refine_depth(
     for number, phase in enumerate(PHASES):
         # Every map is compared with the others as they were before the phase, whatever the order.
         images = _images(maps, greys, planes)
-        for k, (view, guess, found) in enumerate(zip(views, guesses, planes)):
+        offers = _offers(images, views, planes, phase.offer, pool)
+        for k, (view, guess, found, offered) in enumerate(zip(views, guesses, planes, offers)):
             if phase.choose:
                 pool.run(choose_sources, images, view, found, number > 0)
             for parity in (0, 1):
                 key = np.uint64((len(PHASES) * k + number) * 2 + parity)
-                pool.run(match, images, view, guess, found, parity, key, phase.search)
+                pool.run(match, images, view, guess, offered, found, parity, key, phase.search)
             if on_map is not None:
                 on_map((number + (k + 1) / len(maps)) / (len(PHASES) + 1))
     images = _images(maps, greys, planes)
@@ -167,6 +171,37 @@ def _images(
     )
 
 
+def _offers(
+    images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool
+) -> list[Planes]:
+    """For every map, planes of other maps to try, see ``Phase``."""
+    none = [Planes(np.zeros_like(p.depth), p.normal, p.cost) for p in planes]
+    sure = [(p.depth > 0) & (p.cost < OFFERED) for p in planes]
+    if not which or not any(s.any() for s in sure):
+        return none
+    points = np.concatenate([
+        (images.origin[v.index] + v.rays[s] * p.depth[s, None]).astype(np.float32)
+        for v, p, s in zip(views, planes, sure)
+    ])  # fmt: skip
+    normals = np.concatenate([p.normal[s] for p, s in zip(planes, sure)])
+    costs = np.concatenate([p.cost[s] for p, s in zip(planes, sure)])
+    owners = np.repeat(np.arange(len(planes), dtype=np.int32), [int(s.sum()) for s in sure])
+    winner, least = np.empty(len(images.grey), np.int32), np.empty(len(images.grey), np.float32)
+    pool.run(offer, images, points, normals, costs, owners, which == "nearest", winner, least)
+    out = []
+    for view, empty, first in zip(views, none, images.first):
+        won = winner[first : first + view.grey.size].reshape(view.grey.shape)
+        some = won >= 0
+        index, ray = won[some], view.rays[some]
+        along = (normals[index] * ray).sum(axis=-1)
+        reach = (normals[index] * (points[index] - images.origin[view.index])).sum(axis=-1)
+        depth, normal = empty.depth, empty.normal.copy()
+        depth[some] = np.where(along < -1e-3, reach / np.minimum(along, -1e-3), 0.0)
+        normal[some] = normals[index]
+        out.append(Planes(depth, normal, empty.cost))
+    return out
+
+
 def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, pool: Pool) -> DepthMap:
     """The map with the depth of ``planes``, each trusted by its cost and by the maps that confirm it."""
     shape = planes.depth.shape
@@ -176,7 +211,7 @@ def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, poo
     compared = view.chosen[..., 0] >= 0
     alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), UNSURE, 1.0)
     sure = alike * np.where(agree > 0, np.minimum(0.4 + 0.2 * agree, 1.0), ALONE)
-    sure = np.where(against > agree, CONTRADICTED * sure, sure)
+    sure = np.where(against > agree, 0.0, sure)
     # Images may agree by being flat; then only the field knows.
     sure = np.where(rise >= PLAIN, sure, np.minimum(sure, UNSURE))
     # What no other camera sees stays as the field has it.

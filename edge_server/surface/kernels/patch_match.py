@@ -26,7 +26,7 @@ SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so p
 FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
 NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
 DIFFERENCE = np.float32(0.8)  # share of the difference of gray levels in the cost; the rest: 1 - correlation
-LEVELS = np.float32(4.0)  # mean difference, gray levels, that costs 1; at most 2
+LEVELS = np.float32(4.0)  # mean difference, gray levels, that costs 1 on a plain patch; at most 2
 WORST = np.float32(3.0)  # cost of a plane that no other image shows
 SINGLE = np.float32(0.3)  # added if only one other image shows it
 MOST_PX = 3.0  # largest distance that the geometric term counts
@@ -208,8 +208,8 @@ def _take_patch(grey, row, column, across, down, fade, patch, weight):
 
 @part
 def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, weight, facts, geometric):
-    """Cost of the plane through depth d with a normal: mean of the two images that differ least; WORST: none
-    shows it. facts: what ``_take_patch`` returned for the pixel."""
+    """Cost of the plane through depth d with a normal: mean of the two images that differ least; and how many
+    of these there are: 0 (the cost is WORST), 1 or 2. facts: what ``_take_patch`` returned for the pixel."""
     k, rays = view.index, view.rays
     height, width = view.grey.shape
     total, mean, spread = facts
@@ -218,17 +218,18 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
     rx, ry, rz = rays[row, column, 0], rays[row, column, 1], rays[row, column, 2]
     along = nx * rx + ny * ry + nz * rz
     if not along < -LEAST_COS:
-        return WORST
+        return WORST, 0
     ax, ay, az = rays[row, column + right, 0], rays[row, column + right, 1], rays[row, column + right, 2]
     bx, by, bz = rays[row + below, column, 0], rays[row + below, column, 1], rays[row + below, column, 2]
     a, b = d * along / (nx * ax + ny * ay + nz * az), d * along / (nx * bx + ny * by + nz * bz)
     if not (a > 0.0 and b > 0.0 and a < 2.0 * d and b < 2.0 * d):
-        return WORST
+        return WORST, 0
     ox, oy, oz = images.origin[k, 0], images.origin[k, 1], images.origin[k, 2]
     x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
     ax, ay, az = ox + a * ax, oy + a * ay, oz + a * az
     bx, by, bz = ox + b * bx, oy + b * by, oz + b * bz
     one, two = WORST, WORST
+    levels = LEVELS + np.sqrt(spread)  # where texture is strong, so is what interpolation does to it
     for i in range(SOURCES):
         s = np.int64(view.chosen[row, column, i])
         if s < 0:
@@ -262,7 +263,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         other = max(square - level * level / total, np.float32(0.0)) / total
         like = cross / total / np.sqrt((spread + NOISE) * (other + NOISE))
         cost = (np.float32(1.0) - DIFFERENCE) * (np.float32(1.0) - like)
-        cost += DIFFERENCE * min(change / total / LEVELS, np.float32(2.0))
+        cost += DIFFERENCE * min(change / total / levels, np.float32(2.0))
         if geometric > 0.0:
             cost += np.float32(geometric * _way_back(images, k, s, row, column, u, v, x, y, z))
         if cost < one:
@@ -270,8 +271,8 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         elif cost < two:
             two = cost
     if two < WORST:
-        return np.float32(0.5) * (one + two)
-    return min(one + SINGLE, WORST)
+        return np.float32(0.5) * (one + two), 2
+    return one, 1 if one < WORST else 0
 
 
 @part
@@ -308,10 +309,40 @@ def _neighbor(planes, row, column, way):
 
 
 @kernel
-def match(counter, worker, images, view, guess, planes, parity, key, search):
+def offer(counter, worker, images, points, normals, costs, owners, nearest, winner, least):
+    """For every pixel of every image, which point of another map falls on it. Tasks are images.
+
+    points, normals: float32 (M, 3), world. costs: float32 (M,). owners: int32 (M,), image that a point is of.
+    nearest: whether the nearest point wins, else the cheapest. winner: int32 (P,), index of the point, -1:
+    none; least: float32 (P,). Both are written.
+    """
+    while True:
+        k = fetch_add(counter, 1)
+        if k >= images.first.size - 1:
+            return
+        for at in range(images.first[k], images.first[k + 1]):
+            winner[at], least[at] = -1, np.float32(1e9)
+        for m in range(costs.size):
+            if owners[m] == k:
+                continue
+            x, y, z = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
+            u, v = _project(images, k, x, y, z)
+            if not _within(images, k, u, v, 0):
+                continue
+            x, y, z, far = _to(images, k, x, y, z)
+            if not normals[m, 0] * x + normals[m, 1] * y + normals[m, 2] * z < -LEAST_COS * far:
+                continue
+            value = np.float32(far) if nearest else costs[m]
+            at = images.first[k] + np.int64(v) * images.size[k, 0] + np.int64(u)
+            if value < least[at]:
+                winner[at], least[at] = m, value
+
+
+@kernel
+def match(counter, worker, images, view, guess, offered, planes, parity, key, search):
     """One pass over the pixels of one color. Tasks are rows. parity: row + column is odd if 1. key: of the
     pass's random numbers, which depend on the pixel alone. guess: float32 (H, W); no depth leaves ``reach``
-    around it."""
+    around it. offered: planes (``offer``) to try, depth 0: none; their cost is not read."""
     height, width = planes.depth.shape
     across, down, fade = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
@@ -351,11 +382,16 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
                 total += nearness[way]
             pixel = 1.0 / (middle * step)
             least = WORST
-            # Trial 0: the pixel's own plane; 1 to 8: of neighbors; then random ones, then random changes.
-            for trial in range(15 + search.wide):
-                n = np.uint64(((row * width + column) * 64 + trial) * 4)
+            # Trial -1: the pixel's own plane; 0: the offered one; 1 to 8: of neighbors; then random ones, then
+            # random changes.
+            for trial in range(-1, 15 + search.wide):
+                n = np.uint64(((row * width + column) * 64 + trial + 1) * 4)
                 qd, qx, qy, qz = d, nx, ny, nz
-                if trial >= 1 and trial <= 8:
+                if trial == 0:
+                    qd, qx = np.float64(offered.depth[row, column]), np.float64(offered.normal[row, column, 0])
+                    qy = np.float64(offered.normal[row, column, 1])
+                    qz = np.float64(offered.normal[row, column, 2])
+                elif trial >= 1 and trial <= 8:
                     qd = meets[trial - 1]
                     qx, qy, qz = normals[trial - 1, 0], normals[trial - 1, 1], normals[trial - 1, 2]
                 elif trial > 8:
@@ -378,15 +414,18 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
                         qx, qy, qz = qx / length, qy / length, qz / length
                 if not abs(qd - middle) <= search.reach * middle:
                     continue
-                cost = plane_cost(
-                    images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts, search.geometric
-                )
+                cost, shown = plane_cost(
+                    images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts,
+                    search.geometric,
+                )  # fmt: skip
+                if shown == 1:
+                    cost = min(cost + SINGLE, WORST)
                 if total > np.float32(0.0):
                     bumpy = np.float32(0.0)
                     for way in range(8):
                         bumpy += nearness[way] * np.float32(min(pixel * abs(qd - meets[way]), SMOOTH_PX))
                     cost += SMOOTH * bumpy / (total + np.float32(1.0))
-                if trial == 0 or cost < least - BETTER:
+                if trial == -1 or cost < least - BETTER:
                     least, d, nx, ny, nz = cost, qd, qx, qy, qz
             planes.depth[row, column], planes.cost[row, column] = d, least
             planes.normal[row, column, 0] = nx
@@ -438,11 +477,12 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
             ny = np.float64(planes.normal[row, column, 1])
             nz = np.float64(planes.normal[row, column, 2])
             step = 1.0 / min(images.lens[k, 0], images.lens[k, 1])
-            total = np.float32(0.0)
+            total, compared = np.float32(0.0), True
             for trial in range(3):
-                cost = plane_cost(
+                cost, shown = plane_cost(
                     images, view, row, column, d * (1.0 + step * (trial - 1)), nx, ny, nz, across, down, patch,
                     weight, facts, 0.0,
                 )  # fmt: skip
                 total += -cost if trial == 1 else np.float32(0.5) * cost
-            rise[row, column] = total
+                compared = compared and shown > 0
+            rise[row, column] = total if compared else np.float32(0.0)

@@ -207,10 +207,9 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     patch_match._pattern(across, down, fade)
     facts = patch_match._take_patch(gray[0], row, column, across, down, fade, patch, weight)
-    found = patch_match.plane_cost(
+    found, shown = patch_match.plane_cost(
         images, view, row, column, depth, *normal, across, down, patch, weight, facts, 0.0
     )
-    single = patch_match.SINGLE  # one other image
     # Every tap's ray meets the plane; the affine approximation is off by a hundredth of a pixel.
     j, i = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
     near = ((abs(i) < REACH) & (abs(j) < REACH)) | (i == 0) | (j == 0)
@@ -226,12 +225,13 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     w /= w.sum()
     a, b = own - w @ own, other - w @ other
     like = (w @ (a * b)) / np.sqrt((w @ a**2 + NOISE) * (w @ b**2 + NOISE))
-    wanted = (1 - DIFFERENCE) * (1 - like) + DIFFERENCE * min(w @ np.abs(own - other) / LEVELS, 2.0)
-    assert found == pytest.approx(wanted + single, abs=0.02)
-    turned_away = patch_match.plane_cost(
+    levels = LEVELS + np.sqrt(w @ a**2)
+    wanted = (1 - DIFFERENCE) * (1 - like) + DIFFERENCE * min(w @ np.abs(own - other) / levels, 2.0)
+    assert found == pytest.approx(wanted, abs=0.02) and shown == 1
+    turned_away, shown = patch_match.plane_cost(
         images, view, row, column, depth, *-normal, across, down, patch, weight, facts, 0.0
     )
-    assert turned_away == WORST
+    assert turned_away == WORST and shown == 0
 
 
 def test_a_pixel_is_compared_with_those_that_see_the_same_from_aside(rig):
