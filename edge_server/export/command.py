@@ -81,8 +81,8 @@ def _parser() -> argparse.ArgumentParser:
          "where the cameras' pictures agree: faster, for what moves, less exact")  # fmt: skip
     mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
     mesh("--solid", type=float, default=0.8, metavar="A", help="opacity of a surface, 0 to 1 [%(default)g]")
-    mesh("--keep", type=float, default=0.002, metavar="SHARE", help="of the largest piece's area, that others "
-         "need to stay [%(default)g]")  # fmt: skip
+    mesh("--keep", type=float, default=0.002, metavar="SHARE", help="of the largest piece's area, that "
+         "others need to stay [%(default)g]")  # fmt: skip
     mesh("--pieces", type=int, metavar="N", help="at most [all of them]")
     mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
          "far the mesh is from the true surface")  # fmt: skip

@@ -37,7 +37,7 @@ REACH = 0.18  # of the initial depth to each side that is searched
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
 OFFERED = 0.6  # largest cost of a plane that is tried in other maps
-CHEAP, DEAR = 0.3, 1.6  # trust falls from 1 to UNSURE between these costs of a plane
+CHEAP, DEAR = 0.3, 1.0  # trust falls from 1 to UNSURE between these costs of a plane
 ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
 UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
 PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell nothing
@@ -118,8 +118,8 @@ def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> N
 
 
 def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit normals float32 (H, W, 3) in world axes, towards the camera, from derivatives of the smoothed known
-    points: the plane that best fits the pixels around each."""
+    """Unit normals float32 (H, W, 3) in world axes, towards the camera, from derivatives of the smoothed
+    known points: the plane that best fits the pixels around each."""
     known = depth > 0
     points = rays * depth[..., None].astype(np.float64)
     weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), SMOOTH_PX)
@@ -135,7 +135,8 @@ def _grey(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
     """Gray levels, not rounded: a third of the noise where only shading varies."""
     if picture.shape[:2] != found.depth.shape:
         raise SurfaceError(f"a picture of {picture.shape} does not belong to a depth map {found.depth.shape}")
-    return cv2.cvtColor(np.ascontiguousarray(picture[..., :3]).astype(np.float32), cv2.COLOR_RGB2GRAY)
+    color = np.ascontiguousarray(picture[..., :3]).astype(np.float32)
+    return cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
 def _fill_unknown(found: DepthMap) -> NDArray[np.float32]:

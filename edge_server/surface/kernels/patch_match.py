@@ -1,4 +1,4 @@
-"""Photo-consistent depth: multi-view PatchMatch over slanted planes (Bleyer et al. 2011, Galliani et al. 2015).
+"""Photo-consistent depth: multi-view PatchMatch over slanted planes (Bleyer 2011, Galliani 2015).
 
 Every pixel holds a plane: depth along its ray and normal. In turns, the pixels of one color of a chessboard
 try the planes of neighbors and random changes of their own, and keep the cheapest. The cost of a plane is how
@@ -63,8 +63,8 @@ class View(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """A plane per pixel. depth: float32 (H, W), meters along the ray; 0: none. normal: float32 (H, W, 3), unit,
-    world, towards the camera. cost: float32 (H, W)."""
+    """A plane per pixel. depth: float32 (H, W), meters along the ray; 0: none. normal: float32 (H, W, 3),
+    unit, world, towards the camera. cost: float32 (H, W)."""
 
     depth: NDArray[np.float32]
     normal: NDArray[np.float32]
@@ -292,7 +292,7 @@ def _way_back(images, k, s, row, column, u, v, x, y, z):
 
 @part
 def _neighbor(planes, row, column, way):
-    """The cheapest plane of a few pixels of the other color in one of 8 ways: four near, four far, -1: none."""
+    """The cheapest pixel of the other color in one of 8 ways, four near and four far; -1: none."""
     height, width = planes.depth.shape
     dr = 1 if way % 4 == 0 else -1 if way % 4 == 1 else 0
     dc = 1 if way % 4 == 2 else -1 if way % 4 == 3 else 0
@@ -382,13 +382,16 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                 total += nearness[way]
             pixel = 1.0 / (middle * step)
             least = WORST
-            # Trial -1: the pixel's own plane; 0: the offered one; 1 to 8: of neighbors; then random ones, then
-            # random changes.
+            # Trial -1: the pixel's own plane; 0: the offered one; 1 to 8: of neighbors; then random ones,
+            # then random changes.
             for trial in range(-1, 15 + search.wide):
                 n = np.uint64(((row * width + column) * 64 + trial + 1) * 4)
                 qd, qx, qy, qz = d, nx, ny, nz
                 if trial == 0:
-                    qd, qx = np.float64(offered.depth[row, column]), np.float64(offered.normal[row, column, 0])
+                    qd, qx = (
+                        np.float64(offered.depth[row, column]),
+                        np.float64(offered.normal[row, column, 0]),
+                    )
                     qy = np.float64(offered.normal[row, column, 1])
                     qz = np.float64(offered.normal[row, column, 2])
                 elif trial >= 1 and trial <= 8:
@@ -400,7 +403,11 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                     kind = -1 if wide else (trial - search.wide) % 3  # 0: depth, 1: normal, 2: both
                     if kind != 1:
                         part = 2.0 * np.float64(uniform(key, n)) - 1.0
-                        qd = middle * (1.0 + search.reach * part) if wide else d * (1.0 + small * search.share * part)
+                        qd = (
+                            middle * (1.0 + search.reach * part)
+                            if wide
+                            else d * (1.0 + small * search.share * part)
+                        )
                     if kind != 0:
                         turn = 1.0 if wide else small * search.turn
                         keep = 0.0 if wide else 1.0
@@ -480,8 +487,8 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
             total, compared = np.float32(0.0), True
             for trial in range(3):
                 cost, shown = plane_cost(
-                    images, view, row, column, d * (1.0 + step * (trial - 1)), nx, ny, nz, across, down, patch,
-                    weight, facts, 0.0,
+                    images, view, row, column, d * (1.0 + step * (trial - 1)), nx, ny, nz, across, down,
+                    patch, weight, facts, 0.0,
                 )  # fmt: skip
                 total += -cost if trial == 1 else np.float32(0.5) * cost
                 compared = compared and shown > 0

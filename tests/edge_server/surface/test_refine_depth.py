@@ -184,7 +184,9 @@ def test_a_camera_without_overlap_changes_nothing(rig):
 
 def test_depth_that_no_map_confirms_is_hardly_trusted(rig):
     maps, pictures, _ = rig
-    noise = [np.random.default_rng(k).integers(0, 255, p.shape, dtype=np.uint8) for k, p in enumerate(pictures)]
+    noise = [
+        np.random.default_rng(k).integers(0, 255, p.shape, dtype=np.uint8) for k, p in enumerate(pictures)
+    ]
     trust = np.concatenate([m.trust[m.seen] for m in refine_depth(maps, noise, POOL)])
     assert np.mean(trust <= ALONE) > 0.8
 
