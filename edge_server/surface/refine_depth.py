@@ -34,6 +34,9 @@ from edge_server.surface.kernels.patch_match import (
 )
 
 REACH = 0.18  # of the initial depth to each side that is searched
+GAIN_POINTS, LEAST_SHARED = 500, 50  # of an image; in two, to compare their brightness
+GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
+SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
 OFFERED = 0.6  # largest cost of a plane that is tried in other maps
@@ -76,6 +79,8 @@ def refine_depth(
         raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
     greys = [_grey(picture, found) for picture, found in zip(pictures, maps)]
+    gains = exposures(maps, greys)
+    greys = [(grey / np.float32(gain)).astype(np.float32) for grey, gain in zip(greys, gains)]
     guesses = [_fill_unknown(found) for found in maps]
     views = [_view(k, found, grey) for k, (found, grey) in enumerate(zip(maps, greys))]
     planes = [
@@ -99,6 +104,34 @@ def refine_depth(
     if on_map is not None:
         on_map(1.0)
     return out
+
+
+def exposures(maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Brightness of each image relative to the others (N,), from points that two of them show: least squares
+    over the medians of all pairs. 1 where it is within ``SAME_GAIN``, or unknown."""
+    pairs, ratios = [], []
+    for k, found in enumerate(maps):
+        at = np.flatnonzero(found.seen)
+        at = at[:: max(1, len(at) // GAIN_POINTS)]
+        points = found.points()[:: max(1, int(found.seen.sum()) // GAIN_POINTS)]
+        own = greys[k].ravel()[at]
+        for j, other in enumerate(maps):
+            both = on_surface(other, points, GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
+            if both.sum() < LEAST_SHARED:
+                continue
+            lens, pose = other.intrinsics, other.camera_to_world
+            column, row = lens.project((points[both] - pose[:3, 3]) @ pose[:3, :3]).astype(np.int64).T
+            pairs.append((k, j))
+            ratios.append(np.median(np.log((greys[j][row, column] + 1.0) / (own[both] + 1.0))))
+    system = np.eye(len(maps)) * 1e-3  # images that share nothing keep their brightness
+    right = np.zeros(len(maps))
+    for (k, j), ratio in zip(pairs, ratios):
+        system[[k, j], [k, j]] += 1.0
+        system[[k, j], [j, k]] -= 1.0
+        right[j] += ratio
+        right[k] -= ratio
+    log_gain = np.linalg.solve(system, right) if len(maps) else right
+    return np.where(np.abs(log_gain) > SAME_GAIN, np.exp(np.clip(log_gain, -MOST_GAIN, MOST_GAIN)), 1.0)
 
 
 def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:

@@ -27,7 +27,7 @@ from edge_server.surface.kernels.patch_match import (
     View,
     choose_sources,
 )
-from edge_server.surface.refine_depth import ALONE, UNSURE, refine_depth, smooth_normals
+from edge_server.surface.refine_depth import ALONE, UNSURE, exposures, refine_depth, smooth_normals
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
@@ -147,6 +147,19 @@ def test_what_hides_a_point_in_some_pictures_does_not_spoil_it(rig):
     found = refine_depth([maps[0], maps[2], maps[1], maps[3]], [hidden[k] for k in (0, 2, 1, 3)], POOL)
     error = np.abs(found[0].depth - exact[0])[24:48, 24:48]
     assert np.median(error) < 0.002
+
+
+def test_a_picture_taken_darker_is_brightened_before(rig):
+    maps, pictures, exact = rig
+    darker = [pictures[0], (0.7 * pictures[1]).astype(np.uint8), *pictures[2:]]
+    gray = [p[..., 0].astype(np.float32) for p in darker]
+    gains = exposures(maps, gray)
+    assert gains[1] / gains[0] == pytest.approx(0.7, abs=0.05)
+    assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_array_equal(exposures(maps, [p[..., 0].astype(np.float32) for p in pictures]), 1.0)
+    np.testing.assert_array_equal(exposures(maps[:1], gray[:1]), 1.0)
+    after = errors(refine_depth(maps, darker, POOL), exact, 0.3)
+    assert np.median(after) < 0.0005 and len(after) > 0.5 * sum(m.seen.sum() for m in maps)
 
 
 def test_the_number_of_threads_changes_no_bit(rig):
