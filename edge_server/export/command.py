@@ -78,8 +78,6 @@ def _parser() -> argparse.ArgumentParser:
     mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function with the eikonal term [tsdf]")
     mesh("--no-sharpen", action="store_true", help="take the field's depth as it is, without moving it to "
          "where the cameras' pictures agree: faster, for what moves, less exact")  # fmt: skip
-    mesh("--no-carve", action="store_true", help="start from the field's depth instead of voxels fitted anew "
-         "for it, if 30 pictures show a scene that ends at its box: faster, less complete")  # fmt: skip
     mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
     mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
          "far the mesh is from the true surface")  # fmt: skip
@@ -154,7 +152,6 @@ class Export:
         box = None if a.bounds is None else (tuple(a.bounds[:3]), tuple(a.bounds[3:]))
         return MeshSettings(
             method=a.method, sharpen=not a.no_sharpen,
-            carve=a.mesh is not None and not a.no_carve,  # points need no more than the field has
             voxel_m=None if a.voxel is None else 1e-3 * a.voxel, bounds=box, watertight=a.watertight,
             min_weight=a.min_weight,
         )  # fmt: skip

@@ -17,7 +17,7 @@ Floats = NDArray[np.float32]
 SLAB_CELLS = 1 << 24  # voxels per marching cubes call: 64 MB, and a few times that inside the call
 LAYER_CELLS = 1 << 23  # voxels in one layer, at most; the thinnest slab has SIDE layers
 LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
-KEEP_SHARE = 0.02  # share of the largest component's area; smaller components are removed
+KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
 INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
 
 

@@ -12,9 +12,8 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
 from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
-from edge_server.surface.refine_depth import PASSES, refine_depth
+from edge_server.surface.refine_depth import refine_depth
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
-from edge_server.surface.voxel_depth import STEPS, fill_depth, fit_voxels, voxel_box
 
 METHODS = ("tsdf", "sdf")
 GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
@@ -28,14 +27,10 @@ class MeshSettings:
     """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None: the size of a pixel at the surface.
     bounds: lower and upper corner, meters; None: from the depth maps. watertight: close the surface in
     unobserved space. min_weight: known voxels have more weight than this (a camera at normal incidence counts
-    1). memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``). carve: with
-    sharpen, in a scene bounded by its field's box with enough images: start from voxels fitted in
-    ``carve_steps`` steps, and use their depth where the images are ambiguous (``voxel_depth``)."""
+    1). memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``)."""
 
     method: str = "tsdf"
     sharpen: bool = True
-    carve: bool = True
-    carve_steps: int = STEPS
     voxel_m: float | None = None
     bounds: tuple[Corner, Corner] | None = None
     watertight: bool = False
@@ -68,21 +63,12 @@ def make_depth_maps(
     if not views:
         raise SurfaceError("the field knows no cameras yet: fit it first")
     cameras = [(v.camera_to_world, v.intrinsics) for v in views]
-    box = voxel_box(renderer, views) if settings.sharpen and settings.carve else None
-    if box is not None:
-        say("carve", 0.0)
-        behind = getattr(renderer, "background", None)
-        renderer = fit_voxels(box, behind, views, settings.carve_steps, pool)
-        say("carve", 1.0)
     # A translucent initial surface is sufficient for refinement.
     solid = GUESS if settings.sharpen else SOLID
     maps = list(render_depth_maps(renderer, cameras, solid, lambda done: say("depth", done / len(views))))
     if not settings.sharpen or len(maps) < 2:
         return maps
-    # Voxel depth is accurate enough to skip the widest search, which may find a wrong match.
-    passes = PASSES if box is None else PASSES[1:]
-    sharp = refine_depth(maps, [v.image for v in views], passes, pool, lambda share: say("sharpen", share))
-    return sharp if box is None else fill_depth(sharp, maps)
+    return refine_depth(maps, [v.image for v in views], pool, lambda share: say("sharpen", share))
 
 
 def mesh_from_depth_maps(

@@ -1,16 +1,16 @@
 """Refine depth maps by photo-consistency before fusion.
 
-A field is fitted to colors, so its depth may be off by many pixels where a surface has little texture. This
-moves every pixel's depth to where other cameras' images agree with its own (plane sweep as in multi-view
-stereo; PGSR, Chen et al. 2024, has the same comparison in its loss), from coarse to fine, with the current
-normals. Pixels whose depth no other map confirms get a low weight. The field provides what stereo lacks: an
-initial depth nearly right everywhere.
+A field is fitted to colors, so its depth may be off by many pixels where a surface has little texture, and it
+closes narrow gaps. Here the images decide: every pixel gets the plane on which other images agree best with
+its own (multi-view PatchMatch, ``kernels.patch_match``). The first passes search ``REACH`` of the depth to
+each side of the field's, the last ones also ask that the depth of one image leads to that of the others
+(geometric consistency as in ACMM, Xu and Tao 2019). Pixels whose depth no other map confirms are dropped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,25 +19,57 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
-from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.sweep import SourceImages, sweep
+from edge_server.surface.depth import DepthMap
+from edge_server.surface.kernels.patch_match import (
+    SOURCES,
+    WORST,
+    Images,
+    Planes,
+    Search,
+    View,
+    choose_sources,
+    confirm,
+    match,
+    offer,
+)
 
-OTHERS = 4  # images to compare each image with
-# Per pass: search range to each side, as a share of the depth, and number of steps.
-PASSES = ((0.08, 17), (0.03, 17), (0.012, 13), (0.004, 9))
-BEST_DEG, LEAST_DEG, MOST_DEG = 25.0, 4.0, 65.0  # between two cameras' lines of sight
-SMOOTH_PX = 2.5  # sigma of the Gaussian blur for normals
-AGREES = 0.5  # minimum correlation of a reliable depth
+REACH = 0.18  # of the initial depth to each side that is searched
+GAIN_POINTS, LEAST_SHARED = 500, 50  # of an image; in two, to compare their brightness
+GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
+SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
+SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
-ENOUGH = 0.05  # minimum share of good pixels around a bad one to interpolate from them
+OFFERED = 0.6  # largest cost of a plane that is tried in other maps
+CHEAP, DEAR = 0.3, 1.0  # trust falls from 1 to UNSURE between these costs of a plane
 ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
-UNSURE = 0.05  # factor of the trust of a pixel with a flat patch
+UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
+PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell nothing
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One pass over every map. choose: whether the images to compare with are chosen anew, from the current
+    planes. offer: of the points of other maps that fall on a pixel, the plane of the "cheapest" or the
+    "nearest" is tried; "": none."""
+
+    search: Search
+    choose: bool = False
+    offer: str = ""
+
+
+PHASES = (
+    Phase(Search(4, REACH, 0.02, 0.4, 0.0), choose=True),
+    Phase(Search(4, REACH, 0.02, 0.4, 0.0)),
+    Phase(Search(4, REACH, 0.01, 0.3, 0.0), choose=True, offer="cheapest"),
+    Phase(Search(2, REACH, 0.005, 0.2, 0.0), offer="nearest"),
+    Phase(Search(0, REACH, 0.005, 0.2, 0.1), choose=True, offer="cheapest"),
+    Phase(Search(0, REACH, 0.002, 0.1, 0.1), choose=True, offer="nearest"),
+)
 
 
 def refine_depth(
     maps: Sequence[DepthMap],
     pictures: Sequence[NDArray[np.uint8]],
-    passes: Sequence[tuple[float, int]] = PASSES,
     pool: Pool | None = None,
     on_map: Callable[[float], None] | None = None,
 ) -> list[DepthMap]:
@@ -47,55 +79,59 @@ def refine_depth(
         raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
     greys = [_grey(picture, found) for picture, found in zip(pictures, maps)]
-    chosen = [neighboring_maps(maps, k) for k in range(len(maps))]
-    now, scores = list(maps), [np.zeros(m.depth.shape, np.float32) for m in maps]
-    for number, (share, steps) in enumerate(passes):
-        factors = 1.0 + np.linspace(-share, share, steps)
-        for k, found in enumerate(now):
-            if chosen[k]:
-                depth, scores[k] = _sweep_map(found, greys, now, k, chosen[k], factors, pool)
-                if number < len(passes) - 1:
-                    depth = _filter_depth(depth, found.seen, scores[k])
-                now[k] = replace(found, depth=np.where(found.seen, depth, found.depth))
+    gains = exposures(maps, greys)
+    greys = [(grey / np.float32(gain)).astype(np.float32) for grey, gain in zip(greys, gains)]
+    guesses = [_fill_unknown(found) for found in maps]
+    views = [_view(k, found, grey) for k, (found, grey) in enumerate(zip(maps, greys))]
+    planes = [
+        Planes(guess.copy(), smooth_normals(guess, view.rays), np.full(guess.shape, WORST, np.float32))
+        for guess, view in zip(guesses, views)
+    ]
+    for number, phase in enumerate(PHASES):
+        # Every map is compared with the others as they were before the phase, whatever the order.
+        images = _images(maps, greys, planes)
+        offers = _offers(images, views, planes, phase.offer, pool)
+        for k, (view, guess, found, offered) in enumerate(zip(views, guesses, planes, offers)):
+            if phase.choose:
+                pool.run(choose_sources, images, view, found, number > 0)
+            for parity in (0, 1):
+                key = np.uint64((len(PHASES) * k + number) * 2 + parity)
+                pool.run(match, images, view, guess, offered, found, parity, key, phase.search)
             if on_map is not None:
-                on_map((number + (k + 1) / len(now)) / len(passes))
-    return downweight_unconfirmed([_weight_by_score(m, score) for m, score in zip(now, scores)], chosen)
-
-
-def neighboring_maps(maps: Sequence[DepthMap], k: int) -> list[int]:
-    """Indices of the maps to compare map k with: same place, seen from an angle near ``BEST_DEG``."""
-    points = maps[k].points()
-    if not len(points):
-        return []
-    middle = np.median(points, axis=0)
-    ranked = []
-    for j, other in enumerate(maps):
-        if j == k:
-            continue
-        ways = [m.camera_to_world[:3, 3] - middle for m in (maps[k], other)]
-        ways = [w / np.linalg.norm(w) for w in ways]
-        apart = float(np.rad2deg(np.arccos(np.clip(ways[0] @ ways[1], -1.0, 1.0))))
-        pose, lens = other.camera_to_world, other.intrinsics
-        with np.errstate(invalid="ignore"):
-            at = lens.project((points[:: max(1, len(points) // 500)] - pose[:3, 3]) @ pose[:3, :3])
-            share = float(((at >= 0) & (at < (lens.width, lens.height))).all(axis=1).mean())
-        if share > 0.2 and LEAST_DEG <= apart <= MOST_DEG:
-            ranked.append((-share * np.exp(-(((apart - BEST_DEG) / 15.0) ** 2)), j))
-    return [j for _, j in sorted(ranked)[:OTHERS]]
-
-
-def downweight_unconfirmed(maps: Sequence[DepthMap], chosen: Sequence[Sequence[int]]) -> list[DepthMap]:
-    """Scale by ``ALONE`` the trust of pixels that no map in ``chosen`` for their map confirms."""
-    out = []
-    for k, found in enumerate(maps):
-        points = found.points()
-        agree = np.zeros(len(points), np.bool_)
-        for j in chosen[k]:
-            agree |= on_surface(maps[j], points, CONFIRMED)
-        alone = np.zeros(found.depth.shape, np.bool_)
-        alone[found.seen] = ~agree
-        out.append(replace(found, trust=np.where(alone, np.float32(ALONE) * found.trust, found.trust)))
+                on_map((number + (k + 1) / len(maps)) / (len(PHASES) + 1))
+    images = _images(maps, greys, planes)
+    out = [_with_trust(*each, images, pool) for each in zip(maps, views, planes)]
+    if on_map is not None:
+        on_map(1.0)
     return out
+
+
+def exposures(maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Brightness of each image relative to the others (N,), from points that two of them show: least squares
+    over the medians of all pairs. 1 where it is within ``SAME_GAIN``, or unknown."""
+    pairs, ratios = [], []
+    for k, found in enumerate(maps):
+        at = np.flatnonzero(found.seen)
+        at = at[:: max(1, len(at) // GAIN_POINTS)]
+        points = found.points()[:: max(1, int(found.seen.sum()) // GAIN_POINTS)]
+        own = greys[k].ravel()[at]
+        for j, other in enumerate(maps):
+            both = on_surface(other, points, GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
+            if both.sum() < LEAST_SHARED:
+                continue
+            lens, pose = other.intrinsics, other.camera_to_world
+            column, row = lens.project((points[both] - pose[:3, 3]) @ pose[:3, :3]).astype(np.int64).T
+            pairs.append((k, j))
+            ratios.append(np.median(np.log((greys[j][row, column] + 1.0) / (own[both] + 1.0))))
+    system = np.eye(len(maps)) * 1e-3  # images that share nothing keep their brightness
+    right = np.zeros(len(maps))
+    for (k, j), ratio in zip(pairs, ratios):
+        system[[k, j], [k, j]] += 1.0
+        system[[k, j], [j, k]] -= 1.0
+        right[j] += ratio
+        right[k] -= ratio
+    log_gain = np.linalg.solve(system, right) if len(maps) else right
+    return np.where(np.abs(log_gain) > SAME_GAIN, np.exp(np.clip(log_gain, -MOST_GAIN, MOST_GAIN)), 1.0)
 
 
 def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
@@ -114,71 +150,114 @@ def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> N
     return agree
 
 
-def _grey(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
-    if picture.shape[:2] != found.depth.shape:
-        raise SurfaceError(f"a picture of {picture.shape} does not belong to a depth map {found.depth.shape}")
-    return cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-
-
-def _sweep_map(
-    found: DepthMap,
-    greys: Sequence[NDArray[np.float32]],
-    maps: Sequence[DepthMap],
-    k: int,
-    chosen: Sequence[int],
-    factors: NDArray[np.float64],
-    pool: Pool,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    pose = found.camera_to_world
-    rays = np.ascontiguousarray(found.intrinsics.rays() @ pose[:3, :3].T)
-    size = np.array([[maps[j].intrinsics.width, maps[j].intrinsics.height] for j in chosen], np.int64)
-    others = SourceImages(
-        lens=np.array([lens_row(maps[j].intrinsics) for j in chosen], dtype=np.float64),
-        rotation=np.stack([maps[j].camera_to_world[:3, :3] for j in chosen]),
-        origin=np.stack([maps[j].camera_to_world[:3, 3] for j in chosen]),
-        first=np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])]).astype(np.int64),
-        size=size,
-        grey=np.concatenate([greys[j].ravel() for j in chosen]),
-    )
-    known = np.where(found.seen, found.depth, np.float32(0.0))
-    depth, score = np.zeros_like(known), np.zeros_like(known)
-    pool.run(
-        sweep, rays, np.ascontiguousarray(pose[:3, 3]), greys[k], known, smooth_normals(found, rays), others,
-        factors, depth, score,
-    )  # fmt: skip
-    return depth, score
-
-
-def smooth_normals(found: DepthMap, rays: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit normals float32 (H, W, 3) in world axes, from derivatives of the smoothed known points: the plane
-    that best fits the pixels around each."""
-    seen = found.seen
-    points = np.where(seen[..., None], rays * found.depth[..., None], 0.0)
-    weight = cv2.GaussianBlur(seen.astype(np.float64), (0, 0), SMOOTH_PX)
+def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit normals float32 (H, W, 3) in world axes, towards the camera, from derivatives of the smoothed
+    known points: the plane that best fits the pixels around each."""
+    known = depth > 0
+    points = rays * depth[..., None].astype(np.float64)
+    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), SMOOTH_PX)
     smooth = cv2.GaussianBlur(points, (0, 0), SMOOTH_PX) / np.maximum(weight, 1e-6)[..., None]
     normal = np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0))
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1.0), -rays)
-    return normal.astype(np.float32)
+    away = (normal * rays).sum(axis=-1, keepdims=True) > 0
+    return np.where(away, -normal, normal).astype(np.float32)
 
 
-def _filter_depth(
-    depth: NDArray[np.float32], seen: NDArray[np.bool_], score: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Initial depth of the next pass: the 5 x 5 median, without outliers, where images agree; elsewhere
-    interpolated from nearby pixels where they agree."""
-    known = cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    calm = np.where(known, cv2.medianBlur(depth, 5), depth)
-    good = (seen & (score >= AGREES)).astype(np.float32)
-    weight = cv2.GaussianBlur(good, (0, 0), SMOOTH_PX)
-    between = cv2.GaussianBlur(good * calm, (0, 0), SMOOTH_PX) / np.maximum(weight, 1e-6)
-    lost = seen & (good == 0) & (weight > ENOUGH)
-    return np.where(lost, between, calm).astype(np.float32)
+def _grey(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
+    """Gray levels, not rounded: a third of the noise where only shading varies."""
+    if picture.shape[:2] != found.depth.shape:
+        raise SurfaceError(f"a picture of {picture.shape} does not belong to a depth map {found.depth.shape}")
+    color = np.ascontiguousarray(picture[..., :3]).astype(np.float32)
+    return cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
-def _weight_by_score(found: DepthMap, score: NDArray[np.float32]) -> DepthMap:
-    """Weight each pixel of a depth map by how well the images agree there."""
-    sure = np.clip((score - AGREES) / (1.0 - AGREES), 0.0, 1.0)
-    sure = np.where(score == 0.0, np.float32(UNSURE), sure)
-    depth = np.where(found.seen & (sure <= 0.0), np.float32(0.0), found.depth)
-    return depth_map(depth, found.color, found.camera_to_world, found.intrinsics, sure)
+def _fill_unknown(found: DepthMap) -> NDArray[np.float32]:
+    """Initial depth: unknown pixels take that of the nearest known one; 0 where the ray hits nothing."""
+    depth = np.where(found.seen, found.depth, np.float32(0.0))
+    if not found.seen.any():
+        return depth
+    _, label = cv2.distanceTransformWithLabels(
+        (~found.seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[found.seen]] = depth[found.seen]
+    return np.where(found.depth == 0, of_label[label], depth)
+
+
+def _view(k: int, found: DepthMap, grey: NDArray[np.float32]) -> View:
+    rays = np.ascontiguousarray(found.intrinsics.rays() @ found.camera_to_world[:3, :3].T)
+    return View(k, rays, grey, np.full((*grey.shape, SOURCES), -1, np.int16))
+
+
+def _images(
+    maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]], planes: Sequence[Planes]
+) -> Images:
+    size = np.array([[m.intrinsics.width, m.intrinsics.height] for m in maps], np.int64).reshape(-1, 2)
+    return Images(
+        lens=np.array([lens_row(m.intrinsics) for m in maps], dtype=np.float64).reshape(-1, 8),
+        rotation=np.array([m.camera_to_world[:3, :3] for m in maps]).reshape(-1, 3, 3),
+        origin=np.array([m.camera_to_world[:3, 3] for m in maps]).reshape(-1, 3),
+        first=np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])]).astype(np.int64),
+        size=size,
+        grey=np.concatenate([grey.ravel() for grey in greys]),
+        depth=np.concatenate([found.depth.ravel() for found in planes]),
+    )
+
+
+def _offers(
+    images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool
+) -> list[Planes]:
+    """For every map, planes of other maps to try, see ``Phase``."""
+    none = [Planes(np.zeros_like(p.depth), p.normal, p.cost) for p in planes]
+    sure = [(p.depth > 0) & (p.cost < OFFERED) for p in planes]
+    if not which or not any(s.any() for s in sure):
+        return none
+    points = np.concatenate([
+        (images.origin[v.index] + v.rays[s] * p.depth[s, None]).astype(np.float32)
+        for v, p, s in zip(views, planes, sure)
+    ])  # fmt: skip
+    normals = np.concatenate([p.normal[s] for p, s in zip(planes, sure)])
+    costs = np.concatenate([p.cost[s] for p, s in zip(planes, sure)])
+    owners = np.repeat(np.arange(len(planes), dtype=np.int32), [int(s.sum()) for s in sure])
+    winner, least = np.empty(len(images.grey), np.int32), np.empty(len(images.grey), np.float32)
+    pool.run(offer, images, points, normals, costs, owners, which == "nearest", winner, least)
+    out = []
+    for view, empty, first in zip(views, none, images.first):
+        won = winner[first : first + view.grey.size].reshape(view.grey.shape)
+        some = won >= 0
+        index, ray = won[some], view.rays[some]
+        along = (normals[index] * ray).sum(axis=-1)
+        reach = (normals[index] * (points[index] - images.origin[view.index])).sum(axis=-1)
+        depth, normal = empty.depth, empty.normal.copy()
+        depth[some] = np.where(along < -1e-3, reach / np.minimum(along, -1e-3), 0.0)
+        normal[some] = normals[index]
+        out.append(Planes(depth, normal, empty.cost))
+    return out
+
+
+def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, pool: Pool) -> DepthMap:
+    """The map with the depth of ``planes``, each trusted by its cost and by the maps that confirm it."""
+    shape = planes.depth.shape
+    agree, against = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+    rise = np.zeros(shape, np.float32)
+    pool.run(confirm, images, view, planes, CONFIRMED, agree, against, rise)
+    compared = view.chosen[..., 0] >= 0
+    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), UNSURE, 1.0)
+    sure = alike * np.where(agree > 0, np.minimum(0.4 + 0.2 * agree, 1.0), ALONE)
+    sure = np.where(against > agree, 0.0, sure)
+    # Images may agree by being flat; then only the field knows.
+    sure = np.where(rise >= PLAIN, sure, np.minimum(sure, UNSURE))
+    # What no other camera sees stays as the field has it.
+    kept = np.where(compared, sure > 0.0, found.seen)
+    depth = np.where(compared, planes.depth, np.where(found.seen, found.depth, np.float32(0.0)))
+    cosine = -(planes.normal * view.rays).sum(axis=-1)
+    cosine = np.where(compared, np.maximum(cosine, 0.0), found.cosine)
+    empty = np.isposinf(found.depth)
+    trust = np.where(compared, sure, np.float32(UNSURE)) * cosine
+    return replace(
+        found,
+        depth=np.where(kept, depth, np.where(empty, np.inf, 0.0)).astype(np.float32),
+        trust=np.where(kept, trust, np.where(empty, found.trust, 0.0)).astype(np.float32),
+        cosine=np.where(empty, found.cosine, cosine).astype(np.float32),
+    )

@@ -1,10 +1,12 @@
 """Mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
 
 A field is fitted to a scan of ``tile`` from 0.3 m (``scenes.tile_scan``). After each fitting time its depth
-is compared with the exact depth, and meshes are made: from the depth of the field, from depth sharpened by
-the images, and from carved voxels that are then sharpened (``surface.voxel_depth``), with truncated signed
-distances at several voxel sizes and with a fitted distance function. Row ``exact`` fuses the exact depth: the
+is compared with the exact depth, and meshes are made: from the depth of the field, and from depth sharpened
+by the images (``surface.refine_depth``), with truncated signed distances at several voxel sizes and with a
+fitted distance function. Row ``exact`` fuses the exact depth: the
 best that images of this size and these cameras allow.
+
+The same is measured from the viewpoints of scenario ``cell``, with its field after ``CELL_STEPS`` steps.
 """
 
 from __future__ import annotations
@@ -23,7 +25,15 @@ from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, surface_truth
+from edge_server.experiments.scenes.mesh_truth import SPACING_M
+from edge_server.experiments.scenes.tile_scan import (
+    DISTANCE_M,
+    Scan,
+    cell_scan,
+    exact_depth,
+    scan,
+    surface_truth,
+)
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from edge_server.surface import SurfaceError
@@ -50,9 +60,9 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 # Depth that meshes are made from, and the settings that make it.
 DEPTHS = {
     "of the field": MeshSettings(sharpen=False),
-    "sharpened": MeshSettings(carve=False),
-    "carved": MeshSettings(),
+    "sharpened": MeshSettings(),
 }
+CELL_FIELD, CELL_STEPS = "ngp", 300
 TARGET = (
     f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
     f"{1e3 * WITHIN_M:g} mm"
@@ -65,22 +75,25 @@ class Workload:
 
     size: pixels a side of the images.
     fit_s: seconds of fitting after which meshes are made.
-    voxels_mm: of the sharpened and carved meshes; the others are made at the middle one.
+    voxels_mm: of the sharpened meshes; the others are made at the middle one.
     cases: of ``CASES``.
+    cell_sizes: pixels a side of the images from the cell's viewpoints.
     """
 
     size: int
     fit_s: tuple[float, ...]
     voxels_mm: tuple[float, ...]
     cases: tuple[str, ...]
+    cell_sizes: tuple[int, ...]
 
 
-FULL = Workload(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES))
-QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"))
+FULL = Workload(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES), (128, 384))
+QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"), (128,))
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}. BenchError: scikit-image is missing."""
+    """{scan: facts, exact: {meshes}, cell: {SIZE: {...}}, cases: {CASE: {fits: [...]}}}. BenchError:
+    scikit-image is missing."""
     try:
         import skimage  # noqa: F401 -- said before minutes of fitting, not after
     except ImportError:
@@ -100,6 +113,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
     about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm,
              "depths": list(DEPTHS)}  # fmt: skip
     store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
+    for size in workload.cell_sizes:
+        about_cell = {"size": size, "steps": CELL_STEPS, "defaults": settings_digest(CELL_FIELD, {})}
+        store.get("cell", str(size), settings=about_cell, compute=partial(_cell, size))
     progress = Progress(len(names) * workload.fit_s[-1])
     for name in names:
         case = partial(_case, name, workload, close, exact, truth, progress)
@@ -111,11 +127,33 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _exact_meshes(
     workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
 ) -> dict[str, Any]:
-    maps = [
+    maps = _exact_maps(close, exact)
+    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in workload.voxels_mm]}
+
+
+def _cell(size: int) -> dict[str, Any]:
+    """The mesh as ``edge-server export`` makes it, from the cell's viewpoints, and the one of exact depth."""
+    close = cell_scan(size)
+    truth, exact = surface_truth(close, SPACING_M), [exact_depth(close.scene, v) for v in close.views]
+    field = make_field(CELL_FIELD, close.options)
+    field.fit(close.views, Budget(steps=CELL_STEPS))
+    began = time.perf_counter()
+    maps = make_depth_maps(field.snapshot(), close.views, MeshSettings())
+    row: dict[str, Any] = {"views": len(close.views), **_depth_error(maps, exact)}
+    mesh = mesh_from_depth_maps(maps, MeshSettings())
+    row["seconds"] = time.perf_counter() - began
+    best = compare(mesh_from_depth_maps(_exact_maps(close, exact), MeshSettings()), truth)
+    return {
+        **row, **dataclasses.asdict(compare(mesh, truth)), "triangles": len(mesh.faces),
+        "exact_chamfer_mm": best.chamfer_mm, "exact_complete": best.complete,
+    }  # fmt: skip
+
+
+def _exact_maps(close: Scan, exact: Sequence[NDArray[np.float64]]) -> list[DepthMap]:
+    return [
         depth_map(d.astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for d, v in zip(exact, close.views)
     ]
-    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in workload.voxels_mm]}
 
 
 def _case(
@@ -141,7 +179,6 @@ def _case(
         for depth, wanted in (
             ("of the field", [("tsdf", middle)]),
             ("sharpened", [*every, ("sdf", middle)]),
-            ("carved", every),
         ):
             seconds: dict[str, float] = {}
             began = time.perf_counter()
@@ -180,7 +217,7 @@ def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, tr
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Two Markdown tables: depth, and meshes."""
+    """Three Markdown tables: depth, meshes, and meshes of the cell."""
     facts = figures["scan"]
     about = (
         f"{facts['views']} images of {facts['size']} x {facts['size']} of `tile` from "
@@ -214,5 +251,21 @@ def table(figures: dict[str, Any]) -> str:
         "field|fit s|depth|method|voxel mm|chamfer mm|accuracy mm (median)|completeness mm|"
         "within 3 mm: surface, mesh|triangles|seconds"
     )
-    tables = markdown_table(of_depth.split("|"), depths), markdown_table(of_mesh.split("|"), meshes)
+    cells = [
+        (
+            size, c["views"], f"{c['median_mm']:.2f}", f"{c['chamfer_mm']:.2f} ({c['exact_chamfer_mm']:.2f})",
+            f"{c['accuracy_mm']:.2f} ({c['accuracy_median_mm']:.2f})",
+            f"{100 * c['complete']:.1f} % ({100 * c['exact_complete']:.1f}), {100 * c['precise']:.1f} %",
+            f"{c['seconds']:.0f}",
+        )
+        for size, c in figures.get("cell", {}).items()
+    ]  # fmt: skip
+    of_cell = (
+        "cell at|views|depth, median mm|chamfer mm (exact depth)|accuracy mm (median)|"
+        "within 3 mm: surface (exact depth), mesh|seconds"
+    )
+    tables = (
+        markdown_table(of_depth.split("|"), depths), markdown_table(of_mesh.split("|"), meshes),
+        markdown_table(of_cell.split("|"), cells),
+    )  # fmt: skip
     return "\n\n".join((about, *tables))

@@ -6,11 +6,14 @@ point, and tilted to four sides. They see neither the tile's lower side nor its 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.config import WorldConfig, source_config
+from camera_node.robot.arm.viewpoint_tour import viewpoints
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.camera_rig import on_sphere
 from camera_node.synthetic.placement import PlacedParts, place_static
@@ -19,7 +22,8 @@ from camera_node.synthetic.scene import Scene
 from edge_server.experiments.scenes.multiview_still import known_options
 from edge_server.fields import View
 from edge_server.surface.metrics import STEEPEST_DEG, Truth, thin_points
-from freshfield.geometry import Pinhole, world_rays
+from freshfield.geometry import Array, Pinhole, world_rays
+from freshfield.scenario import load
 
 DISTANCE_M = 0.3
 FOV_DEG = 50.0
@@ -46,9 +50,20 @@ class Scan:
 
 def scan(size: int = 256, raster: tuple[tuple[float, float, float], ...] = RASTER_M) -> Scan:
     """``size`` pixels a side; five cameras a point of ``raster``."""
+    return _scan_from([on_sphere(p, DISTANCE_M, a, e) for p in raster for a, e in ANGLES_DEG], size, FOV_DEG)
+
+
+def cell_scan(size: int) -> Scan:
+    """The tile from the viewpoints of scenario ``cell``, with exact poses, and ``size`` pixels a side."""
+    source = source_config(load("cell"))
+    assert isinstance(source, WorldConfig) and source.arm is not None and source.arm.path is not None
+    assert source.horizontal_fov_deg is not None
+    return _scan_from(viewpoints(source.arm.path), size, source.horizontal_fov_deg)
+
+
+def _scan_from(poses: Sequence[Array], size: int, fov_deg: float) -> Scan:
     scene = make_scene("tile", {"count": 1, "width": size, "height": size})
-    lens = Pinhole.from_fov(size, size, FOV_DEG)
-    poses = [on_sphere(point, DISTANCE_M, a, e) for point in raster for a, e in ANGLES_DEG]
+    lens = Pinhole.from_fov(size, size, fov_deg)
     cameras = {f"scan{k:02d}": (lens, pose) for k, pose in enumerate(poses)}
     scene = scene.with_cameras(cameras)
     views = tuple(

@@ -187,17 +187,6 @@ def test_nothing_asked_for_is_an_error(run, capsys):
     assert "say what to write" in capsys.readouterr().err
 
 
-def test_voxels_are_carved_for_a_mesh_and_only_unless_told_otherwise():
-    from edge_server.export.command import Export, _parser
-
-    def carves(*words: str) -> bool:
-        return Export(_parser().parse_args(["run", *words]))._settings().carve
-
-    assert carves("--mesh", "m.ply")
-    assert not carves("--mesh", "m.ply", "--no-carve")
-    assert not carves("--points", "p.ply")
-
-
 def test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked(tmp_path):
     """Ours are written without compression: none is larger than its file."""
     file = tmp_path / "field.npz"

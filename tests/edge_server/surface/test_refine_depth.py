@@ -1,7 +1,8 @@
-"""Depth from pictures that agree: the kernel against plain numpy, and a textured plate whose depth is
-known."""
+"""Depth from pictures that agree: the cost against plain numpy, and plates whose depth is known."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,44 +11,155 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.sweep import NONE, REACH, SourceImages, correlation
-from edge_server.surface.refine_depth import neighboring_maps, refine_depth, smooth_normals
+from edge_server.surface.kernels import patch_match
+from edge_server.surface.kernels.patch_match import (
+    DIFFERENCE,
+    FADE,
+    LANES,
+    LEVELS,
+    NOISE,
+    REACH,
+    SIMILAR,
+    SOURCES,
+    WORST,
+    Images,
+    Planes,
+    View,
+    choose_sources,
+)
+from edge_server.surface.refine_depth import ALONE, UNSURE, exposures, refine_depth, smooth_normals
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
 TEXTURE = gaussian_filter(np.random.default_rng(1).normal(size=(400, 400)), 2.0, mode="wrap")
+EYES = [(0.0, 0.0, 0.3), (0.12, 0.0, 0.28), (-0.1, 0.05, 0.29), (0.0, -0.13, 0.27)]
+POSES = [look_at(eye, (0, 0, 0), up=(0, 1, 0)) for eye in EYES]
+POOL = Pool(2, nice=0)
 
 
-def plate(pose) -> tuple[np.ndarray, np.ndarray]:
-    """Exact depth of the plane z = 0 and a picture of a random texture on it."""
+def texture(x, y) -> np.ndarray:
+    return 128 + 400 * map_coordinates(TEXTURE, [x / 0.001 + 200, y / 0.001 + 200], order=1, mode="wrap")
+
+
+def shading(x, y) -> np.ndarray:
+    """Brightness that changes evenly, two gray levels a pixel, in every direction but one."""
+    return 128 + 900 * x + 300 * y
+
+
+def picture_of(gray) -> np.ndarray:
+    return np.repeat(np.rint(np.clip(gray, 0, 255)).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def plate(pose, paint=texture) -> tuple[np.ndarray, np.ndarray]:
+    """Exact depth of the plane z = 0 and a picture of what is painted on it."""
     origin, rays = world_rays(LENS, pose)
     depth = -origin[2] / rays[..., 2]
     x, y = (origin + rays * depth[..., None])[..., :2].transpose(2, 0, 1)
-    grey = map_coordinates(TEXTURE, [x / 0.001 + 200, y / 0.001 + 200], order=1, mode="wrap")
-    picture = np.clip(128 + 400 * grey, 0, 255).astype(np.uint8)
-    return depth.astype(np.float32), np.repeat(picture[..., None], 3, axis=-1)
+    return depth.astype(np.float32), picture_of(paint(x, y))
+
+
+def trench(pose, half_m=0.012, deep_m=0.03) -> tuple[np.ndarray, np.ndarray]:
+    """Exact depth and a picture of a textured plate with a trench along y."""
+    origin, rays = world_rays(LENS, pose)
+    top = -origin[2] / rays[..., 2]
+    at = origin + rays * top[..., None]
+    inside = np.abs(at[..., 0]) < half_m
+    floor = (-deep_m - origin[2]) / rays[..., 2]
+    with np.errstate(divide="ignore"):
+        wall = (np.sign(rays[..., 0]) * half_m - origin[0]) / rays[..., 0]
+    wall = np.where(wall > top, wall, np.inf)
+    depth = np.where(inside, np.minimum(floor, wall), top)
+    x, y, z = (origin + rays * depth[..., None]).transpose(2, 0, 1)
+    gray = texture(x + 3.0 * z, y + z)  # a wall shows another part of the texture
+    return depth.astype(np.float32), picture_of(gray)
+
+
+def maps_of(shown, wrong=1.0) -> tuple[list[DepthMap], list[np.ndarray]]:
+    maps = [
+        depth_map((d * wrong).astype(np.float32), picture, pose, LENS)
+        for (d, picture), pose in zip(shown, POSES)
+    ]
+    return maps, [picture for _, picture in shown]
+
+
+def errors(found, exact, least_trust=0.0) -> np.ndarray:
+    """Absolute errors, meters, of all pixels with a depth and more trust than ``least_trust``."""
+    kept = [m.seen & (m.trust > least_trust) for m in found]
+    return np.concatenate([np.abs(m.depth - e)[k] for m, e, k in zip(found, exact, kept)])
 
 
 @pytest.fixture(scope="module")
 def rig() -> tuple[list[DepthMap], list[np.ndarray], list[np.ndarray]]:
     """Four cameras whose depth is 2 to 4 % off, their pictures, and the exact depth."""
-    eyes = [(0.0, 0.0, 0.3), (0.12, 0.0, 0.28), (-0.1, 0.05, 0.29), (0.0, -0.13, 0.27)]
-    poses = [look_at(eye, (0, 0, 0), up=(0, 1, 0)) for eye in eyes]
-    shown = [plate(pose) for pose in poses]
+    shown = [plate(pose) for pose in POSES]
     y = np.linspace(0, 3, 72)[:, None]
     wrong = [(d * (1.03 + 0.01 * np.sin(y + k))).astype(np.float32) for k, (d, _) in enumerate(shown)]
-    maps = [depth_map(d, picture, pose, LENS) for d, (_, picture), pose in zip(wrong, shown, poses)]
+    maps = [depth_map(d, picture, pose, LENS) for d, (_, picture), pose in zip(wrong, shown, POSES)]
     return maps, [picture for _, picture in shown], [d for d, _ in shown]
 
 
 def test_depth_moves_to_where_the_pictures_agree(rig):
     maps, pictures, exact = rig
-    found = refine_depth(maps, pictures)
+    found = refine_depth(maps, pictures, POOL)
     before = [np.abs(m.depth - e)[m.seen] for m, e in zip(maps, exact)]
     after = [np.abs(m.depth - e)[m.seen & (m.trust > 0.3)] for m, e in zip(found, exact)]
     assert np.median(np.concatenate(before)) > 0.005
     assert np.median(np.concatenate(after)) < 0.0004  # a tenth of a pixel
     assert sum(map(len, after)) > 0.6 * sum(map(len, before))
+
+
+def test_a_start_far_off_is_mended_too(rig):
+    _, _, exact = rig
+    maps, pictures = maps_of([plate(pose) for pose in POSES], wrong=1.12)
+    after = errors(refine_depth(maps, pictures, POOL), exact, 0.3)
+    assert np.median(after) < 0.0006
+    assert len(after) > 0.5 * sum(m.seen.sum() for m in maps)
+
+
+def test_shading_alone_locates_a_surface():
+    """An even slope of brightness correlates with itself wherever it is shifted to; gray levels do not."""
+    shown = [plate(pose, shading) for pose in POSES]
+    maps, pictures = maps_of(shown, wrong=1.03)
+    found = refine_depth(maps, pictures, POOL)
+    inner = [(slice(8, -8), slice(8, -8))] * 4
+    after = np.concatenate([np.abs(m.depth - d)[at].ravel() for m, (d, _), at in zip(found, shown, inner)])
+    assert np.median(after) < 0.002  # of 9 mm
+
+
+def test_a_trench_that_the_field_has_closed_opens():
+    shown = [trench(pose) for pose in POSES]
+    closed = [plate(pose)[0] for pose in POSES]
+    maps, pictures = maps_of([(d, picture) for d, (_, picture) in zip(closed, shown)])
+    found = refine_depth(maps, pictures, POOL)
+    straight = found[0]  # looks down into it: the floor is 30 mm below the lid
+    deep = (shown[0][0] > closed[0] + 0.02) & (np.abs(np.arange(72) - 36) < 20)[:, None]
+    assert deep.sum() > 100
+    error = np.abs(straight.depth - shown[0][0])[deep & (straight.trust > 0.1)]
+    assert len(error) > 0.5 * deep.sum()
+    assert np.median(error) < 0.002
+
+
+def test_what_hides_a_point_in_some_pictures_does_not_spoil_it(rig):
+    maps, pictures, exact = rig
+    hidden = [picture.copy() for picture in pictures]
+    hidden[1][20:50, 20:50] = 255  # something bright before two of three others
+    hidden[3][20:50, 20:50] = 0
+    found = refine_depth([maps[0], maps[2], maps[1], maps[3]], [hidden[k] for k in (0, 2, 1, 3)], POOL)
+    error = np.abs(found[0].depth - exact[0])[24:48, 24:48]
+    assert np.median(error) < 0.002
+
+
+def test_a_picture_taken_darker_is_brightened_before(rig):
+    maps, pictures, exact = rig
+    darker = [pictures[0], (0.7 * pictures[1]).astype(np.uint8), *pictures[2:]]
+    gray = [p[..., 0].astype(np.float32) for p in darker]
+    gains = exposures(maps, gray)
+    assert gains[1] / gains[0] == pytest.approx(0.7, abs=0.05)
+    assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_array_equal(exposures(maps, [p[..., 0].astype(np.float32) for p in pictures]), 1.0)
+    np.testing.assert_array_equal(exposures(maps[:1], gray[:1]), 1.0)
+    after = errors(refine_depth(maps, darker, POOL), exact, 0.3)
+    assert np.median(after) < 0.0005 and len(after) > 0.5 * sum(m.seen.sum() for m in maps)
 
 
 def test_the_number_of_threads_changes_no_bit(rig):
@@ -58,40 +170,119 @@ def test_the_number_of_threads_changes_no_bit(rig):
         np.testing.assert_array_equal(a.trust, b.trust)
 
 
-def test_agreement_is_the_correlation_of_two_patches():
-    rng = np.random.default_rng(3)
-    grey = rng.uniform(0, 255, (30, 40)).astype(np.float32)
-    others = SourceImages(
-        np.zeros((1, 8)), np.eye(3)[None], np.zeros((1, 3)), np.array([0, grey.size]), np.array([[40, 30]]),
-        grey.ravel(),
-    )  # fmt: skip
-    patch = rng.uniform(0, 255, (5, 5)).astype(np.float32)
-    u, v, ux, vx, uy, vy = 20.3, 14.8, 1.1, 0.2, -0.3, 0.9
+def test_flat_pictures_are_not_trusted(rig):
+    maps, pictures, _ = rig
+    flat = [np.full_like(picture, 90) for picture in pictures]
+    for before, after in zip(maps, refine_depth(maps, flat, POOL)):
+        assert after.trust[before.seen].max() <= UNSURE + 1e-6
+
+
+def test_one_camera_alone_keeps_its_depth(rig):
+    maps, pictures, _ = rig
+    (found,) = refine_depth(maps[:1], pictures[:1], POOL)
+    np.testing.assert_array_equal(found.depth[found.seen], maps[0].depth[found.seen])
+    assert found.seen.sum() > 0.8 * maps[0].seen.sum()
+    np.testing.assert_allclose(found.trust, UNSURE * maps[0].cosine, atol=1e-6)
+
+
+def test_a_camera_without_overlap_changes_nothing(rig):
+    maps, pictures, _ = rig
+    far = depth_map(maps[0].depth, maps[0].color, look_at((5.0, 0, 0.3), (5, 0, 0), up=(0, 1, 0)), LENS)
+    with_far = refine_depth([*maps, far], [*pictures, pictures[0]], POOL)
+    np.testing.assert_array_equal(with_far[4].depth[with_far[4].seen], far.depth[with_far[4].seen])
+    for a, b in zip(with_far, refine_depth(maps, pictures, POOL)):
+        # Random numbers are those of the pass and the map, so only these may differ.
+        assert np.median(np.abs(a.depth - b.depth)[a.seen & b.seen]) < 0.0003
+
+
+def test_depth_that_no_map_confirms_is_hardly_trusted(rig):
+    maps, pictures, _ = rig
+    noise = [
+        np.random.default_rng(k).integers(0, 255, p.shape, dtype=np.uint8) for k, p in enumerate(pictures)
+    ]
+    trust = np.concatenate([m.trust[m.seen] for m in refine_depth(maps, noise, POOL)])
+    assert np.mean(trust <= ALONE) > 0.8
+
+
+def _kernel_view(k: int, maps, gray) -> tuple[Images, View]:
+    from edge_server.surface.refine_depth import _images, _view
+
+    planes = [Planes(np.where(m.seen, m.depth, 0).astype(np.float32), None, None) for m in maps]
+    return _images(maps, gray, planes), _view(k, maps[k], gray[k])
+
+
+def test_the_cost_is_that_of_plain_numpy(rig):
+    maps, pictures, exact = rig
+    gray = [p[..., 0].astype(np.float32) for p in pictures]
+    images, view = _kernel_view(0, maps, gray)
+    view.chosen[..., 0] = 1
+    row, column, normal = 30, 41, np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
+    depth = 1.01 * float(exact[0][row, column])
+    across, down, fade = (np.empty(LANES, np.float32) for _ in range(3))
+    patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    patch_match._pattern(across, down, fade)
+    facts = patch_match._take_patch(gray[0], row, column, across, down, fade, patch, weight)
+    found, shown = patch_match.plane_cost(
+        images, view, row, column, depth, *normal, across, down, patch, weight, facts, 0.0
+    )
+    # Every tap's ray meets the plane; the affine approximation is off by a hundredth of a pixel.
     j, i = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
-    at = [v - 0.5 + i * vx + j * vy, u - 0.5 + i * ux + j * uy]
-    other = map_coordinates(grey.astype(float), at, order=1)
-    centred = (patch - patch.mean()).ravel()
-    found = correlation(centred, np.float32(centred @ centred), others, 0, u, v, ux, vx, uy, vy)
-    assert found == pytest.approx(np.corrcoef(patch.ravel(), other.ravel())[0, 1], abs=1e-4)
-    assert correlation(centred, np.float32(1.0), others, 0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0) == NONE
-    same = grey[12:17, 17:22] - grey[12:17, 17:22].mean()
-    exact = correlation(same.ravel(), np.float32((same**2).sum()), others, 0, 19.5, 14.5, 1.0, 0.0, 0.0, 1.0)
-    assert exact == pytest.approx(1.0, abs=1e-4)
+    near = ((abs(i) < REACH) & (abs(j) < REACH)) | (i == 0) | (j == 0)
+    i, j = i[near], j[near]
+    rays, origin = view.rays, maps[0].camera_to_world[:3, 3]
+    reach = depth * (normal @ rays[row, column])
+    points = origin + rays[row + j, column + i] * (reach / (rays[row + j, column + i] @ normal))[:, None]
+    pose = maps[1].camera_to_world
+    at = LENS.project((points - pose[:3, 3]) @ pose[:3, :3])
+    other = map_coordinates(gray[1].astype(float), [at[:, 1] - 0.5, at[:, 0] - 0.5], order=1)
+    own = gray[0][row + j, column + i].astype(float)
+    w = np.exp(-np.abs(own - gray[0][row, column]) / SIMILAR - FADE * (i * i + j * j))
+    w /= w.sum()
+    a, b = own - w @ own, other - w @ other
+    like = (w @ (a * b)) / np.sqrt((w @ a**2 + NOISE) * (w @ b**2 + NOISE))
+    levels = LEVELS + np.sqrt(w @ a**2)
+    wanted = (1 - DIFFERENCE) * (1 - like) + DIFFERENCE * min(w @ np.abs(own - other) / levels, 2.0)
+    assert found == pytest.approx(wanted, abs=0.02) and shown == 1
+    turned_away, shown = patch_match.plane_cost(
+        images, view, row, column, depth, *-normal, across, down, patch, weight, facts, 0.0
+    )
+    assert turned_away == WORST and shown == 0
+
+
+def test_a_pixel_is_compared_with_those_that_see_the_same_from_aside(rig):
+    maps, pictures, _ = rig
+    far = depth_map(maps[0].depth, maps[0].color, look_at((5.0, 0, 0.3), (5, 0, 0), up=(0, 1, 0)), LENS)
+    every = [*maps, far, replace(maps[0])]  # one sees something else, one stands where map 0 does
+    gray = [p[..., 0].astype(np.float32) for p in [*pictures, pictures[0], pictures[0]]]
+    images, view = _kernel_view(0, every, gray)
+    depth = np.where(maps[0].seen, maps[0].depth, 0).astype(np.float32)
+    planes = Planes(depth, smooth_normals(depth, view.rays), np.zeros_like(depth))
+    POOL.run(choose_sources, images, view, planes, False)
+    assert set(view.chosen[36, 36]) == {1, 2, 3, -1}
+    assert view.chosen.shape[-1] == SOURCES
+    # Hidden by something that stands before it in map 1: that comes last.
+    images.depth[images.first[1] : images.first[2]] = 0.1
+    POOL.run(choose_sources, images, view, planes, True)
+    assert [s for s in view.chosen[36, 36] if s >= 0][-1] == 1
 
 
 def test_normals_are_those_of_the_plate(rig):
-    _, pictures, exact = rig
-    pose = look_at((0.12, 0.0, 0.28), (0, 0, 0), up=(0, 1, 0))
-    found = depth_map(exact[1], pictures[1], pose, LENS)
-    normal = smooth_normals(found, LENS.rays() @ pose[:3, :3].T)
-    assert (np.abs(normal[10:-10, 10:-10, 2]) > 0.9995).all()
+    _, _, exact = rig
+    normal = smooth_normals(exact[1], LENS.rays() @ POSES[1][:3, :3].T)
+    assert (normal[10:-10, 10:-10, 2] > 0.9995).all()
 
 
-def test_a_map_is_compared_with_those_that_see_the_same_from_aside(rig):
-    maps, _, _ = rig
-    far = depth_map(maps[0].depth, maps[0].color, look_at((5.0, 0, 0.3), (5, 0, 0), up=(0, 1, 0)), LENS)
-    assert set(neighboring_maps([*maps, far], 0)) == {1, 2, 3}
-    assert neighboring_maps([maps[0], maps[0]], 0) == []  # no angle between them, no depth
+def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):
+    maps, pictures, exact = rig
+    holed = []
+    for m in maps:
+        depth = m.depth.copy()
+        depth[30:40, 30:40], depth[:, :6] = 0.0, np.inf
+        holed.append(depth_map(depth, m.color, m.camera_to_world, LENS))
+    found = refine_depth(holed, pictures, POOL)
+    error = np.abs(found[0].depth - exact[0])[31:39, 31:39]
+    assert np.isfinite(error).all() and np.median(error) < 0.0006
+    assert np.isposinf(found[0].depth[:, :6]).all()
 
 
 def test_pictures_must_belong_to_the_maps(rig):

@@ -14,24 +14,26 @@ from edge_server.experiments.bench.surface import Workload
 @pytest.mark.slow
 def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    monkeypatch.setattr(surface, "QUICK", Workload(40, (2.0,), (8.0,), ("splat",)))
+    monkeypatch.setattr(surface, "QUICK", Workload(40, (2.0,), (8.0,), ("splat",), (24,)))
+    monkeypatch.setattr(surface, "CELL_STEPS", 20)
     words = ["bench", "surface", "--quick", "--json", str(tmp_path / "s.json")]
     assert edge_server(words) == 0
     found = json.loads((tmp_path / "s.json").read_text())["surface"]
     (exact,) = found["exact"]["meshes"]
     assert exact["chamfer_mm"] < 3.0 and exact["complete"] > 0.8
+    cell = found["cell"]["24"]
+    assert cell["views"] == 51 and 0.0 < cell["exact_chamfer_mm"] < cell["chamfer_mm"]
     (fit,) = found["cases"]["splat"]["fits"]
     assert {(m["depth"], m["method"]) for m in fit["meshes"]} == {
-        ("of the field", "tsdf"), ("sharpened", "tsdf"), ("sharpened", "sdf"), ("carved", "tsdf"),
+        ("of the field", "tsdf"), ("sharpened", "tsdf"), ("sharpened", "sdf"),
     }  # fmt: skip
     # What the pictures agree on is nearer to the truth than what the field made of them.
     assert fit["sharpened"]["median_mm"] < fit["of the field"]["median_mm"]
-    carved, sharpened = (
+    rough, sharpened = (
         next(m for m in fit["meshes"] if (m["depth"], m["method"]) == (depth, "tsdf"))
-        for depth in ("carved", "sharpened")
+        for depth in ("of the field", "sharpened")
     )
-    assert carved["complete"] > sharpened["complete"]
-    assert fit["carved"]["carve_s"] > 0.0 and "carve_s" not in fit["sharpened"]
+    assert sharpened["chamfer_mm"] < rough["chamfer_mm"]
     assert "| exact |  | exact | tsdf | 8 |" in capsys.readouterr().out
     assert edge_server([*words, "--resume"]) == 0
     again = json.loads((tmp_path / "s.json").read_text())["surface"]

@@ -1,0 +1,495 @@
+"""Photo-consistent depth: multi-view PatchMatch over slanted planes (Bleyer 2011, Galliani 2015).
+
+Every pixel holds a plane: depth along its ray and normal. In turns, the pixels of one color of a chessboard
+try the planes of neighbors and random changes of their own, and keep the cheapest. The cost of a plane is how
+much the pixel's patch differs from the other images where the plane maps it (affine approximation).
+
+Two measures are added. Normalized cross-correlation is invariant to exposure, but blind where brightness only
+changes evenly: an even slope correlates with itself wherever it is shifted to. The difference of gray levels
+is not, and on surfaces that only shading varies it alone locates the surface.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
+
+SOURCES = 5  # images that a pixel is compared with
+LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
+REACH = 3  # pixels from the middle of a patch to its farthest tap
+SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so patches end at edges
+FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
+NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
+DIFFERENCE = np.float32(0.8)  # share of the difference of gray levels in the cost; the rest: 1 - correlation
+LEVELS = np.float32(4.0)  # mean difference, gray levels, that costs 1 on a plain patch; at most 2
+WORST = np.float32(3.0)  # cost of a plane that no other image shows
+SINGLE = np.float32(0.3)  # added if only one other image shows it
+MOST_PX = 3.0  # largest distance that the geometric term counts
+LEAST_COS = 0.1  # between ray and normal
+SMOOTH = np.float32(0.06)  # weight of the distance, pixels, to what neighbors' planes say; at most SMOOTH_PX
+SMOOTH_PX = 2.0
+BETTER = np.float32(1e-4)  # a plane replaces another if it is cheaper by this
+LEAST_DEG, BEST_DEG, SPREAD_DEG, MOST_DEG = 3.0, 25.0, 15.0, 70.0  # between two images' lines of sight
+HIDDEN = 0.02  # a surface nearer by this share of the distance hides a point
+
+
+class Images(NamedTuple):
+    """N images. lens: float64 (N, 8), fx fy cx cy k1 k2 p1 p2. rotation: (N, 3, 3), camera-to-world; origin:
+    (N, 3), meters. first: int64 (N + 1,) into grey and depth: float32 (P,), row by row, gray levels and
+    meters along the ray (0: unknown); size: int64 (N, 2), width and height."""
+
+    lens: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    first: NDArray[np.int64]
+    size: NDArray[np.int64]
+    grey: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+class View(NamedTuple):
+    """The image whose planes are sought. index: of ``Images``. rays: float64 (H, W, 3), world, unit. grey:
+    float32 (H, W). chosen: int16 (H, W, SOURCES), images to compare each pixel with, best first; -1: none."""
+
+    index: int
+    rays: NDArray[np.float64]
+    grey: NDArray[np.float32]
+    chosen: NDArray[np.int16]
+
+
+class Planes(NamedTuple):
+    """A plane per pixel. depth: float32 (H, W), meters along the ray; 0: none. normal: float32 (H, W, 3),
+    unit, world, towards the camera. cost: float32 (H, W)."""
+
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    cost: NDArray[np.float32]
+
+
+class Search(NamedTuple):
+    """What one pass tries. wide: number of planes with random normal, depth within ``reach`` (share) of
+    ``guess``. share, turn: largest changes of depth (share) and normal. geometric: weight, per pixel, of the
+    distance to where the other image's depth leads back to."""
+
+    wide: int
+    reach: float
+    share: float
+    turn: float
+    geometric: float
+
+
+@part
+def _project(images, s, x, y, z):
+    """Project a world point to image s; -1e9 if behind the camera or far outside."""
+    x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]
+    r, lens = images.rotation, images.lens
+    deep = r[s, 0, 2] * x + r[s, 1, 2] * y + r[s, 2, 2] * z
+    if not deep > 1e-6:
+        return -1e9, -1e9
+    a = (r[s, 0, 0] * x + r[s, 1, 0] * y + r[s, 2, 0] * z) / deep
+    b = (r[s, 0, 1] * x + r[s, 1, 1] * y + r[s, 2, 1] * z) / deep
+    k1, k2, p1, p2 = lens[s, 4], lens[s, 5], lens[s, 6], lens[s, 7]
+    r2 = a * a + b * b
+    radial = 1.0 + r2 * (k1 + r2 * k2)
+    if not (radial > 0.0 and r2 < 16.0):
+        return -1e9, -1e9
+    u = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
+    v = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
+    return lens[s, 0] * u + lens[s, 2], lens[s, 1] * v + lens[s, 3]
+
+
+@part
+def _within(images, s, u, v, margin):
+    """Whether (u, v) lies in image s, ``margin`` pixels from its border or more."""
+    return u >= margin and v >= margin and u < images.size[s, 0] - margin and v < images.size[s, 1] - margin
+
+
+@part
+def _shown(images, s, u, v):
+    """Depth of image s at the pixel of (u, v)."""
+    return np.float64(images.depth[images.first[s] + np.int64(v) * images.size[s, 0] + np.int64(u)])
+
+
+@part
+def _to(images, s, x, y, z):
+    """Direction (not unit) from camera s to a point, and distance."""
+    x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]
+    return x, y, z, np.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def choose_sources(counter, worker, images, view, planes, visible):
+    """Writes ``view.chosen``: the images that show a pixel's point best, by the angle between the lines of
+    sight and at the surface. Tasks are rows. visible: whether an image whose depth hides the point counts
+    a tenth."""
+    height, width = planes.depth.shape
+    k = view.index
+    ox, oy, oz = images.origin[k, 0], images.origin[k, 1], images.origin[k, 2]
+    score, index = np.empty(SOURCES), np.empty(SOURCES, np.int64)
+    while True:
+        row = fetch_add(counter, 1)
+        if row >= height:
+            return
+        for column in range(width):
+            for i in range(SOURCES):
+                score[i], index[i] = 0.0, -1
+            d = np.float64(planes.depth[row, column])
+            if d > 0.0:
+                rx, ry, rz = view.rays[row, column, 0], view.rays[row, column, 1], view.rays[row, column, 2]
+                nx = np.float64(planes.normal[row, column, 0])
+                ny = np.float64(planes.normal[row, column, 1])
+                nz = np.float64(planes.normal[row, column, 2])
+                x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
+                for s in range(images.first.size - 1):
+                    u, v = _project(images, s, x, y, z)
+                    if s == k or not _within(images, s, u, v, REACH):
+                        continue
+                    ex, ey, ez, far = _to(images, s, x, y, z)
+                    cosine = min(1.0, max(-1.0, (ex * rx + ey * ry + ez * rz) / far))
+                    apart = np.degrees(np.arccos(cosine))
+                    if not (apart >= LEAST_DEG and apart <= MOST_DEG):
+                        continue
+                    off = (apart - BEST_DEG) / SPREAD_DEG
+                    facing = -(ex * nx + ey * ny + ez * nz) / far
+                    good = np.exp(-0.5 * off * off) * min(1.0, max(2.0 * facing, 0.2))
+                    shown = _shown(images, s, u, v)
+                    if visible and shown > 0.0 and shown < far * (1.0 - HIDDEN):
+                        good *= 0.1
+                    if good > score[SOURCES - 1]:
+                        i = SOURCES - 1
+                        while i > 0 and good > score[i - 1]:
+                            score[i], index[i] = score[i - 1], index[i - 1]
+                            i -= 1
+                        score[i], index[i] = good, s
+            for i in range(SOURCES):
+                view.chosen[row, column, i] = index[i]
+
+
+@part
+def _pattern(across, down, fade):
+    """Write the taps' offsets, pixels, and weights by distance, float32 (LANES,) each."""
+    t = 0
+    for j in range(-REACH, REACH + 1):
+        for i in range(-REACH, REACH + 1):
+            if (abs(i) < REACH and abs(j) < REACH) or i == 0 or j == 0:
+                across[t], down[t] = i, j
+                fade[t] = np.exp(-FADE * (i * i + j * j))
+                t += 1
+    for k in range(t, LANES):
+        across[k] = down[k] = fade[k] = 0.0
+
+
+@part
+def _take_patch(grey, row, column, across, down, fade, patch, weight):
+    """Write a pixel's patch, less its weighted mean, and its weights; returns sum of weights, mean and
+    variance. Taps similar to the middle weigh more, taps outside nothing."""
+    height, width = grey.shape
+    total = mean = spread = np.float32(0.0)
+    for t in range(LANES):
+        r, c = row + np.int64(down[t]), column + np.int64(across[t])
+        g, w = np.float32(0.0), np.float32(0.0)
+        if r >= 0 and c >= 0 and r < height and c < width:
+            g = grey[r, c]
+            w = exp32(-abs(g - grey[row, column]) / SIMILAR) * fade[t]
+        patch[t], weight[t] = g, w
+        total += w
+        mean += w * g
+    mean /= total
+    for t in range(LANES):
+        patch[t] -= mean
+        spread += weight[t] * patch[t] * patch[t]
+    return total, mean, spread / total
+
+
+@part
+def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, weight, facts, geometric):
+    """Cost of the plane through depth d with a normal: mean of the two images that differ least; and how many
+    of these there are: 0 (the cost is WORST), 1 or 2. facts: what ``_take_patch`` returned for the pixel."""
+    k, rays = view.index, view.rays
+    height, width = view.grey.shape
+    total, mean, spread = facts
+    # A pixel to the right and one down, or their opposites at the border.
+    right, below = 1 if column < width - 1 else -1, 1 if row < height - 1 else -1
+    rx, ry, rz = rays[row, column, 0], rays[row, column, 1], rays[row, column, 2]
+    along = nx * rx + ny * ry + nz * rz
+    if not along < -LEAST_COS:
+        return WORST, 0
+    ax, ay, az = rays[row, column + right, 0], rays[row, column + right, 1], rays[row, column + right, 2]
+    bx, by, bz = rays[row + below, column, 0], rays[row + below, column, 1], rays[row + below, column, 2]
+    a, b = d * along / (nx * ax + ny * ay + nz * az), d * along / (nx * bx + ny * by + nz * bz)
+    if not (a > 0.0 and b > 0.0 and a < 2.0 * d and b < 2.0 * d):
+        return WORST, 0
+    ox, oy, oz = images.origin[k, 0], images.origin[k, 1], images.origin[k, 2]
+    x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
+    ax, ay, az = ox + a * ax, oy + a * ay, oz + a * az
+    bx, by, bz = ox + b * bx, oy + b * by, oz + b * bz
+    one, two = WORST, WORST
+    levels = LEVELS + np.sqrt(spread)  # where texture is strong, so is what interpolation does to it
+    for i in range(SOURCES):
+        s = np.int64(view.chosen[row, column, i])
+        if s < 0:
+            break
+        u, v = _project(images, s, x, y, z)
+        ur, vr = _project(images, s, ax, ay, az)
+        ud, vd = _project(images, s, bx, by, bz)
+        ux, vx, uy, vy = right * (ur - u), right * (vr - v), below * (ud - u), below * (vd - v)
+        margin = 1.0 + REACH * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
+        if not _within(images, s, u, v, margin):
+            continue
+        u0, v0 = np.float32(u - 0.5), np.float32(v - 0.5)
+        fux, fvx, fuy, fvy = np.float32(ux), np.float32(vx), np.float32(uy), np.float32(vy)
+        stride, first = np.int32(images.size[s, 0]), np.uint32(images.first[s])
+        level = square = cross = change = np.float32(0.0)
+        for t in range(LANES):
+            p, q = u0 + across[t] * fux + down[t] * fuy, v0 + across[t] * fvx + down[t] * fvy
+            px, py = np.int32(p), np.int32(q)
+            fa, fb = p - np.float32(px), q - np.float32(py)
+            at = np.uint32(first + np.uint32(py * stride + px))
+            under = np.uint32(at + np.uint32(stride))
+            top = images.grey[at] + fa * (images.grey[np.uint32(at + np.uint32(1))] - images.grey[at])
+            low = images.grey[under]
+            low += fa * (images.grey[np.uint32(under + np.uint32(1))] - low)
+            g = top + fb * (low - top) - mean
+            w = weight[t]
+            level += w * g
+            square += w * g * g
+            cross += w * g * patch[t]
+            change += w * abs(g - patch[t])
+        other = max(square - level * level / total, np.float32(0.0)) / total
+        like = cross / total / np.sqrt((spread + NOISE) * (other + NOISE))
+        cost = (np.float32(1.0) - DIFFERENCE) * (np.float32(1.0) - like)
+        cost += DIFFERENCE * min(change / total / levels, np.float32(2.0))
+        if geometric > 0.0:
+            cost += np.float32(geometric * _way_back(images, k, s, row, column, u, v, x, y, z))
+        if cost < one:
+            one, two = cost, one
+        elif cost < two:
+            two = cost
+    if two < WORST:
+        return np.float32(0.5) * (one + two), 2
+    return one, 1 if one < WORST else 0
+
+
+@part
+def _way_back(images, k, s, row, column, u, v, x, y, z):
+    """Pixels between a pixel of image k and where the depth of image s, in which its point (x, y, z) is at
+    (u, v), leads back to; MOST_PX at most."""
+    shown = _shown(images, s, u, v)
+    if not shown > 0.0:
+        return MOST_PX
+    ex, ey, ez, far = _to(images, s, x, y, z)
+    far = shown / far
+    ox, oy, oz = images.origin[s, 0], images.origin[s, 1], images.origin[s, 2]
+    u, v = _project(images, k, ox + far * ex, oy + far * ey, oz + far * ez)
+    u, v = u - column - 0.5, v - row - 0.5
+    return min(MOST_PX, np.sqrt(u * u + v * v))
+
+
+@part
+def _neighbor(planes, row, column, way):
+    """The cheapest pixel of the other color in one of 8 ways, four near and four far; -1: none."""
+    height, width = planes.depth.shape
+    dr = 1 if way % 4 == 0 else -1 if way % 4 == 1 else 0
+    dc = 1 if way % 4 == 2 else -1 if way % 4 == 3 else 0
+    least, found_row, found_column = WORST, -1, -1
+    for m in range(3 if way < 4 else 5):
+        ahead = 3 + 2 * m if way >= 4 else 1 if m == 0 else 2
+        aside = 0 if way >= 4 or m == 0 else 2 * m - 3
+        r, c = row + dr * ahead + dc * aside, column + dc * ahead + dr * aside
+        if r < 0 or c < 0 or r >= height or c >= width:
+            continue
+        if planes.depth[r, c] > 0.0 and planes.cost[r, c] < least:
+            least, found_row, found_column = planes.cost[r, c], r, c
+    return found_row, found_column
+
+
+@kernel
+def offer(counter, worker, images, points, normals, costs, owners, nearest, winner, least):
+    """For every pixel of every image, which point of another map falls on it. Tasks are images.
+
+    points, normals: float32 (M, 3), world. costs: float32 (M,). owners: int32 (M,), image that a point is of.
+    nearest: whether the nearest point wins, else the cheapest. winner: int32 (P,), index of the point, -1:
+    none; least: float32 (P,). Both are written.
+    """
+    while True:
+        k = fetch_add(counter, 1)
+        if k >= images.first.size - 1:
+            return
+        for at in range(images.first[k], images.first[k + 1]):
+            winner[at], least[at] = -1, np.float32(1e9)
+        for m in range(costs.size):
+            if owners[m] == k:
+                continue
+            x, y, z = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
+            u, v = _project(images, k, x, y, z)
+            if not _within(images, k, u, v, 0):
+                continue
+            x, y, z, far = _to(images, k, x, y, z)
+            if not normals[m, 0] * x + normals[m, 1] * y + normals[m, 2] * z < -LEAST_COS * far:
+                continue
+            value = np.float32(far) if nearest else costs[m]
+            at = images.first[k] + np.int64(v) * images.size[k, 0] + np.int64(u)
+            if value < least[at]:
+                winner[at], least[at] = m, value
+
+
+@kernel
+def match(counter, worker, images, view, guess, offered, planes, parity, key, search):
+    """One pass over the pixels of one color. Tasks are rows. parity: row + column is odd if 1. key: of the
+    pass's random numbers, which depend on the pixel alone. guess: float32 (H, W); no depth leaves ``reach``
+    around it. offered: planes (``offer``) to try, depth 0: none; their cost is not read."""
+    height, width = planes.depth.shape
+    across, down, fade = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    meets, nearness, normals = np.empty(8), np.empty(8, np.float32), np.empty((8, 3))
+    step = 1.0 / min(images.lens[view.index, 0], images.lens[view.index, 1])
+    _pattern(across, down, fade)
+    while True:
+        row = fetch_add(counter, 1)
+        if row >= height:
+            return
+        for column in range((row + parity) % 2, width, 2):
+            d = np.float64(planes.depth[row, column])
+            if not d > 0.0 or view.chosen[row, column, 0] < 0:
+                continue
+            facts = _take_patch(view.grey, row, column, across, down, fade, patch, weight)
+            rx, ry, rz = view.rays[row, column, 0], view.rays[row, column, 1], view.rays[row, column, 2]
+            nx = np.float64(planes.normal[row, column, 0])
+            ny = np.float64(planes.normal[row, column, 1])
+            nz = np.float64(planes.normal[row, column, 2])
+            middle = np.float64(guess[row, column])
+            # Where the planes of neighbors meet the ray, and how much each counts: 0 across an edge.
+            total = np.float32(0.0)
+            for way in range(8):
+                meets[way] = nearness[way] = 0.0
+                r, c = _neighbor(planes, row, column, way)
+                if r < 0:
+                    continue
+                qx, qy = np.float64(planes.normal[r, c, 0]), np.float64(planes.normal[r, c, 1])
+                qz = np.float64(planes.normal[r, c, 2])
+                along = qx * rx + qy * ry + qz * rz
+                if not along < -LEAST_COS:
+                    continue
+                there = qx * view.rays[r, c, 0] + qy * view.rays[r, c, 1] + qz * view.rays[r, c, 2]
+                meets[way] = np.float64(planes.depth[r, c]) * there / along
+                normals[way, 0], normals[way, 1], normals[way, 2] = qx, qy, qz
+                nearness[way] = exp32(-abs(view.grey[r, c] - view.grey[row, column]) / SIMILAR)
+                total += nearness[way]
+            pixel = 1.0 / (middle * step)
+            least = WORST
+            # Trial -1: the pixel's own plane; 0: the offered one; 1 to 8: of neighbors; then random ones,
+            # then random changes.
+            for trial in range(-1, 15 + search.wide):
+                n = np.uint64(((row * width + column) * 64 + trial + 1) * 4)
+                qd, qx, qy, qz = d, nx, ny, nz
+                if trial == 0:
+                    qd, qx = (
+                        np.float64(offered.depth[row, column]),
+                        np.float64(offered.normal[row, column, 0]),
+                    )
+                    qy = np.float64(offered.normal[row, column, 1])
+                    qz = np.float64(offered.normal[row, column, 2])
+                elif trial >= 1 and trial <= 8:
+                    qd = meets[trial - 1]
+                    qx, qy, qz = normals[trial - 1, 0], normals[trial - 1, 1], normals[trial - 1, 2]
+                elif trial > 8:
+                    wide = trial < 9 + search.wide
+                    small = 0.25 if trial >= 12 + search.wide else 1.0
+                    kind = -1 if wide else (trial - search.wide) % 3  # 0: depth, 1: normal, 2: both
+                    if kind != 1:
+                        part = 2.0 * np.float64(uniform(key, n)) - 1.0
+                        qd = (
+                            middle * (1.0 + search.reach * part)
+                            if wide
+                            else d * (1.0 + small * search.share * part)
+                        )
+                    if kind != 0:
+                        turn = 1.0 if wide else small * search.turn
+                        keep = 0.0 if wide else 1.0
+                        qx = keep * nx + turn * (2.0 * np.float64(uniform(key, n + np.uint64(1))) - 1.0)
+                        qy = keep * ny + turn * (2.0 * np.float64(uniform(key, n + np.uint64(2))) - 1.0)
+                        qz = keep * nz + turn * (2.0 * np.float64(uniform(key, n + np.uint64(3))) - 1.0)
+                        length = np.sqrt(qx * qx + qy * qy + qz * qz)
+                        if not length > 1e-3:
+                            continue
+                        length = -length if qx * rx + qy * ry + qz * rz > 0.0 else length
+                        qx, qy, qz = qx / length, qy / length, qz / length
+                if not abs(qd - middle) <= search.reach * middle:
+                    continue
+                cost, shown = plane_cost(
+                    images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts,
+                    search.geometric,
+                )  # fmt: skip
+                if shown == 1:
+                    cost = min(cost + SINGLE, WORST)
+                if total > np.float32(0.0):
+                    bumpy = np.float32(0.0)
+                    for way in range(8):
+                        bumpy += nearness[way] * np.float32(min(pixel * abs(qd - meets[way]), SMOOTH_PX))
+                    cost += SMOOTH * bumpy / (total + np.float32(1.0))
+                if trial == -1 or cost < least - BETTER:
+                    least, d, nx, ny, nz = cost, qd, qx, qy, qz
+            planes.depth[row, column], planes.cost[row, column] = d, least
+            planes.normal[row, column, 0] = nx
+            planes.normal[row, column, 1] = ny
+            planes.normal[row, column, 2] = nz
+
+
+@kernel
+def confirm(counter, worker, images, view, planes, share, agree, against, rise):
+    """How far to trust each plane. Tasks are rows. share: tolerance, of the distance, plus one pixel.
+
+    agree, against: int16 (H, W), written: chosen images whose depth agrees with the point, and that look
+    through it. rise: float32 (H, W), written: mean rise of the cost (photometric) at depths one pixel's width
+    nearer and farther; 0 where images tell nothing.
+    """
+    height, width = planes.depth.shape
+    k = view.index
+    across, down, fade = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    _pattern(across, down, fade)
+    while True:
+        row = fetch_add(counter, 1)
+        if row >= height:
+            return
+        for column in range(width):
+            agree[row, column] = against[row, column] = rise[row, column] = 0
+            d = np.float64(planes.depth[row, column])
+            if not d > 0.0 or view.chosen[row, column, 0] < 0:
+                continue
+            x = images.origin[k, 0] + d * view.rays[row, column, 0]
+            y = images.origin[k, 1] + d * view.rays[row, column, 1]
+            z = images.origin[k, 2] + d * view.rays[row, column, 2]
+            for i in range(SOURCES):
+                s = np.int64(view.chosen[row, column, i])
+                if s < 0:
+                    break
+                u, v = _project(images, s, x, y, z)
+                if not _within(images, s, u, v, 0):
+                    continue
+                shown = _shown(images, s, u, v)
+                _, _, _, far = _to(images, s, x, y, z)
+                tolerance = (share + 1.0 / min(images.lens[s, 0], images.lens[s, 1])) * far
+                if abs(shown - far) <= tolerance:
+                    agree[row, column] += 1
+                elif shown > far + 2.0 * tolerance:
+                    against[row, column] += 1
+            facts = _take_patch(view.grey, row, column, across, down, fade, patch, weight)
+            nx = np.float64(planes.normal[row, column, 0])
+            ny = np.float64(planes.normal[row, column, 1])
+            nz = np.float64(planes.normal[row, column, 2])
+            step = 1.0 / min(images.lens[k, 0], images.lens[k, 1])
+            total, compared = np.float32(0.0), True
+            for trial in range(3):
+                cost, shown = plane_cost(
+                    images, view, row, column, d * (1.0 + step * (trial - 1)), nx, ny, nz, across, down,
+                    patch, weight, facts, 0.0,
+                )  # fmt: skip
+                total += -cost if trial == 1 else np.float32(0.5) * cost
+                compared = compared and shown > 0
+            rise[row, column] = total if compared else np.float32(0.0)
