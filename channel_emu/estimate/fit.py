@@ -30,6 +30,7 @@ from channel_emu.estimate.recording import (
 )
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import EventKind
+from freshfield.scenario import ScenarioError
 
 MIN_DELAYS = 20
 # A state with fewer frames or fewer visits is taken for outliers.
@@ -124,6 +125,11 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scop
     if states != "1" and (poisson or not constant):
         _require_libraries(path)
         estimate = hmm.fit(lines, not constant, poisson)
+        if states == "2" and not estimate.finite:
+            raise RecordingError(f"{path}: --states 2: delays and arrivals do not determine two states")
+    if estimate is not None and not estimate.finite:
+        estimate = None
+    elif estimate is not None:
         parameter_count = len(estimate.model.log_parameters())
         bic[2] = parameter_count * math.log(_observation_count(lines)) - 2 * estimate.log_likelihood
         why_not = _reject_two_states(estimate, lines)
@@ -141,7 +147,12 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scop
     chosen_by = "BIC" if states == "auto" else "asked"
     bursts = _loss_statistics(recording.cameras)
     channel = _channel_section(recording, parameters, kind, period_ms, scope, bursts)
-    channel_from_mapping(channel, "the fitted channel")
+    try:
+        channel_from_mapping(channel, "the fitted channel")
+    except ScenarioError as error:
+        raise RecordingError(
+            f"{path}: delays and arrivals do not determine a channel of two states ({error}): --states 1"
+        ) from None
     return Fit(recording, 1 if estimate is None else 2, chosen_by, kind, parameters, bic, bursts, channel,
                warnings, estimate, lines)  # fmt: skip
 

@@ -102,6 +102,11 @@ class Estimate:
     log_sd: Array | None
     states: list[Array]
 
+    @property
+    def finite(self) -> bool:
+        """Whether the likelihood has its maximum where it can be computed."""
+        return math.isfinite(self.log_likelihood) and all(np.isfinite(s).all() for s in self.states)
+
     def interval(self, place: int) -> tuple[float, float] | None:
         """95 % interval of the parameter at ``place`` in ``log_parameters``."""
         if self.log_sd is None or not self.log_sd[place] < _MAX_LOG_SD:
@@ -245,10 +250,14 @@ def _deviations(model: TwoStateModel, lines: Sequence[Timeline], best: float) ->
         return log_likelihood(model.with_logs(at + shift), lines)
 
     up, down = np.array([value(m) for m in moves]), np.array([value(-m) for m in moves])
+    if not np.isfinite([best, *up, *down]).all():
+        return None  # what lies beside is impossible
     hessian = np.diag(up + down - 2 * best)
     for i in range(count):
         for j in range(i):
             both = value(moves[i] + moves[j]) + value(-moves[i] - moves[j])
+            if not np.isfinite(both):
+                return None
             hessian[i, j] = hessian[j, i] = (both - up[i] - down[i] - up[j] - down[j] + 2 * best) / 2
     information = -hessian / _STEP**2
     try:
