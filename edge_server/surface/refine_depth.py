@@ -40,10 +40,10 @@ SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest corr
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
 OFFERED = 0.6  # largest cost of a plane that is tried in other maps
-CHEAP, DEAR = 0.3, 1.0  # trust falls from 1 to UNSURE between these costs of a plane
-ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
+CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
 UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
-PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell nothing
+PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell next to nothing
+NOTHING = 1e-5  # ... below which they tell nothing, and the field's depth stays
 
 
 @dataclass(frozen=True)
@@ -243,12 +243,12 @@ def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, poo
     rise = np.zeros(shape, np.float32)
     pool.run(confirm, images, view, planes, CONFIRMED, agree, against, rise)
     compared = view.chosen[..., 0] >= 0
-    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), UNSURE, 1.0)
-    sure = alike * np.where(agree > 0, np.minimum(0.4 + 0.2 * agree, 1.0), ALONE)
-    sure = np.where(against > agree, 0.0, sure)
+    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), 0.0, 1.0)
+    sure = alike * np.minimum(0.4 + 0.2 * agree, 1.0) * ((agree > 0) & (agree >= against))
     # Images may agree by being flat; then only the field knows.
     sure = np.where(rise >= PLAIN, sure, np.minimum(sure, UNSURE))
-    # What no other camera sees stays as the field has it.
+    # What no other camera sees, and what they show flat, stays as the field has it.
+    compared &= np.abs(rise) > NOTHING
     kept = np.where(compared, sure > 0.0, found.seen)
     depth = np.where(compared, planes.depth, np.where(found.seen, found.depth, np.float32(0.0)))
     cosine = -(planes.normal * view.rays).sum(axis=-1)
