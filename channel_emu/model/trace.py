@@ -1,6 +1,6 @@
 """The trace file: what the link did to every message, one JSON line each.
 
-First line: ``{"freshfield_trace": 1, "seed": ..., "channel": {...}}``. Then one line when a message's outcome
+First line: ``{"freshfield_trace": 2, "seed": ..., "channel": {...}}``. Then one line when a message's outcome
 is known::
 
     {"camera": "cam03", "session": "f3a1", "sequence": 17, "number": 16, "bytes": 20481, "offered_ns": ...,
@@ -8,11 +8,10 @@ is known::
      "ended_ns": ..., "actual_ns": ..., "duplicated": false, "flips": []}
 
 Instants are nanoseconds since the emulator started. ``arrived_ns`` is when the message entered the link,
-later than its offer where an arrival process samples messages (null if it never did, and in traces of older
-versions). ``due_ns`` is when the link releases the message,
-``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a message that was still inside the link
-when the recording ended. For services other than the frame stream, ``camera`` is the link's name
-(``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the message's place in it.
+later than its offer where an arrival process samples messages (null if it never did). ``due_ns`` is when the
+link releases the message, ``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a message that
+was still inside the link when the recording ended. For services other than the frame stream, ``camera`` is
+the link's name (``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the message's place in it.
 """
 
 from __future__ import annotations

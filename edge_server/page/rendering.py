@@ -44,7 +44,7 @@ LEVELS = (
     DetailLevel(0.20, 0.2, 120, 480),
     DetailLevel(1.2, 0.15, 200, 720),
 )
-# Least time for an image of what is newer: in it, at its share, the picture changes seven times a second.
+# Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second.
 LEAST_S = 0.03
 BAND_S = 0.1
 MIN_GAP_S = 0.05
@@ -230,8 +230,8 @@ class RenderLoop:
                 visitor.level, visitor.renderer = level, renderer
 
     def _budget_s(self, number: int) -> float:
-        """Time for an image of a level. One of what is newer may take its share of an update: where updates
-        are short, a fine picture would be old."""
+        """Time for an image of a level. The image of a new publication may take its share of an update: where
+        updates are short, a fine picture would be old."""
         level, newest = LEVELS[number], self._state.newest()
         if number != NEWER or newest is None:
             return level.budget_s

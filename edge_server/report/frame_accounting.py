@@ -28,14 +28,14 @@ captured and sent, with a note. Where nodes' ledgers are present, a frame that w
 camera that no process accepted, of a session whose node did not write about it or with a garbled id, is of
 unknown origin and counted apart (``strangers`` in the report).
 
-Runs are long. Ledgers are therefore read line by line, and frames with the same history share it: there are a
-few dozen different ones, each of which is evaluated once.
+Runs are long. Ledgers are therefore read line by line, and each frame keeps only the number of its history:
+frames share a few dozen different histories, each of which is evaluated once.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -54,8 +54,6 @@ _EVENTS = {
     "edge": {"delivered", "rejected"},
 }
 _ROLES = tuple(_EVENTS)
-Events = tuple[tuple[int, str], ...]
-"""What was written about a frame: (number of the ledger, event) in the order of reading."""
 # What the edge and the emulator write in place of an id that they cannot accept.
 _GARBLED = "?"
 # Enough to see what went wrong; the count says how often.
@@ -175,41 +173,63 @@ class _History:
     its reason). incomplete: roles whose ledger for this frame may lack lines (killed, or a full disk).
     last_file, last_role: the ledger and the role furthest down the path that wrote about it."""
 
-    node: Counter[str]
-    emulator: Counter[str]
-    edge: Counter[str]
-    incomplete: frozenset[str]
-    last_file: int
-    last_role: int
+    node: Counter[str] = field(default_factory=Counter)
+    emulator: Counter[str] = field(default_factory=Counter)
+    edge: Counter[str] = field(default_factory=Counter)
+    incomplete: frozenset[str] = frozenset()
+    last_file: int = -1
+    last_role: int = -1
 
-    @staticmethod
-    def of(events: Events, ledgers: Sequence[LedgerReader], incomplete: Collection[int]) -> _History:
-        """The history of these events. incomplete: numbers of the ledgers that may lack lines."""
-        counts: dict[str, Counter[str]] = {role: Counter() for role in _ROLES}
-        last_file = last_role = -1
-        for file, event in events:
-            role = ledgers[file].role
-            counts[role][event] += 1
-            if _ROLES.index(role) >= last_role:
-                last_file, last_role = file, _ROLES.index(role)
-        lacking = frozenset(ledgers[file].role for file, _ in events if file in incomplete)
-        return _History(**counts, incomplete=lacking, last_file=last_file, last_role=last_role)
+    def after(self, role: str, event: str, file: int, complete: bool) -> _History:
+        """The history with one more event."""
+        number = _ROLES.index(role)
+        last = (file, number) if number >= self.last_role else (self.last_file, self.last_role)
+        counts = {name: getattr(self, name) for name in _ROLES}
+        counts[role] = counts[role] + Counter([event])
+        return _History(**counts, incomplete=self.incomplete | (set() if complete else {role}),
+                        last_file=last[0], last_role=last[1])  # fmt: skip
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for equal histories, and hashable."""
+        counts = (tuple(getattr(self, name).items()) for name in _ROLES)  # in order: the first end counts
+        return (*counts, self.incomplete, self.last_file, self.last_role)
+
+
+class _Histories:
+    """Every different history, by number; 0 is the empty one. A hundred thousand frames share a few dozen, so
+    a frame costs one number and each transition is computed once."""
+
+    def __init__(self) -> None:
+        self.all = [_History()]
+        self._numbers = {self.all[0].key: 0}
+        self._transitions: dict[tuple[int, int, str], int] = {}
+
+    def after(self, number: int, role: str, event: str, file: int, complete: bool) -> int:
+        """The number of history ``number`` with one more event."""
+        transition = (number, file, event)
+        result = self._transitions.get(transition)
+        if result is None:
+            history = self.all[number].after(role, event, file, complete)
+            result = self._numbers.setdefault(history.key, len(self.all))
+            if result == len(self.all):
+                self.all.append(history)
+            self._transitions[transition] = result
+        return result
 
 
 @dataclass
 class _LedgerContents:
     """What all ledgers say.
 
-    frames: what was written about each frame, by (camera, session) and sequence. known: every different
-    history, which frames share. incomplete: numbers of the ledgers that may lack lines. accepted: cameras
-    about which some process wrote more than refusals. garbled: by camera, the reasons for which frames with a
-    garbled id were refused; each is one frame. unknown_events: how often each event that no role writes was
-    read. near_end: frames written about near the end of a ledger without ``closed``; bit r: of one of role r.
+    frames: number of each frame's history, by (camera, session) and sequence. accepted: cameras about which
+    some process wrote more than refusals. garbled: by camera, the reasons for which frames with a garbled id
+    were refused; each is one frame. unknown_events: how often each event that no role writes was read.
+    near_end: frames written about near the end of a ledger without ``closed``; bit r: of one of role r.
     """
 
-    frames: dict[tuple[str, str], dict[int, Events]] = field(default_factory=dict)
-    known: dict[Events, Events] = field(default_factory=dict)
-    incomplete: set[int] = field(default_factory=set)
+    histories: _Histories = field(default_factory=_Histories)
+    frames: dict[tuple[str, str], dict[int, int]] = field(default_factory=dict)
     accepted: set[str] = field(default_factory=set)
     garbled: dict[str, Counter[str]] = field(default_factory=dict)
     unknown_events: Counter[str] = field(default_factory=Counter)
@@ -236,15 +256,14 @@ def account_frames(out: Path) -> FrameAccounting:
     notes += [f"{count} lines with an unknown {event} left out" for event, count in unknown]
 
     has_node_ledger = any(ledger.role == "node" for ledger in ledgers)
-    histories = {events: _History.of(events, ledgers, contents.incomplete) for events in contents.known}
-    evaluated = {events: _evaluate(history) for events, history in histories.items()}
+    evaluated = [_evaluate(history) for history in contents.histories.all]
     open_at: dict[str, Counter[int]] = {"in_flight": Counter(), "cut_off": Counter()}
     without_node = 0
     for (camera, session), frames in sorted(contents.frames.items()):
         contradicting: dict[int, list[str]] = {}
-        node_wrote = any(histories[events].node for events in set(frames.values()))
-        for events, count in Counter(frames.values()).items():
-            history, (counts, contradictions) = histories[events], evaluated[events]
+        node_wrote = any(contents.histories.all[number].node for number in set(frames.values()))
+        for number, count in Counter(frames.values()).items():
+            history, (counts, contradictions) = contents.histories.all[number], evaluated[number]
             refusals = _refusals(history)
             only_refused = node_wrote and refusals.total() == history.emulator.total() + history.edge.total()
             if not history.node and (only_refused or (has_node_ledger and camera not in contents.accepted)):
@@ -259,13 +278,13 @@ def account_frames(out: Path) -> FrameAccounting:
             open_at["in_flight"][history.last_file] += counts.in_flight * count
             if contradictions:
                 contradicting |= dict.fromkeys(
-                    (s for s, other in frames.items() if other == events), contradictions
+                    (s for s, other in frames.items() if other == number), contradictions
                 )
             unsent, copies = counts.without_end
             if unsent <= 0 and copies <= 0:
                 continue
             newest = max(frames)
-            for sequence in [s for s, other in frames.items() if other == events]:
+            for sequence in [s for s, other in frames.items() if other == number]:
                 near = contents.near_end.get((camera, session, sequence), 0)
                 if unsent > 0 and sequence == newest and near & 1 and not history.last_role:
                     accounting.add(camera, FrameCounts(waiting=unsent))
@@ -336,11 +355,9 @@ def _read_ledger(
     ``_cut_off_ends``."""
     role, name, notes = ledger.role, ledger.path.name, accounting.notes
     known = _EVENTS.get(role, set())
-    lost, lost_at_end = 0, 0
+    after, lost, lost_at_end = contents.histories.after, 0, 0
     try:
-        closed = ledger.closed
-        if not ledger.complete:
-            contents.incomplete.add(number)
+        complete, closed = ledger.complete, ledger.closed
         for e in ledger:
             event = e.event
             if event in known:
@@ -355,8 +372,7 @@ def _read_ledger(
                 if e.event != "rejected":
                     contents.accepted.add(e.camera)
                 frames = contents.frames.setdefault((e.camera, e.session), {})
-                events = (*frames.get(e.sequence, ()), (number, event))
-                frames[e.sequence] = contents.known.setdefault(events, events)
+                frames[e.sequence] = after(frames.get(e.sequence, 0), role, event, number, complete)
                 for ended, first_ns, last_ns in ends:
                     if first_ns <= e.t_ns <= last_ns:
                         frame = (e.camera, e.session, e.sequence)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.foreground import WHY
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
@@ -198,6 +197,8 @@ def _cut_line(report: Report) -> str:
     cut = report.get("foreground")
     if not cut:
         return ""
+    from edge_server.foreground import WHY  # only where a run cuts objects out
+
     whole = [f"{cut[name]} ({why})" for name, why in WHY.items() if cut.get(name)]
     spent = _n(cut["ms_per_image"], 0, " ms")
     return (

@@ -1,4 +1,4 @@
-"""omega-wait (6.15-6.17): wait omega, then use the newest frame of each camera if it is of the meantime.
+"""omega-wait (6.15-6.17): wait omega, then use each newest frame that was generated, or arrived, meanwhile.
 
 The horizon is (t, t + omega] and ages are taken at its end. omega = 0 uses the buffer as it is (6.34). If
 nothing qualifies at the end, the wait goes on until the first frame that does. The thesis has two readings of
@@ -56,7 +56,7 @@ def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> Selectio
 
 
 def qualified(epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-    """Cameras whose newest frame is of the window; all where it admits all."""
+    """Cameras whose newest frame falls into the window; all where it admits all."""
     if (after := window.received_after_ns) is not None:
         return tuple(c for c, received in epoch.received_ns.items() if received > after)
     after = window.generated_after_ns

@@ -235,7 +235,7 @@ def yaml(text: str) -> Callable[[Path], Callable[[], object]]:
 
 def onnx(save: Callable[[Path], Path]) -> Callable[[Path], Callable[[], object]]:
     def make(folder: Path) -> Callable[[], object]:
-        config = ForegroundConfig(box=(0, 0, 1, 1), segment=str(save(folder / "a.onnx")))
+        config = ForegroundConfig(detector=str(save(folder / "a.onnx")))
         return lambda: make_foreground(config)
 
     return make

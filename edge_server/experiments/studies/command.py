@@ -18,7 +18,7 @@ from edge_server.experiments.common.arguments import (
 )
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.study import StudyRequest, run_study
-from edge_server.experiments.studies.trial import scenario_of
+from edge_server.experiments.studies.trial import SCENARIOS, scenario_of
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fields.registry import field_names
@@ -133,9 +133,13 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
         raise StudyError(f"--jobs: expected at least 1, got {request.jobs}")
     for scene in request.scenes or ():
         try:
-            scenario_of(scene)
+            found = scenario_of(scene)
         except ScenarioError as error:
             raise StudyError(f"--scene: {error}") from None
+        if scene != found.path.stem and scene not in SCENARIOS:
+            raise StudyError(f"--scene {scene}: expected the name of a shipped scenario")
+        if {"arm", "host"} & set(found.source):
+            raise StudyError(f"--scene {scene}: its camera moves, which studies do not simulate")
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
     if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
@@ -176,7 +180,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--scene",
         metavar="NAME,...",
-        help="scenarios with fixed cameras: room, dynerf, a file [the study's own]",
+        help="shipped scenarios with fixed cameras, as kitchen or dynerf; room: room19 [the study's own]",
     )
     add("--field", choices=field_names(), default="splat",
         help="representation, where the study names none [%(default)s]")  # fmt: skip

@@ -43,7 +43,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Trial:
-    """scene: a scenario, shipped or a file, or a key of ``SCENARIOS``. size: image width and height of a
+    """scene: a shipped scenario, or a key of ``SCENARIOS``. size: image width and height of a
     world; recordings: divided by ``scale``. channel: scenario section. steps: optimizer steps per update.
     scratch: restart the field at each update (thesis); otherwise it stays warm, and the first update has
     ``first_steps``. compute: charged ms_per_step and ms_per_update; empty in the thesis. decisions: number
@@ -89,7 +89,7 @@ class Trial:
         cameras: Row = {"ids": list(shipped.cameras), "held_out": list(shipped.held_out)}
         if source.get("kind") == "world":
             source |= {"width": self.size, "height": self.size, "fps": WORLD_FPS}
-            if self.speed_m_per_s is not None:
+            if self.speed_m_per_s is not None and source.get("scene") != "tile":  # nothing moves there
                 source["speed_m_per_s"] = self.speed_m_per_s
             cameras = {"count": self.cameras, "held_out": ["cam00"]}
         elif self.scale != 1.0:
@@ -114,7 +114,6 @@ class Trial:
             grace_ms=0.0,
             first_ms=self.first_ms,
             scratch=self.scratch,
-            shown_every_ms=self.every_ms / 2.0,
         )
 
 
@@ -142,31 +141,19 @@ class Stage:
 def run_trial(trial: Trial, folders: Folders) -> Row:
     """Means over the trial's decisions.
 
-    psnr_db, psnr_moving_db, ssim, lpips: of what was published; None where there are none. shown_db,
-    shown_moving_db: PSNR of what was shown at random instants since. views: number of used views. aaoi_ms:
+    psnr_db, psnr_moving_db, ssim, lpips: None where there are none. views: number of used views. aaoi_ms:
     their mean age at publication (6.35). age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from
     decision to publication. decisions: their number.
 
     Raises ScenarioError or DatasetError.
     """
     rows: list[Row] = []
-    shown_before = [0]  # each publication
-
-    def published(publication: Publication) -> None:
-        rows.append(_row(publication, deployment))
-        shown_before.append(len(deployment.shown))
-
-    deployment = _deploy(trial, folders, published)
+    deployment: VirtualDeployment = _deploy(trial, folders, lambda p: rows.append(_row(p, deployment)))
     _finish(deployment, trial)
     kept = rows[trial.settle : trial.settle + trial.decisions]
     if not kept:
         raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
-    shown = deployment.shown[shown_before[trial.settle + 1] :]
-    return {
-        **{n: mean_or_none([row[n] for row in kept]) for n in kept[0]},
-        **{f"shown_{n}": mean_or_none([getattr(s, f"psnr_{n}") for s in shown]) for n in ("db", "moving_db")},
-        "decisions": len(kept),
-    }
+    return {**{n: mean_or_none([row[n] for row in kept]) for n in kept[0]}, "decisions": len(kept)}
 
 
 def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:

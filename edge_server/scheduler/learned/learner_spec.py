@@ -58,7 +58,7 @@ class Spec:
         if self.action not in ACTIONS:
             raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
         if (self.action == "select") != (not self.omegas_ms):
-            raise ValueError(f"action {self.action}: omegas_ms belong to all but select, and only there")
+            raise ValueError(f"action {self.action}: all but select need omegas_ms, and select takes none")
         if len(self.omegas_ms) > MAX_OMEGAS:
             raise ValueError(f"omegas_ms: expected at most {MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))

@@ -126,8 +126,8 @@ def f_w(row: Mapping[str, Any]) -> float | None:
 
 
 def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:
-    """The preset ``name`` with ``fidelity`` and other fields in place of its own. ValueError for an unknown
-    name lists the known ones."""
+    """The preset ``name`` with ``fidelity`` and other fields of ``Reward`` in place of its own. ValueError
+    for an unknown name lists the known ones."""
     if name not in REWARDS:
         raise ValueError(f"reward {name!r} is not known; choose one of {', '.join(REWARDS)}")
     return replace(REWARDS[name], fidelity=fidelity, **others)  # type: ignore[arg-type] # checked by Reward

@@ -208,7 +208,8 @@ class Preview:
             decided_ns = self._clock.now_ns()
             with self._lock:
                 newest = {n: f for n, f in self._newest.items() if not f.held_out}
-            epoch = Epoch(decided_ns, number, {n: f.generated_ns for n, f in newest.items()})
+            generated = {n: f.generated_ns for n, f in newest.items()}
+            epoch = Epoch(decided_ns, number, generated, received_ns=dict.fromkeys(newest, decided_ns))
             plan = self._policy.plan(epoch)
             selected = self._policy.select(epoch, plan)
             if not selected:

@@ -29,8 +29,8 @@ _SHOWN_TEXT = (
 )
 _SLOWER_TEXT = (
     "Slower processors: the same scenes, first seed, where an update and a frame are charged twice and four "
-    "times as much. *A perfect field that stands still*: the true moving pixels as they were at the mean "
-    "capture of the newest views that the same run showed."
+    "times as much. *A perfect field that stands still*: the true picture at the mean capture time of the "
+    "newest views that the same run showed."
 )
 _CEILINGS_TEXT = (
     "Ceilings, whole / moving, first seed. *Nothing late*: the same field, ideal network, computing free: "

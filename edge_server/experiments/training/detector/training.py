@@ -148,7 +148,7 @@ def _read(checkpoint: Path) -> dict[str, Any]:
         kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)
         kept["settings"], kept["averaged"]
     except Exception as error:  # torch's reader raises whatever its archive's layers raise
-        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+        raise CheckpointError(f"{checkpoint}: cannot be read ({error})") from None
     return kept
 
 

@@ -43,6 +43,16 @@ def test_policies_decide_at_the_same_instants_on_the_same_deliveries():
     assert run_trial(replace(TRIAL, seed=2), NO_DATA)["age_sum_ms"] != ages[0]
 
 
+def test_waiting_for_arrivals_takes_what_was_on_its_way_and_waiting_for_captures_does_not():
+    slow = {"preset": "ch5", "service": {"law": "deterministic", "mean_ms": 200.0}}
+    generated, arrived = (
+        run_trial(replace(TRIAL, channel=slow, policy=p, value=240.0, seed=4), NO_DATA)
+        for p in ("wait", "wait-arrived")
+    )
+    assert arrived["wait_ms"] == pytest.approx(240.0) and arrived["views"] == 4.0
+    assert generated["wait_ms"] > arrived["wait_ms"] and arrived["aaoi_ms"] > 200.0
+
+
 def test_nothing_is_old_where_nothing_is_delayed_and_flushing_frees_the_links():
     ideal = run_trial(replace(TRIAL, channel={"preset": "ideal"}), NO_DATA)
     assert ideal["aaoi_ms"] < 30.0 and ideal["views"] == 4.0

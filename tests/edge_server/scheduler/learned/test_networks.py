@@ -93,8 +93,8 @@ def test_before_anything_is_learned_every_camera_has_the_probability_asked_for(s
     ("words", "says"),
     [
         ({"action": "skip"}, "choose one of select"),
-        ({"action": "select", "omegas_ms": (0.0,)}, "belong to all but select"),
-        ({"action": "wait"}, "belong to all but select"),
+        ({"action": "select", "omegas_ms": (0.0,)}, "all but select need"),
+        ({"action": "wait"}, "all but select need"),
         ({"action": "wait", "omegas_ms": (50.0, 0.0)}, "rising"),
         ({"action": "wait", "omegas_ms": (0.0, float("inf"))}, "finite"),
         ({"action": "select", "network": "deep"}, "pooled or flat"),

@@ -55,7 +55,17 @@ def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
 
 
 @pytest.mark.parametrize(
-    "policy", ["all", "threshold:70", "wait:60", "freshest-k:2", "freshen", "periodic:400", "bandit:"]
+    "policy",
+    [
+        "all",
+        "threshold:70",
+        "wait:60",
+        "wait-arrived:60",
+        "freshest-k:2",
+        "freshen",
+        "periodic:400",
+        "bandit:",
+    ],
 )
 def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     if policy.startswith("bandit:"):
