@@ -125,7 +125,7 @@ class FrameStream:
                 await context.send_initial_metadata(())
                 while (raw := await context.read()) is not grpc.aio.EOF:
                     response, flow = self._take(raw, flow, call)
-                    await context.write(response.SerializeToString())
+                    await call.write(response.SerializeToString())
             finally:
                 if flow is not None:
                     flow.link.calls.discard(call)

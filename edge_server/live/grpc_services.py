@@ -75,11 +75,11 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
     ) -> None:
         last = self._state.newest()
         seen = -1 if last is None else last.number
-        async with self._watchers.open(context):
+        async with self._watchers.open(context) as call:
             while True:
                 for publication in self._state.publications(since=seen):
                     seen = publication.number
-                    await context.write(edge_pb2.WatchDecisionsResponse(decision=to_decision(publication)))
+                    await call.write(edge_pb2.WatchDecisionsResponse(decision=to_decision(publication)))
                 await asyncio.sleep(_WATCH_S)
 
     async def ResetField(

@@ -159,7 +159,7 @@ class Ingest:
     async def _push(self, _: object, context: grpc.aio.ServicerContext) -> None:
         async with self.streams.open(context) as stream:
             while (message := await context.read()) is not grpc.aio.EOF:
-                await context.write(self.take(message, stream))
+                await stream.write(self.take(message, stream))
 
     def take(self, message: bytes | pb.PushRequest, stream: ServedCall | None = None) -> pb.PushResponse:
         """Check and buffer one frame, which came on ``stream``, and enter it in the ledger; the response says

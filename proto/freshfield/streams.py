@@ -17,6 +17,9 @@ from freshfield.access import caller
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 
+# How long a call that is to end waits for the client to take the answer under way.
+_TAKEN_S = 0.5
+
 
 async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> health.aio.HealthServicer:
     """Add health checks, which say that ``services`` are served, and reflection of them. Before the start."""
@@ -39,11 +42,27 @@ class ServedCall:
         self.open = True
         self._context = context
         self._status: tuple[grpc.StatusCode, str] | None = None
+        self._writing = False
 
     def end(self, code: grpc.StatusCode, why: str) -> None:
-        """The client is given ``code`` and ``why``."""
+        """The client is given ``code`` and ``why``, unless it leaves an answer untaken for _TAKEN_S."""
         self._status = code, why
-        self.task.cancel()
+        if self._writing:
+            asyncio.get_running_loop().call_later(_TAKEN_S, self._cancel)
+        else:
+            self.task.cancel()
+
+    async def write(self, answer: Any) -> None:
+        """Send an answer. A call that ends in the midst of it could not say why: ``end`` waits for it."""
+        self._writing = True
+        await self._context.write(answer)
+        self._writing = False
+        if self._status is not None:
+            raise asyncio.CancelledError
+
+    def _cancel(self) -> None:
+        if self.open:
+            self.task.cancel()
 
     async def __aenter__(self) -> ServedCall:
         return self
@@ -52,7 +71,7 @@ class ServedCall:
         self.open = False
         if self._status is not None and kind is asyncio.CancelledError:
             self.task.uncancel()
-            # In the midst of an answer that the client does not take, gRPC has no way to say why it ends.
+            # An answer that the client does not take leaves gRPC no way to say why the call ends.
             with contextlib.suppress(grpc.aio.InternalError):
                 await self._context.abort(*self._status)
 

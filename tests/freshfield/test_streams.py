@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 import grpc
 import grpc.aio
@@ -26,9 +26,19 @@ async def echoing(streams: OpenStreams):
             while (message := await context.read()) is not grpc.aio.EOF:
                 if message == b"use":
                     streams.use(call)
-                await context.write(message)
+                await call.write(message)
 
-    handler = {"Echo": grpc.stream_stream_rpc_method_handler(answer)}
+    async def pour(_, context):
+        async with streams.open(context) as call:
+            while True:
+                for _ in range(5):
+                    await call.write(bytes(2000))
+                await asyncio.sleep(0.002)
+
+    handler = {
+        "Echo": grpc.stream_stream_rpc_method_handler(answer),
+        "Pour": grpc.unary_stream_rpc_method_handler(pour),
+    }
     server = Transport().aio_server()
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t", handler),))
     port = Transport().bind(server, "127.0.0.1:0")
@@ -47,12 +57,35 @@ async def opened(channel, say: bytes | None = None):
     return call
 
 
+async def poured(channel) -> grpc.StatusCode:
+    """Takes what is poured; the status at the end."""
+    call = channel.unary_stream("/t/Pour")(b"")
+    with suppress(grpc.RpcError):
+        async for _ in call:
+            pass
+    return await call.code()
+
+
 def run(scene):
     async def limited():
         async with asyncio.timeout(30):
             await scene()
 
     asyncio.run(limited())
+
+
+def test_a_stream_that_ends_in_the_midst_of_an_answer_is_told_why():
+    async def scene():
+        async with echoing(OpenStreams(8)) as channel:
+            calls = [asyncio.create_task(poured(channel)) for _ in range(200)]
+            while sum(not call.done() for call in calls) > 8:
+                await asyncio.sleep(0.02)
+            ended = [call.result() for call in calls if call.done()]
+            assert ended == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
+            for call in calls:
+                call.cancel()
+
+    run(scene)
 
 
 def test_silent_streams_shut_nobody_out():
