@@ -40,6 +40,7 @@ SCENARIO = "scan"
 SPACING_M = 0.0015  # between points of the truth
 ABOVE_M = 0.015  # where a box by hand begins, above the lower end of the scene's bounds
 _WHOLE, _BY_HAND, _TRUE = "whole images", "whole images, mesh cut to a box by hand", "true masks"
+WAYS: tuple[str, ...] = (_WHOLE, "box", "grabcut", "detector", _TRUE)
 
 Mask = NDArray[np.bool_]
 
@@ -66,7 +67,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     truth = surface_truth(Scan(scene, tuple(views)), SPACING_M)
     load_meter = LoadMeter()
     rows: dict[str, Any] = {}
-    for way in (_WHOLE, "box", "grabcut", "detector", _TRUE):
+    for way in WAYS:
         given, facts = _cut(way, views, masks, edge)
         # Whole images go on beyond the tile: their field has no known end.
         field, began = make_field(edge.field, {} if way == _WHOLE else edge.field_options, seed=0), _now()

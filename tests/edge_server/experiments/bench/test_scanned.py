@@ -7,10 +7,12 @@ import json
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.experiments.bench import scanned
 
 
 @pytest.mark.slow
-def test_masks_leave_the_tile_alone(tmp_path, capsys):
+def test_masks_leave_the_tile_alone(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(scanned, "WAYS", ("whole images", "detector", "true masks"))
     for module in ("skimage", "onnxruntime", "onnx"):
         pytest.importorskip(module, reason=f"{module} is not installed (extras surface, embed)")
     assert edge_server(["bench", "scanned", "--quick", "--json", str(tmp_path / "s.json")]) == 0
