@@ -408,8 +408,7 @@ def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
     field.fit([knocked, *now], Budget(steps=2))
     assert not field.layered
     shown = field.render(HELD.camera_to_world, HELD.intrinsics).color
-    # 0.9 dB on one kind of processor, 1.15 on another, whose last bits differ.
-    assert psnr(shown[~body], still.image[~body] / 255.0) > before_db - 1.5
+    assert psnr(shown[~body], still.image[~body] / 255.0) > before_db - 1.0
 
 
 def _small(camera: int, frame: int) -> View:
