@@ -277,13 +277,21 @@ def test_a_slow_processor_makes_it_older_but_not_worse_than_standing_still() -> 
 
 
 def test_motion_is_solved_again_where_it_was_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mostly once where all stands, twice where a ball goes around, and more often after a teleport."""
     solve, passes = Motion.solve, list[int]()
     monkeypatch.setattr(Motion, "solve", lambda self, rows: passes.append(1) or solve(self, rows))
-    for case, least, most in ((CASES["a stop"], 1.0, 1.4), (CASES["a teleport"], 1.6, 3.0)):
-        stage = _begun(_walk, True).going_on_as(case)
+
+    def passes_a_frame(stage: Stage, until_s: float) -> float:
         before, passes[:] = stage.frames, []
-        stage.run(0.8, score=False)
-        assert least <= len(passes) / (stage.frames - before) <= most
+        stage.run(until_s, score=False)
+        return len(passes) / (stage.frames - before)
+
+    stopped = _begun(_walk, True).going_on_as(CASES["a stop"])
+    stopped.run(0.8, score=False)
+    assert passes_a_frame(stopped, 2.0) <= 1.4
+    around = _begun(_walk, True).going_on_as(Case())
+    assert 1.6 <= passes_a_frame(around, 0.8) <= 2.4
+    assert 2.4 < passes_a_frame(_begun(_walk, True).going_on_as(CASES["a teleport"]), 0.4) <= 3.0
 
 
 @pytest.mark.slow

@@ -392,23 +392,32 @@ def test_a_fit_without_a_step_says_why() -> None:
 
 
 def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
-    field = LayeredField(SMALL)
-    field.load_state(_moving().state())
-    still = replace(HELD, image=picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(0.0, False)))
-    pose = CAMERAS[0].camera_to_world.copy()
-    pose[:3, 3] += 0.02
+    """The ball is seeded anew, over its surroundings too: these are left out. One seed differs from the next,
+    and one processor from another, by half a decibel."""
+    still = picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(0.0, False))
     at_s = 43 * FRAME_S
     now = [_frame(k, 43, True) for k in range(1, len(CAMERAS))]
+    pose = CAMERAS[0].camera_to_world.copy()
+    pose[:3, 3] += 0.02
     image = picture(CAMERAS[0].intrinsics, pose, _ball_m(at_s, True))
     knocked = replace(CAMERAS[0], camera_to_world=pose, image=image, generated_ns=round(at_s * 1e9))
     truth = picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(at_s, True))
-    body = (truth != still.image).any(axis=-1)
-    before = field.render(HELD.camera_to_world, HELD.intrinsics).color
-    before_db = psnr(before[~body], still.image[~body] / 255.0)
-    field.fit([knocked, *now], Budget(steps=2))
-    assert not field.layered
-    shown = field.render(HELD.camera_to_world, HELD.intrinsics).color
-    assert psnr(shown[~body], still.image[~body] / 255.0) > before_db - 1.0
+    body = (truth != still).any(axis=-1).astype(np.uint8)
+    scene = cv2.dilate(body, np.ones((9, 9), np.uint8)) == 0
+
+    def score(field: LayeredField) -> float:
+        color = field.render(HELD.camera_to_world, HELD.intrinsics).color
+        return psnr(color[scene], still[scene] / 255.0)
+
+    lost_db = []
+    for seed in range(3):
+        field = LayeredField(replace(SMALL, seed=seed))
+        _run(field, range(42))
+        before_db = score(field)
+        field.fit([knocked, *now], Budget(steps=2))
+        assert not field.layered
+        lost_db.append(before_db - score(field))
+    assert np.median(lost_db) < 1.0, lost_db
 
 
 def _small(camera: int, frame: int) -> View:
