@@ -100,6 +100,13 @@ Over TLS as many more may be in their handshake, of which a new one ends the old
 TLS_HANDSHAKE_TIMEOUT_S = 5.0
 """Of a connection to the page or to gRPC: without a handshake it ends."""
 
+MAX_GRPC_CONNECTIONS = 512
+"""To one port, those in their handshake included; more are closed at once. A process may usually have 1,024
+files open, and a run needs some for itself. A node has one for all its cameras."""
+
+GRPC_IDLE_S = 60.0
+"""Of a connection to gRPC: without a call it ends, and its place is free. Clients connect again by themselves."""
+
 MAX_QUEUED_BYTES = 256 * 2**20
 """Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""
 

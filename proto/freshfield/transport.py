@@ -21,7 +21,9 @@ import numpy as np
 
 from freshfield.access import Access, is_loopback
 from freshfield.limits import (
+    GRPC_IDLE_S,
     MAX_CONCURRENT_STREAMS,
+    MAX_GRPC_CONNECTIONS,
     MAX_MESSAGE_BYTES,
     MAX_PEER_TEXT_CHARS,
     TLS_HANDSHAKE_TIMEOUT_S,
@@ -57,6 +59,8 @@ SERVER_OPTIONS = [
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
     ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
     ("grpc.server_handshake_timeout_ms", round(TLS_HANDSHAKE_TIMEOUT_S * 1e3)),
+    ("grpc.max_allowed_incoming_connections", MAX_GRPC_CONNECTIONS),
+    ("grpc.max_connection_idle_ms", round(GRPC_IDLE_S * 1e3)),
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),
 ]

@@ -230,6 +230,29 @@ def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
     asyncio.run(scene())
 
 
+def test_connections_are_few_and_those_that_do_nothing_end(pem, monkeypatch):
+    changed = {"grpc.max_allowed_incoming_connections": 4, "grpc.max_connection_idle_ms": 1000}
+    fewer = [(name, changed.get(name, value)) for name, value in transport.SERVER_OPTIONS]
+    monkeypatch.setattr(transport, "SERVER_OPTIONS", fewer)
+
+    async def ended(reader):
+        while await reader.read(4096):
+            pass
+
+    async def scene():
+        async with serving(Transport()) as port:
+            kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
+            await asyncio.gather(*(reader.readexactly(1) for reader, _ in kept))  # they are served
+            surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
+            assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
+            await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
+            assert await ask(Transport(), port) == 42
+            for _, writer in kept + surplus:
+                writer.close()
+
+    asyncio.run(scene())
+
+
 LISTENING = {
     "an authority alone": (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
     "a token without a name": (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
