@@ -327,22 +327,22 @@ def verdicts() -> str:
 
 
 def figures() -> str:
-    """A paragraph for each study: how it was run, and each claim with its verdicts and intervals."""
+    """A section for each study: how it was run, and a table of its claims, verdicts and intervals."""
     names = [study["study"] for study in studies()]
     parts = []
     for study in studies():
         name = study["study"]
         seeds = f", {study['seeds']} seeds a point" if study["seeds"] else ""
         field = ", ".join(f"`{f}`" for f in study["field"])
-        claims: dict[str, dict[str, list[str]]] = {}
+        claims: dict[str, list[list[str]]] = {}
         for v in study["verdicts"]:
             known = v["interval"] and v["interval"][0] is not None
-            span = f" {_interval(v['interval'], 2 if abs(v['interval'][0]) >= 0.1 else 4)}" if known else ""
-            claims.setdefault(v["claim"], {}).setdefault(v["verdict"], []).append(v["about"] + span)
-        lines = []
-        for claim, found in claims.items():
-            answers = (f"**{verdict}**: {'; '.join(where)}" for verdict, where in found.items())
-            lines.append(f"- {claim[0].upper()}{claim[1:]} {'. '.join(answers)}.")
+            row = [v["about"], v["verdict"], _short_interval(v["interval"]) if known else ""]
+            claims.setdefault(v["claim"], []).append(row)
+        rows = [
+            [f"{claim[0].upper()}{claim[1:].rstrip('.')}" if k == 0 else "", *row]
+            for claim, found in claims.items() for k, row in enumerate(found)
+        ]  # fmt: skip
         longer = tuple(n for n in names if n != name and n.startswith(name))
         drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
                  if not (longer and p.name.startswith(longer))]  # fmt: skip
@@ -353,11 +353,20 @@ def figures() -> str:
             f"`{study['command']}`: {'quick pass' if study['quick'] else 'full run'}{seeds}"
             f"{', ' if field else ''}{field}, commit {study['commit']}. "
             f"[Rows]({name}.csv), [verdicts and means]({name}.json){more}.\n",
-            *lines,
+            table(["claim", "where", "verdict", "difference"], rows),
             *(f"\n![{study['title']}]({p})" for p in drawn[:1]),
             "",
         ]
     return "\n".join(parts).rstrip()
+
+
+def _short_interval(values: Sequence[float]) -> str:
+    """Mean and interval with the decimals that they call for; 0 where all are 0."""
+    if not any(values):
+        return "0"
+    scale = max(values[2] - values[1], abs(values[0]) / 10, 1e-3)
+    digits = max(0, min(3, 1 - math.floor(math.log10(scale))))
+    return _interval([round(v, digits) + 0.0 for v in values], digits)  # + 0.0: no -0.00
 
 
 def _interval(values: Sequence[float | None], digits: int = 2) -> str:
