@@ -148,9 +148,19 @@ def _finite(field: Any) -> None:
     assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
 
 
-@pytest.mark.parametrize("updates", [1, pytest.param(10, marks=pytest.mark.slow)])
 @each_with(PICTURES + POSES, soon=[_noise, _a_metre_off])
-def test_a_poisoned_view_is_survived(name: str, poison: Poison, updates: int) -> None:
+def test_a_poisoned_view_is_survived(name: str, poison: Poison) -> None:
+    _survives(name, poison, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poison", PICTURES + POSES)
+@pytest.mark.parametrize("name", ["splat", "voxel"])
+def test_a_view_that_stays_poisoned_is_survived(name: str, poison: Poison) -> None:
+    _survives(name, poison, 10)
+
+
+def _survives(name: str, poison: Poison, updates: int) -> None:
     deployment = _deployment(name)
     deployment.update(updates, poison)
     deployment.update(AFTER)

@@ -164,7 +164,7 @@ def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
     for process in others:
         process.start()
     try:
-        for _ in range(100):
+        for _ in range(60):
             began = time.perf_counter()
             selection = updates.select(updates.plan(10), 10)
             budget = budgets.next()
@@ -177,4 +177,4 @@ def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
         stop.set()
         for process in others:
             process.join()
-    assert met >= 95
+    assert met >= 0.95 * 60

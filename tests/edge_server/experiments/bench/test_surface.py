@@ -9,6 +9,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import surface
 from edge_server.experiments.bench.surface import Workload
+from edge_server.experiments.scenes.tile_scan import RASTER_M, scan
 
 
 @pytest.mark.slow
@@ -16,6 +17,7 @@ def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     monkeypatch.setattr(surface, "QUICK", Workload(40, (2.0,), (8.0,), ("splat",), (24,)))
     monkeypatch.setattr(surface, "CELL_STEPS", 20)
+    monkeypatch.setattr(surface, "scan", lambda size: scan(size, RASTER_M[4:8]))  # 20 of 60 views
     words = ["bench", "surface", "--quick", "--json", str(tmp_path / "s.json")]
     assert edge_server(words) == 0
     found = json.loads((tmp_path / "s.json").read_text())["surface"]
