@@ -132,36 +132,27 @@ class _Propagator:
         self.p_slow = np.array([[first, a], [b, second]]) / (2 * self.root)
         self.p_fast = np.array([[second, -a], [-b, first]]) / (2 * self.root)
 
-    def steps(self, span_ms: Array) -> Array:
-        """exp(G u) (N, 2, 2) of the spans u (N,)."""
-        slow, apart = np.exp(self.slow * span_ms), -np.expm1(-2 * self.root * span_ms)
-        fast = np.exp(self.fast * span_ms)
-        out = np.empty((len(span_ms), 2, 2))
-        for i in range(2):
-            out[:, i, i] = slow * self.p_slow[i, i] + fast * self.p_fast[i, i]
-            out[:, i, 1 - i] = slow * apart * self.p_slow[i, 1 - i]
-        return out
-
 
 def _propagators(model: TwoStateModel, line: Timeline) -> Array:
-    steps = np.empty((len(line.span_ms), 2, 2))
-    for waiting in np.unique(line.waiting):
-        chosen = line.waiting == waiting
-        steps[chosen] = _Propagator(model, int(waiting)).steps(line.span_ms[chosen])
-    return steps
+    """exp(G u) (N, 2, 2) of every span."""
+    from channel_emu.estimate import hmm_kernels
+
+    of = [_Propagator(model, waiting) for waiting in range(int(line.waiting.max(initial=0)) + 1)]
+    return hmm_kernels.propagate(
+        np.array([(p.slow, p.fast, p.root) for p in of]), np.array([p.p_slow for p in of]),
+        np.array([p.p_fast for p in of]), line.span_ms, line.waiting,
+    )  # fmt: skip
 
 
 def _emissions(model: TwoStateModel, line: Timeline) -> tuple[Array, float]:
     """Likelihood (N, 2) of each event by state, each row scaled to a largest of 1, and the log of the
     scales' product."""
-    logs = np.zeros((len(line.span_ms), 2))
-    if model.mean_ms is not None:
-        has_delay = ~np.isnan(line.delay_ms)
-        logs[has_delay] -= np.log(model.mean_ms) + line.delay_ms[has_delay, None] / model.mean_ms
-    if model.rate_per_ms is not None:
-        logs[line.arrived] += np.log(model.rate_per_ms)
-    scale = logs.max(1)
-    return np.exp(logs - scale[:, None]), float(scale.sum())
+    from channel_emu.estimate import hmm_kernels
+
+    none = np.full(2, np.nan)
+    means = none if model.mean_ms is None else model.mean_ms
+    rates = none if model.rate_per_ms is None else model.rate_per_ms
+    return hmm_kernels.emit(means, rates, line.delay_ms, line.arrived)
 
 
 _UNIFORM = np.array([0.5, 0.5])

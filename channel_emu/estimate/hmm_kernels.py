@@ -1,4 +1,4 @@
-"""Forward and backward recursions of ``hmm``."""
+"""Likelihoods of spans and events, and the forward and backward recursions of ``hmm``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,44 @@ import math
 
 import numpy as np
 from numba import njit
+
+
+@njit(cache=True)
+def propagate(eigenvalues, p_slow, p_fast, span_ms, waiting):
+    """exp(G u) (N, 2, 2) of spans u (N,), for the G of as many cameras as wait (N,).
+
+    eigenvalues (W, 3): slow, fast, half of their distance; p_slow, p_fast (W, 2, 2): see ``hmm._Propagator``.
+    """
+    out = np.empty((len(span_ms), 2, 2))
+    for k in range(len(span_ms)):
+        w, u = waiting[k], span_ms[k]
+        slow, fast = math.exp(eigenvalues[w, 0] * u), math.exp(eigenvalues[w, 1] * u)
+        apart = -math.expm1(-2.0 * eigenvalues[w, 2] * u)
+        for i in range(2):
+            out[k, i, i] = slow * p_slow[w, i, i] + fast * p_fast[w, i, i]
+            out[k, i, 1 - i] = slow * apart * p_slow[w, i, 1 - i]
+    return out
+
+
+@njit(cache=True)
+def emit(mean_ms, rate_per_ms, delay_ms, arrived):
+    """Likelihood (N, 2) of each event by state, each row scaled to a largest of 1, and the log of the scales'
+    product. mean_ms, rate_per_ms (2,): NaN where they are not part of the model."""
+    delays, rates = not np.isnan(mean_ms[0]), not np.isnan(rate_per_ms[0])
+    log_mean, log_rate = np.log(mean_ms), np.log(rate_per_ms)
+    out, total = np.empty((len(delay_ms), 2)), 0.0
+    for k in range(len(delay_ms)):
+        a = b = 0.0
+        if delays and not math.isnan(delay_ms[k]):
+            a -= log_mean[0] + delay_ms[k] / mean_ms[0]
+            b -= log_mean[1] + delay_ms[k] / mean_ms[1]
+        if rates and arrived[k]:
+            a += log_rate[0]
+            b += log_rate[1]
+        scale = max(a, b)
+        out[k, 0], out[k, 1] = math.exp(a - scale), math.exp(b - scale)
+        total += scale
+    return out, total
 
 
 @njit(cache=True)

@@ -260,10 +260,16 @@ def line_of(n: int = 60, seed: int = 0) -> Timeline:
     return Timeline(rng.exponential(20.0, n), rng.integers(0, 3, n), arrived, delay)
 
 
+def quiet(span_ms: np.ndarray, waiting: int) -> Timeline:
+    """Spans at whose ends nothing happens."""
+    n = len(span_ms)
+    return Timeline(span_ms, np.full(n, waiting), np.zeros(n, np.bool_), np.full(n, np.nan))
+
+
 def test_without_arrivals_a_step_is_the_chains_transition_matrix() -> None:
     span_ms = np.array([0.0, 1e-9, 0.3, 40.0, 1e5])
     silent = dataclasses.replace(MODEL, rate_per_ms=None)
-    steps = hmm._Propagator(silent, 3).steps(span_ms)
+    steps = hmm._propagators(silent, quiet(span_ms, 3))
     for span, step in zip(span_ms, steps):
         assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-14)
 
@@ -276,7 +282,7 @@ def test_a_step_against_small_time_steps() -> None:
     generator = two_state_generator(*MODEL.leave_per_ms) - 2 * np.diag(rates)
     h = span_ms / parts
     short = np.eye(2) + h * generator + h * h / 2 * generator @ generator
-    step = hmm._Propagator(MODEL, 2).steps(np.array([span_ms]))[0]
+    step = hmm._propagators(MODEL, quiet(np.array([span_ms]), 2))[0]
     assert step == pytest.approx(np.linalg.matrix_power(short, parts), rel=1e-6)
 
 
