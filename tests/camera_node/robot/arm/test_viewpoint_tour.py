@@ -1,4 +1,5 @@
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,11 @@ BASE = base_matrix(ARM)
 MOUNT = load_hand_eyes(CELL, ARM, ["hand"])["hand"].transform
 
 
+@cache
+def cells_tour():
+    return plan_tour(UR3E, BASE, MOUNT, ARM.path)
+
+
 def test_viewpoints_look_at_their_target_from_their_radius():
     path = PathConfig(target_m=(0.1, 0.2, 0.3), radius_m=0.5, elevations_deg=(20.0, 70.0), step_deg=30.0)
     poses = viewpoints(path)
@@ -33,7 +39,7 @@ def test_viewpoints_look_at_their_target_from_their_radius():
 
 
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
-    found = plan_tour(UR3E, BASE, MOUNT, ARM.path)
+    found = cells_tour()
     assert ARM.path.radius_m == 0.34 and found.reached >= 45
     reached = found.reached_by_ring(ARM.path)
     assert sum(reached) == found.reached and min(reached) >= 10
@@ -60,7 +66,7 @@ def rolled(quarters):
 
 def test_what_no_straight_way_leads_to_is_reached_by_way_of_others():
     """All that the arm could stand at without touching anything."""
-    found = plan_tour(UR3E, BASE, MOUNT, ARM.path)
+    found = cells_tour()
     free = set()
     for place, pose in enumerate(viewpoints(ARM.path)):
         goals = [np.linalg.inv(BASE) @ pose @ rolled(turn) @ np.linalg.inv(MOUNT) for turn in (0, 1, 2, 3)]
@@ -86,7 +92,7 @@ def test_a_way_is_the_shortest_of_those_that_are_free():
 
 
 def test_the_tour_begins_where_it_can_be_begun():
-    free = plan_tour(UR3E, BASE, MOUNT, ARM.path).stops[0]
+    free = cells_tour().stops[0]
     again = plan_tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]
     assert np.allclose(again, free, atol=1e-9)
 
@@ -192,7 +198,7 @@ def test_reachable_viewpoints_are_those_with_a_free_posture():
     """Every stop of a tour is reachable; what lies beyond the arm, or in the floor, is not."""
     poses = viewpoints(ARM.path)
     found = reachable(UR3E, BASE, MOUNT, ARM.path, poses)
-    assert found[plan_tour(UR3E, BASE, MOUNT, ARM.path).places].all()
+    assert found[cells_tour().places].all()
     far = [pose.copy() for pose in poses[:3]]
     for pose, z_m in zip(far, (2.0, -0.2, 0.02)):
         pose[2, 3] = z_m

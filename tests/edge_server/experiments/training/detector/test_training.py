@@ -197,13 +197,9 @@ def test_the_mask_loss_is_that_of_the_pixels_in_and_near_the_box():
 
 
 @pytest.mark.slow
-def test_it_learns_masks_and_repeats_bit_for_bit(tmp_path):
-    pictures = discs(2 * BATCH)
+def test_it_learns_masks(tmp_path):
     settings = dataclasses.replace(SETTINGS, epochs=30, subject="tile")
-    model, log = train(pictures, settings, tmp_path / "a.pt")
-    again, _ = train(pictures, settings, tmp_path / "b.pt")
-    for key, value in model.state_dict().items():
-        assert torch.equal(value, again.state_dict()[key]), key
+    _, log = train(discs(2 * BATCH), settings, tmp_path / "a.pt")
     assert log[-1]["mask_loss"] < 0.5 * log[0]["mask_loss"]
 
 
