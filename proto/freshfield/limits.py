@@ -105,7 +105,7 @@ MAX_GRPC_CONNECTIONS = 512
 files open, and a run needs some for itself. A node has one for all its cameras."""
 
 GRPC_IDLE_S = 60.0
-"""Of a connection to gRPC: without a call it ends, and its place is free. Clients connect again by themselves."""
+"""Of a connection to gRPC: without a call it ends, and its place is free. Clients connect again."""
 
 MAX_QUEUED_BYTES = 256 * 2**20
 """Of all frames inside the emulator's links: 2.5 s of a thousand cameras of 100 kB a second."""
