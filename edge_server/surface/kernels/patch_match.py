@@ -21,7 +21,7 @@ from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 
 SOURCES = 5  # images that a pixel is compared with
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
-REACH = 3  # pixels from the middle of a patch to its farthest tap
+PATCH_PX = 3  # from the middle of a patch to its farthest tap
 SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so patches end at edges
 FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
 NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
@@ -147,7 +147,7 @@ def choose_sources(counter, worker, images, view, planes, visible):
                 x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
                 for s in range(images.first.size - 1):
                     u, v = _project(images, s, x, y, z)
-                    if s == k or not _within(images, s, u, v, REACH):
+                    if s == k or not _within(images, s, u, v, PATCH_PX):
                         continue
                     ex, ey, ez, far = _to(images, s, x, y, z)
                     cosine = min(1.0, max(-1.0, (ex * rx + ey * ry + ez * rz) / far))
@@ -174,9 +174,9 @@ def choose_sources(counter, worker, images, view, planes, visible):
 def _pattern(across, down, fade):
     """Write the taps' offsets, pixels, and weights by distance, float32 (LANES,) each."""
     t = 0
-    for j in range(-REACH, REACH + 1):
-        for i in range(-REACH, REACH + 1):
-            if (abs(i) < REACH and abs(j) < REACH) or i == 0 or j == 0:
+    for j in range(-PATCH_PX, PATCH_PX + 1):
+        for i in range(-PATCH_PX, PATCH_PX + 1):
+            if (abs(i) < PATCH_PX and abs(j) < PATCH_PX) or i == 0 or j == 0:
                 across[t], down[t] = i, j
                 fade[t] = np.exp(-FADE * (i * i + j * j))
                 t += 1
@@ -238,7 +238,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         ur, vr = _project(images, s, ax, ay, az)
         ud, vd = _project(images, s, bx, by, bz)
         ux, vx, uy, vy = right * (ur - u), right * (vr - v), below * (ud - u), below * (vd - v)
-        margin = 1.0 + REACH * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
+        margin = 1.0 + PATCH_PX * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
         if not _within(images, s, u, v, margin):
             continue
         u0, v0 = np.float32(u - 0.5), np.float32(v - 0.5)
@@ -402,11 +402,11 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                     small = 0.25 if trial >= 12 + search.wide else 1.0
                     kind = -1 if wide else (trial - search.wide) % 3  # 0: depth, 1: normal, 2: both
                     if kind != 1:
-                        part = 2.0 * np.float64(uniform(key, n)) - 1.0
+                        drawn = 2.0 * np.float64(uniform(key, n)) - 1.0
                         qd = (
-                            middle * (1.0 + search.reach * part)
+                            middle * (1.0 + search.reach * drawn)
                             if wide
-                            else d * (1.0 + small * search.share * part)
+                            else d * (1.0 + small * search.share * drawn)
                         )
                     if kind != 0:
                         turn = 1.0 if wide else small * search.turn
