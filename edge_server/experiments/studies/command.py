@@ -138,7 +138,7 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
             raise StudyError(f"--scene: {error}") from None
         if scene != found.path.stem and scene not in SCENARIOS:
             raise StudyError(f"--scene {scene}: expected the name of a shipped scenario")
-        if {"arm", "host"} & set(found.source):
+        if {"arm", "host"} & set(found.source) and not set(names) <= set(CAPTURING):
             raise StudyError(f"--scene {scene}: its camera moves, which studies do not simulate")
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")

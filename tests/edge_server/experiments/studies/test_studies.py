@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.studies import command
 from edge_server.experiments.studies.age import omega, trade_map
 from edge_server.experiments.studies.command import CAPTURING, LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
@@ -258,6 +259,7 @@ def test_a_table_selects_by_labels():
     [
         (["mat", "--seeds", "0"], "--seeds"),
         (["mat", "--scene", "moon"], "moon"),
+        (["mat", "--scene", "cell"], "its camera moves"),
         (["mat", "--jobs", "0"], "--jobs"),
         (["ppo-wait", "--scene", "tower"], "scenes of their own"),
         (["learning", "--ray", "local"], "scenes of their own"),
@@ -267,6 +269,10 @@ def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, c
     assert main([*words, "--quick", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert why in error and error.count("\n") == 1
+
+
+def test_captures_are_planned_for_a_camera_that_an_arm_carries(tmp_path: Path):
+    assert command._checked(["viewpoints"], request(tmp_path, scenes=("cell",)), None) == ["viewpoints"]
 
 
 def test_metrics_runs_whole(tmp_path: Path, capsys):
