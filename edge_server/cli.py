@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ from freshfield.transport import TransportError
 
 if TYPE_CHECKING:
     from edge_server.config import EdgeConfig, LearnConfig
+    from edge_server.live.server import OpenPage, ServerOptions
+    from edge_server.live.state import EdgeState
 
 DESCRIPTION = """\
 The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
@@ -208,8 +211,18 @@ def _run(args: argparse.Namespace) -> int:
         timer = threading.Timer(args.seconds, server.stop)
         timer.daemon = True
         timer.start()
-    server.run()
+    server.run(None if options.page_port is None else partial(_open_page, options))
     return 0
+
+
+def _open_page(options: ServerOptions, state: EdgeState) -> OpenPage:
+    from edge_server.page import PageError, start_page  # the viewer is imported only where there is a page
+
+    assert options.page_port is not None
+    try:
+        return start_page(state, options.page_host, options.page_port, options.transport)
+    except PageError as error:
+        raise TransportError(f"page: {error}") from None
 
 
 def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:

@@ -29,11 +29,8 @@ FORBIDDEN = {
         f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf", "voxel")
     ),
     "edge_server.embed": ("edge_server.live", "edge_server.fields", "edge_server.page", "edge_server.report"),
-    # The buffer comes before the scheduler, whose state is read from its frames.
-    "edge_server.scheduler": (
-        "edge_server.live.loop", "edge_server.live.server", "edge_server.live.state",
-        "edge_server.live.ingest", "edge_server.page", "edge_server.report",
-    ),
+    "edge_server.scheduler": ("edge_server.live", "edge_server.page", "edge_server.report"),
+    "edge_server.live": ("edge_server.page", "edge_server.report"),
     "edge_server.fidelity": ("edge_server.live", "edge_server.page"),
     "edge_server.report": ("edge_server.live", "edge_server.page"),
     "edge_server.viewpoints": (

@@ -9,24 +9,11 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from freshfield.frame import Frame
+from freshfield.frame import BufferedFrame, Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 
 MOST_UNSELECTED = 8  # frames of a camera that wait for a field that wants every frame
-
-
-@dataclass(frozen=True)
-class BufferedFrame:
-    """A frame in the buffer. generated_ns is on the edge's clock (the node's offset added)."""
-
-    frame: Frame
-    generated_ns: int
-    received_ns: int
-
-    def age_ms(self, now_ns: int) -> float:
-        return (now_ns - self.generated_ns) / 1e6
 
 
 class FrameBuffer:

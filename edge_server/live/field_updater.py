@@ -15,10 +15,11 @@ import numpy as np
 
 from edge_server.config import EdgeConfig, embedding_for, open_embedder
 from edge_server.fields import Budget, Field, FitReport, View
-from edge_server.live.buffer import BufferedFrame, FrameBuffer
+from edge_server.live.buffer import FrameBuffer
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
+from freshfield.frame import BufferedFrame
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it

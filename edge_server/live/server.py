@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -40,7 +41,7 @@ from freshfield.files import ReplacedJson, write_json
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.transport import Transport, TransportError, host_port
+from freshfield.transport import Transport, host_port
 from freshfield.untrusted import stored_bytes
 
 if TYPE_CHECKING:  # imported at run time only where a run is recorded
@@ -52,6 +53,16 @@ _STATUS_PERIOD_S = 0.5
 _AGES_PERIOD_S = 0.2
 _SNAPSHOT_TIMEOUT_S = 30.0
 _UPDATE_TIMES = 4096  # of which percentiles are shown
+
+
+class OpenPage(Protocol):
+    """The live page, being served. url: its address on this machine."""
+
+    url: str
+
+    def stop(self) -> None:
+        """Serve it no longer."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -179,9 +190,10 @@ class EdgeServer:
 
     # --- running ----------------------------------------------------------------------------------
 
-    def run(self) -> None:
-        """Serve until stopped, then write everything down. Raises what ended the update loop, if it
-        failed; TransportError if a port would be open to others."""
+    def run(self, open_page: Callable[[EdgeState], OpenPage] | None = None) -> None:
+        """Serve until stopped, then write everything down. open_page: shows the state to visitors; None: no
+        page. Raises what ended the update loop, if it failed; TransportError if a port would be open to
+        others."""
         self.state.warnings = self._warnings()
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
@@ -189,16 +201,8 @@ class EdgeServer:
         grpc.start()
         page = None
         try:
-            if self.options.page_port is not None:
-                # The viewer is imported only where there is a page.
-                from edge_server.page import PageError, start_page
-
-                try:
-                    page = start_page(
-                        self.state, self.options.page_host, self.options.page_port, self.options.transport
-                    )
-                except PageError as error:
-                    raise TransportError(f"page: {error}") from None
+            if open_page is not None:
+                page = open_page(self.state)
                 log.info("page: %s", page.url)
             if self.options.metrics_port is not None:
                 from edge_server.live.output.prometheus import serve_metrics

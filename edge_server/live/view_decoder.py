@@ -11,9 +11,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from edge_server.fields import View
-from edge_server.live.buffer import BufferedFrame
 from freshfield import payload
-from freshfield.frame import Frame
+from freshfield.frame import BufferedFrame, Frame
 from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:

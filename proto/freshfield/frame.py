@@ -63,6 +63,18 @@ class Frame:
         return self.generated_ns + self.clock_offset_ns
 
 
+@dataclass(frozen=True)
+class BufferedFrame:
+    """A frame as the edge's buffer has it. generated_ns is on the edge's clock (the node's offset added)."""
+
+    frame: Frame
+    generated_ns: int
+    received_ns: int
+
+    def age_ms(self, now_ns: int) -> float:
+        return (now_ns - self.generated_ns) / 1e6
+
+
 def valid_id(text: str) -> bool:
     """Whether ``text`` may be a camera or session id: 1 to 64 letters, digits, '.', '_', '-'."""
     return _ID.fullmatch(text) is not None

@@ -11,9 +11,9 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.embed.letterbox import GREY, letterbox
-from edge_server.live.buffer import BufferedFrame
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
+from freshfield.frame import BufferedFrame
 from freshfield.geometry import Pinhole
 from tests.edge_server.embed.graphs import CHANNELS, detector
 from tests.edge_server.frames import frame

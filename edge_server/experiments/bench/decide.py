@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.bench.run import BenchRun
-from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler import STATE_PARTS, Epoch
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import Actor
@@ -22,7 +21,7 @@ from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import State, StateLayout
-from freshfield.frame import Frame
+from freshfield.frame import BufferedFrame, Frame
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.machine_load import LoadMeter
 

@@ -23,11 +23,11 @@ from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings
-from edge_server.live.buffer import BufferedFrame
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
 from freshfield.files import write_json
+from freshfield.frame import BufferedFrame
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\

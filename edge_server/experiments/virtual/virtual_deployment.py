@@ -26,13 +26,12 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Snapshot
-from edge_server.live.buffer import BufferedFrame
 from edge_server.live.field_updater import LEAST_TAKEN, FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler.policy import Policy
 from freshfield.clock import VirtualClock
-from freshfield.frame import Frame, FrameRejected, from_request, to_request
+from freshfield.frame import BufferedFrame, Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
 from freshfield.scenario import seed_sequence
 

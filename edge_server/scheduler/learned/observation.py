@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler.learned.state import POSE_WIDTH, State
 from edge_server.scheduler.policy import STATE_PARTS
+from freshfield.frame import BufferedFrame
 from freshfield.geometry import quaternion_normalize
 
 # A rig of one camera, or of several at one point, has no size to scale by.

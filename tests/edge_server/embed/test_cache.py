@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.embed.cache import EmbeddingCache
-from edge_server.live.buffer import BufferedFrame
 from edge_server.live.view_decoder import ViewDecoder
+from freshfield.frame import BufferedFrame
 from tests.edge_server.frames import damaged_frame, frame
 
 DIM = 4

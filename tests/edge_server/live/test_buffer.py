@@ -4,7 +4,8 @@ import threading
 import time
 from collections.abc import Sequence
 
-from edge_server.live.buffer import MOST_UNSELECTED, BufferedFrame, FrameBuffer
+from edge_server.live.buffer import MOST_UNSELECTED, FrameBuffer
+from freshfield.frame import BufferedFrame
 from tests.edge_server.frames import frame
 
 MS = 1_000_000

@@ -36,12 +36,12 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
-from edge_server.live.buffer import BufferedFrame, FrameBuffer
+from edge_server.live.buffer import FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
-from freshfield.frame import Frame
+from freshfield.frame import BufferedFrame, Frame
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:

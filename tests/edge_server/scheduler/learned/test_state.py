@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import StateLayout
+from freshfield.frame import BufferedFrame
 from freshfield.geometry import Pose, look_at, so3_exp
 from tests.edge_server.frames import frame
 from tests.edge_server.scheduler.learned.problems import state
