@@ -17,6 +17,7 @@ from statistics import median
 from typing import Any
 
 DOCS = Path(__file__).parent
+VERDICT_WORDS = ("holds", "does not hold", "undecided")
 FIELDS = {
     "splat": "3D Gaussians",
     "voxel": "voxel grid, no network",
@@ -78,6 +79,8 @@ VERDICTS = (
     ("omega", "room, high traffic, wait-flush, PSNR (dB)", "threshold"),
     ("omega", "room, low traffic, wait, PSNR (dB)", "threshold"),
     ("omega", "room, high traffic, wait, F_w (6.37)", "inside"),
+    ("omega", "room, high traffic, wait-arrived, PSNR (dB)", "arrive"),
+    ("omega", "room, high traffic, wait-arrived, F_w (6.37)", "arrive"),
     ("images", "room, LPIPS", ""),
     ("images", "room, mean age of used views (ms)", ""),
     ("images", "tower, LPIPS", ""),
@@ -327,7 +330,7 @@ def verdicts() -> str:
 
 
 def figures() -> str:
-    """A section for each study: how it was run, and a table of its claims, verdicts and intervals."""
+    """A section for each study: how it was run, how often each claim holds, and folded, where."""
     names = [study["study"] for study in studies()]
     parts = []
     for study in studies():
@@ -339,9 +342,14 @@ def figures() -> str:
             known = v["interval"] and v["interval"][0] is not None
             row = [v["about"], v["verdict"], _short_interval(v["interval"]) if known else ""]
             claims.setdefault(v["claim"], []).append(row)
+        names_of = {claim: f"{claim[0].upper()}{claim[1:].rstrip('.')}" for claim in claims}
         rows = [
-            [f"{claim[0].upper()}{claim[1:].rstrip('.')}" if k == 0 else "", *row]
+            [names_of[claim] if k == 0 else "", *row]
             for claim, found in claims.items() for k, row in enumerate(found)
+        ]  # fmt: skip
+        counts = [
+            [names_of[claim], *(sum(row[1] == word for row in found) or "" for word in VERDICT_WORDS)]
+            for claim, found in claims.items()
         ]  # fmt: skip
         longer = tuple(n for n in names if n != name and n.startswith(name))
         drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
@@ -353,7 +361,10 @@ def figures() -> str:
             f"`{study['command']}`: {'quick pass' if study['quick'] else 'full run'}{seeds}"
             f"{', ' if field else ''}{field}, commit {study['commit']}. "
             f"[Rows]({name}.csv), [verdicts and means]({name}.json){more}.\n",
+            table(["claim", *VERDICT_WORDS], counts),
+            "\n<details><summary>Where, with differences and intervals</summary>\n",
             table(["claim", "where", "verdict", "difference"], rows),
+            "\n</details>",
             *(f"\n![{study['title']}]({p})" for p in drawn[:1]),
             "",
         ]

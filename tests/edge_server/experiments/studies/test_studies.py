@@ -206,6 +206,16 @@ def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
     assert found["room, high traffic, wait, F_w (6.37)"] == "does not hold", "age outweighs all else"
 
 
+@pytest.mark.parametrize(("gain", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
+def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: Path):
+    def rule(trial):
+        return figures(2.0 + gain * (trial.policy == "wait-arrived") + noise(trial.seed, 1.0), 50.0)
+
+    found = [v for v in judged("omega", tmp_path, rule) if "that arrive while it waits" in v.claim]
+    assert {v.verdict for v in found if "F_w" not in v.about} == {said}
+    assert all("wait-arrived" in v.about for v in found) and len(found) == 10
+
+
 def test_images_judges_both_directions(tmp_path: Path):
     for sign, answer in ((1, "holds"), (-1, "does not hold")):
 
