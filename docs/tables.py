@@ -79,8 +79,8 @@ VERDICTS = (
     ("omega", "room, high traffic, wait-flush, PSNR (dB)", "threshold"),
     ("omega", "room, low traffic, wait, PSNR (dB)", "threshold"),
     ("omega", "room, high traffic, wait, F_w (6.37)", "inside"),
-    ("omega", "room, high traffic, wait-arrived, PSNR (dB)", "arrive"),
-    ("omega", "room, high traffic, wait-arrived, F_w (6.37)", "arrive"),
+    ("omega", "room, high traffic, wait-arrived, PSNR (dB)", "arrive meanwhile"),
+    ("omega", "room, high traffic, wait-arrived, F_w (6.37)", "arrive meanwhile"),
     ("images", "room, LPIPS", ""),
     ("images", "room, mean age of used views (ms)", ""),
     ("images", "tower, LPIPS", ""),
@@ -371,13 +371,16 @@ def figures() -> str:
     return "\n".join(parts).rstrip()
 
 
-def _short_interval(values: Sequence[float]) -> str:
-    """Mean and interval with the decimals that they call for; 0 where all are 0."""
+def _short_interval(values: Sequence[float | None]) -> str:
+    """Mean and interval with the decimals that they call for; 0 where all are 0. One seed has no interval."""
+    mean, low, high = values
+    if mean is None or low is None or high is None:
+        return "" if mean is None else f"{mean:.2f}"
     if not any(values):
         return "0"
-    scale = max(values[2] - values[1], abs(values[0]) / 10, 1e-3)
+    scale = max(high - low, abs(mean) / 10, 1e-3)
     digits = max(0, min(3, 1 - math.floor(math.log10(scale))))
-    return _interval([round(v, digits) + 0.0 for v in values], digits)  # + 0.0: no -0.00
+    return _interval([round(v, digits) + 0.0 for v in (mean, low, high)], digits)  # + 0.0: no -0.00
 
 
 def _interval(values: Sequence[float | None], digits: int = 2) -> str:

@@ -21,7 +21,7 @@ from freshfield.transport import TransportError
 
 if TYPE_CHECKING:
     from edge_server.config import EdgeConfig, LearnConfig
-    from edge_server.live.server import OpenPage, ServerOptions
+    from edge_server.live.server import OpenPage
     from edge_server.live.state import EdgeState
 
 DESCRIPTION = """\
@@ -184,13 +184,15 @@ def _run(args: argparse.Namespace) -> int:
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     config = replace(config, learn=_learn(args, config))
+    secure = transport.from_arguments(args)
+    open_page = partial(_open_page, args.page_host, args.page_port, secure)
     options = ServerOptions(
         listen=args.listen,
         out=args.out,
         emulator_out=args.emulator_out,
-        transport=transport.from_arguments(args),
+        transport=secure,
         page_host=args.page_host,
-        page_port=args.page_port,
+        open_page=None if args.page_port is None else open_page,
         metrics_port=args.metrics_port,
         lpips_folder=weights_folder(args.lpips, args.data),
         resume=args.resume,
@@ -211,18 +213,17 @@ def _run(args: argparse.Namespace) -> int:
         timer = threading.Timer(args.seconds, server.stop)
         timer.daemon = True
         timer.start()
-    server.run(None if options.page_port is None else partial(_open_page, options))
+    server.run()
     return 0
 
 
-def _open_page(options: ServerOptions, state: EdgeState) -> OpenPage:
+def _open_page(host: str, port: int, secure: transport.Transport, state: EdgeState) -> OpenPage:
     from edge_server.page import PageError, start_page  # the viewer is imported only where there is a page
 
-    assert options.page_port is not None
     try:
-        return start_page(state, options.page_host, options.page_port, options.transport)
+        return start_page(state, host, port, secure)
     except PageError as error:
-        raise TransportError(f"page: {error}") from None
+        raise TransportError(str(error)) from None
 
 
 def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:

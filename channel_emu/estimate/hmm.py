@@ -137,10 +137,10 @@ def _propagators(model: TwoStateModel, line: Timeline) -> Array:
     """exp(G u) (N, 2, 2) of every span."""
     from channel_emu.estimate import hmm_kernels
 
-    of = [_Propagator(model, waiting) for waiting in range(int(line.waiting.max(initial=0)) + 1)]
+    each = [_Propagator(model, waiting) for waiting in range(int(line.waiting.max(initial=0)) + 1)]
     return hmm_kernels.propagate(
-        np.array([(p.slow, p.fast, p.root) for p in of]), np.array([p.p_slow for p in of]),
-        np.array([p.p_fast for p in of]), line.span_ms, line.waiting,
+        np.array([(p.slow, p.fast, p.root) for p in each]), np.array([p.p_slow for p in each]),
+        np.array([p.p_fast for p in each]), line.span_ms, line.waiting,
     )  # fmt: skip
 
 

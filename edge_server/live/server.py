@@ -70,7 +70,8 @@ class ServerOptions:
     """How one server process runs; the scenario says what it does.
 
     listen: HOST:PORT for frames. out: folder of the run's files. transport: security of connections.
-    page_host, page_port, metrics_port: of the page and of Prometheus metrics; without a port there is none.
+    page_host, metrics_port: where the page and Prometheus metrics listen; without a port there are none.
+    open_page: shows the state to visitors; None: no page.
     lpips_folder: with weights. resume: checkpoint to start from. checkpoint_s: period of writing one.
     record: MCAP file to write the session to. emulator_out: folder with the emulator's status; None: ``out``.
     """
@@ -79,7 +80,7 @@ class ServerOptions:
     out: Path
     transport: Transport = field(default_factory=Transport)
     page_host: str = "127.0.0.1"
-    page_port: int | None = None
+    open_page: Callable[[EdgeState], OpenPage] | None = None
     metrics_port: int | None = None
     lpips_folder: Path | None = None
     resume: Path | None = None
@@ -190,10 +191,9 @@ class EdgeServer:
 
     # --- running ----------------------------------------------------------------------------------
 
-    def run(self, open_page: Callable[[EdgeState], OpenPage] | None = None) -> None:
-        """Serve until stopped, then write everything down. open_page: shows the state to visitors; None: no
-        page. Raises what ended the update loop, if it failed; TransportError if a port would be open to
-        others."""
+    def run(self) -> None:
+        """Serve until stopped, then write everything down. Raises what ended the update loop, if it
+        failed; TransportError if a port would be open to others."""
         self.state.warnings = self._warnings()
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
@@ -201,8 +201,8 @@ class EdgeServer:
         grpc.start()
         page = None
         try:
-            if open_page is not None:
-                page = open_page(self.state)
+            if self.options.open_page is not None:
+                page = self.options.open_page(self.state)
                 log.info("page: %s", page.url)
             if self.options.metrics_port is not None:
                 from edge_server.live.output.prometheus import serve_metrics
@@ -233,7 +233,7 @@ class EdgeServer:
         """What the page says of every port."""
         options = self.options
         ports = [(host_port(options.listen)[0], "gRPC", False)]
-        ports += [(options.page_host, "page", True)] if options.page_port is not None else []
+        ports += [(options.page_host, "page", True)] if options.open_page is not None else []
         ports += [(options.page_host, "metrics", True)] if options.metrics_port is not None else []
         words = [options.transport.guard(host, what, http) for host, what, http in ports]
         return [each for each in words if each]

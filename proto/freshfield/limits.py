@@ -101,8 +101,8 @@ TLS_HANDSHAKE_TIMEOUT_S = 5.0
 """Of a connection to the page or to gRPC: without a handshake it ends."""
 
 MAX_GRPC_CONNECTIONS = 512
-"""To one port, those in their handshake included; more are closed at once. A process may usually have 1,024
-files open, and a run needs some for itself. A node has one for all its cameras."""
+"""To one address, those in their handshake included; more are closed at once. A process may usually have
+1,024 files open, and a run needs some for itself. A node has one for all its cameras."""
 
 GRPC_IDLE_S = 60.0
 """Of a connection to gRPC: without a call it ends, and its place is free. Clients connect again."""

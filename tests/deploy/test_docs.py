@@ -110,6 +110,10 @@ def test_tables_say_what_the_measured_files_say() -> None:
     assert spec is not None and spec.loader is not None
     tables = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tables)
+    kept = {study["study"]: study["verdicts"] for study in tables.studies()}
+    for study, about, word in tables.VERDICTS:
+        found = [v for v in kept.get(study, ()) if v["about"] == about and word in v["claim"]]
+        assert found or study not in kept, f"docs/results/thesis/{study}.json: {about}, {word!r}: no verdict"
     for page in (ROOT / "docs").rglob("*.md"):
         assert tables.renewed(page.read_text()) == page.read_text(), (
             f"{name(page)}: run `python docs/tables.py`"

@@ -230,8 +230,17 @@ def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
     asyncio.run(scene())
 
 
-def test_connections_are_few_and_those_that_do_nothing_end(pem, monkeypatch):
+PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
+
+
+@pytest.mark.parametrize("encrypted", [False, True])
+def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monkeypatch):
+    """Over TLS four in their handshake take all places, and end with its time-out; else four without a call,
+    which have said that they speak HTTP/2."""
     changed = {"grpc.max_allowed_incoming_connections": 4, "grpc.max_connection_idle_ms": 1000}
+    changed |= {"grpc.server_handshake_timeout_ms": 1000 if encrypted else 60_000}
+    tls = Transport(cert=pem / "server.pem", key=pem / "server.key") if encrypted else Transport()
+    caller = Transport(ca=pem / "ca.pem") if encrypted else Transport()
     fewer = [(name, changed.get(name, value)) for name, value in transport.SERVER_OPTIONS]
     monkeypatch.setattr(transport, "SERVER_OPTIONS", fewer)
 
@@ -240,13 +249,17 @@ def test_connections_are_few_and_those_that_do_nothing_end(pem, monkeypatch):
             pass
 
     async def scene():
-        async with serving(Transport()) as port:
+        async with serving(tls) as port:
             kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
-            await asyncio.gather(*(reader.readexactly(1) for reader, _ in kept))  # they are served
+            if not encrypted:
+                for reader, writer in kept:
+                    writer.write(PREFACE)
+                    await reader.readexactly(1)
+            await asyncio.sleep(0.2)
             surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
             assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
             await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
-            assert await ask(Transport(), port) == 42
+            assert await ask(caller, port) == 42
             for _, writer in kept + surplus:
                 writer.close()
 

@@ -84,15 +84,15 @@ POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
 
 
 def each_with(
-    poisons: list[Poison], soon: list[Poison], slowly: tuple[Poison, ...] = (_noise, _in_millimetres)
+    poisons: list[Poison], soon: list[Poison], in_slow_tests: tuple[Poison, ...] = (_noise, _in_millimetres)
 ) -> pytest.MarkDecorator:
     """Every poison with splat and voxel. Networks take ten times as long, and share with voxel what refuses
-    views: they meet ``slowly``, in slow tests. ngp meets ``soon`` besides."""
+    views: they meet ``in_slow_tests`` there, for one update, and ngp meets ``soon`` besides."""
     cases = []
     for name in NAMES:
         for poison in poisons:
             at_once = name in ("splat", "voxel") or (name == "ngp" and poison in soon)
-            if at_once or poison in slowly:
+            if at_once or poison in in_slow_tests:
                 marks = [] if at_once else [pytest.mark.slow]
                 cases.append(pytest.param(name, poison, id=f"{name}-{poison.__name__}", marks=marks))
     return pytest.mark.parametrize(("name", "poison"), cases)
@@ -171,7 +171,7 @@ def _survives(name: str, poison: Poison, updates: int) -> None:
     assert expected > 22.0 and deployment.score() > expected - WITHIN_DB
 
 
-@each_with(PICTURES + POSES, soon=[_in_millimetres], slowly=(_in_millimetres,))
+@each_with(PICTURES + POSES, soon=[_in_millimetres], in_slow_tests=(_in_millimetres,))
 def test_poison_in_the_very_first_update_is_survived(name: str, poison: Poison) -> None:
     """Before anything is known, and where the scene's box is found."""
     deployment = Deployment(field_of(name))

@@ -34,7 +34,7 @@ STUDIES = {
                   "figure 5.8: the best maximum age against the mean delay"),
     "lambda": ("age.age_weight", "Weighing", "equation 5.8: the weight of timeliness"),
     "omega": ("age.omega", "Omega",
-              "figures 6.3, 6.4: threshold and wait, two traffic states, with and without flush"),
+              "figures 6.3, 6.4: threshold and wait in both readings, two traffic states, flush"),
     "images": ("age.image_count", "Images", "figures 6.5, 6.6: LPIPS and age against the number of images"),
     "representations": ("age.representations", "Representations",
                         "figure 6.7: the same trade with other representations"),
@@ -180,7 +180,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--scene",
         metavar="NAME,...",
-        help="shipped scenarios with fixed cameras, as kitchen or dynerf; room: room19 [the study's own]",
+        help="shipped scenarios with fixed cameras, as kitchen or dynerf (viewpoints: cell too); "
+        "room: room19 [the study's own]",
     )
     add("--field", choices=field_names(), default="splat",
         help="representation, where the study names none [%(default)s]")  # fmt: skip

@@ -21,7 +21,7 @@ from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 
 SOURCES = 5  # images that a pixel is compared with
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
-PATCH_PX = 3  # from the middle of a patch to its farthest tap
+PATCH_RADIUS_PX = 3  # from the middle of a patch to its farthest tap
 SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so patches end at edges
 FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
 NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
@@ -147,7 +147,7 @@ def choose_sources(counter, worker, images, view, planes, visible):
                 x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
                 for s in range(images.first.size - 1):
                     u, v = _project(images, s, x, y, z)
-                    if s == k or not _within(images, s, u, v, PATCH_PX):
+                    if s == k or not _within(images, s, u, v, PATCH_RADIUS_PX):
                         continue
                     ex, ey, ez, far = _to(images, s, x, y, z)
                     cosine = min(1.0, max(-1.0, (ex * rx + ey * ry + ez * rz) / far))
@@ -174,9 +174,9 @@ def choose_sources(counter, worker, images, view, planes, visible):
 def _pattern(across, down, fade):
     """Write the taps' offsets, pixels, and weights by distance, float32 (LANES,) each."""
     t = 0
-    for j in range(-PATCH_PX, PATCH_PX + 1):
-        for i in range(-PATCH_PX, PATCH_PX + 1):
-            if (abs(i) < PATCH_PX and abs(j) < PATCH_PX) or i == 0 or j == 0:
+    for j in range(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1):
+        for i in range(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1):
+            if (abs(i) < PATCH_RADIUS_PX and abs(j) < PATCH_RADIUS_PX) or i == 0 or j == 0:
                 across[t], down[t] = i, j
                 fade[t] = np.exp(-FADE * (i * i + j * j))
                 t += 1
@@ -238,7 +238,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         ur, vr = _project(images, s, ax, ay, az)
         ud, vd = _project(images, s, bx, by, bz)
         ux, vx, uy, vy = right * (ur - u), right * (vr - v), below * (ud - u), below * (vd - v)
-        margin = 1.0 + PATCH_PX * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
+        margin = 1.0 + PATCH_RADIUS_PX * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
         if not _within(images, s, u, v, margin):
             continue
         u0, v0 = np.float32(u - 0.5), np.float32(v - 0.5)

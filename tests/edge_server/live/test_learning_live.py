@@ -151,7 +151,7 @@ def test_a_scenario_says_that_its_policy_learns_and_the_command_has_the_last_wor
     learn = {"reward": "set:moving", "fallback": "threshold:200"}
     file = on_disk(tmp_path, policy={"name": f"bandit:{policy.name}"}, learn=learn)
     found = []
-    monkeypatch.setattr(EdgeServer, "run", lambda self, open_page: found.append(self))
+    monkeypatch.setattr(EdgeServer, "run", lambda self: found.append(self))
     monkeypatch.setattr("edge_server.cli.signal.signal", lambda *_: None)  # Ctrl-C is pytest's
     assert main(["run", file, "--out", str(tmp_path / "out"), *words]) == 0
     trainer = found[0].trainer

@@ -331,7 +331,7 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
     made = tiny_scenario(tmp_path)
 
     def server(**options):
-        ports = {"page_host": "0.0.0.0", "page_port": 0, "metrics_port": 0}
+        ports = {"page_host": "0.0.0.0", "open_page": lambda state: pytest.fail("opened"), "metrics_port": 0}
         return EdgeServer(
             made, read_config(made), ServerOptions("0.0.0.0:0", tmp_path / "o", **ports, **options)
         )

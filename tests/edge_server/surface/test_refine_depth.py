@@ -18,7 +18,7 @@ from edge_server.surface.kernels.patch_match import (
     LANES,
     LEVELS,
     NOISE,
-    PATCH_PX,
+    PATCH_RADIUS_PX,
     SIMILAR,
     SOURCES,
     WORST,
@@ -226,8 +226,8 @@ def test_the_cost_is_that_of_plain_numpy(rig):
         images, view, row, column, depth, *normal, across, down, patch, weight, facts, 0.0
     )
     # Every tap's ray meets the plane; the affine approximation is off by a hundredth of a pixel.
-    j, i = np.mgrid[-PATCH_PX : PATCH_PX + 1, -PATCH_PX : PATCH_PX + 1]
-    near = ((abs(i) < PATCH_PX) & (abs(j) < PATCH_PX)) | (i == 0) | (j == 0)
+    j, i = np.mgrid[-PATCH_RADIUS_PX : PATCH_RADIUS_PX + 1, -PATCH_RADIUS_PX : PATCH_RADIUS_PX + 1]
+    near = ((abs(i) < PATCH_RADIUS_PX) & (abs(j) < PATCH_RADIUS_PX)) | (i == 0) | (j == 0)
     i, j = i[near], j[near]
     rays, origin = view.rays, maps[0].camera_to_world[:3, 3]
     reach = depth * (normal @ rays[row, column])

@@ -116,7 +116,7 @@ class Omega(SceneStudy):
         ]
         if policy == "wait-arrived":
             over = _best_against(table, metric, policy, labels, "wait")
-            claim = "frames that arrive while it waits (6.16) serve better than those taken meanwhile (6.5)."
+            claim = "frames that arrive meanwhile (6.16) serve better than those generated meanwhile (6.5)."
             found.append(_is_better(about, claim, over, metric))
         return found
 

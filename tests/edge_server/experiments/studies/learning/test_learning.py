@@ -64,7 +64,7 @@ def small(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, tmp_path: Path, capsys):
-    cases = ("priced",) if name == "ppo-select" else ()  # of five that differ in numbers
+    cases = ("priced",) if name == "ppo-select" else ()  # one of its five
     request = StudyRequest(True, tmp_path, Folders(), seeds=2, cases=cases)
     study = make_study(name)
     assert study.points(request) == []

@@ -197,10 +197,13 @@ def test_the_mask_loss_is_that_of_the_pixels_in_and_near_the_box():
 
 
 @pytest.mark.slow
-def test_it_learns_masks(tmp_path):
+def test_it_learns_masks_and_repeats_bit_for_bit(tmp_path):
     settings = dataclasses.replace(SETTINGS, epochs=30, subject="tile")
     _, log = train(discs(2 * BATCH), settings, tmp_path / "a.pt")
     assert log[-1]["mask_loss"] < 0.5 * log[0]["mask_loss"]
+    short = dataclasses.replace(settings, epochs=2)
+    one, two = (train(discs(BATCH), short, tmp_path / f"{k}.pt")[0].state_dict() for k in "bc")
+    assert all(torch.equal(value, two[key]) for key, value in one.items())
 
 
 @pytest.mark.slow
