@@ -493,6 +493,19 @@ def masks() -> str:
     return table(head, rows)
 
 
+def cell_meshes() -> str:
+    """Meshes from the viewpoints of ``cell`` (``edge-server bench surface --only cell``)."""
+    rows = [
+        [f"{size} x {size}", f"{c['chamfer_mm']:.2f}", f"{100 * c['complete']:.0f} %",
+         f"{100 * c['precise']:.0f} %", f"{c['median_mm']:.2f}",
+         f"{c['exact_chamfer_mm']:.2f} mm, {100 * c['exact_complete']:.0f} %", f"{c['seconds']:.0f}"]
+        for size, c in measured("docs/results/surface.json")["surface"]["cell"].items()
+    ]  # fmt: skip
+    head = ["images", "chamfer, mm (aim 1.5)", "surface within 3 mm (aim 95 %)", "mesh within 3 mm",
+            "median depth error, mm", "with exact depth", "seconds"]  # fmt: skip
+    return table(head, rows)
+
+
 def scanned() -> str:
     """Meshes of the tile on its bench, by what its images were cut with (``edge-server bench scanned``)."""
     run = measured("docs/results/scanned.json")["scanned"]
@@ -546,6 +559,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "verdicts": verdicts,
     "masks": masks,
     "scanned": scanned,
+    "cell-meshes": cell_meshes,
 }
 
 

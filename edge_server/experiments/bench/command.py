@@ -65,7 +65,7 @@ _FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
 # Flags of some parts only.
 _ONLY_OF = {
     "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
-    "only": ("options",), "scene": (*_FOLLOWING, "shown"),
+    "only": ("options", "surface"), "scene": (*_FOLLOWING, "shown"),
     "option": _FOLLOWING, "model": ("embed",),
 }  # fmt: skip
 
@@ -133,7 +133,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
+    add(
+        "--only",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="of options: 'exposure', ...; of surface: 'cell' [all]",
+    )
     add("--model", type=Path, metavar="FILE", help="of embed: a YOLO ONNX [the shipped ones]")
     add("--scene", action="append", default=[], metavar="NAME",
         help=f"of track, drift: {', '.join(_FOLLOWED)} [track: both; drift: room]; of shown: a row of its "

@@ -92,16 +92,23 @@ QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"), (128,))
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{scan: facts, exact: {meshes}, cell: {SIZE: {...}}, cases: {CASE: {fits: [...]}}}. BenchError:
-    scikit-image is missing."""
+    """{cell: {SIZE: {...}}, scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}; the cell alone where
+    ``run.only`` says so. BenchError: scikit-image is missing."""
     try:
         import skimage  # noqa: F401 -- said before minutes of fitting, not after
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
+    if set(run.only) - {"cell"}:
+        raise BenchError(f"--only {', '.join(run.only)}: of surface, only cell can be measured alone")
     workload, store = QUICK if run.quick else FULL, run.store
     names = workload.cases
     if run.fields:
         names = tuple(n for n, (representation, _) in CASES.items() if representation in run.fields)
+    for size in workload.cell_sizes:
+        about_cell = {"size": size, "steps": CELL_STEPS, "defaults": settings_digest(CELL_FIELD, {})}
+        store.get("cell", str(size), settings=about_cell, compute=partial(_cell, size))
+    if "cell" in run.only:
+        return store.results
     close = scan(workload.size)
     truth = surface_truth(close)
     store.results["scan"] = {
@@ -113,9 +120,6 @@ def measure(run: BenchRun) -> dict[str, Any]:
     about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm,
              "depths": list(DEPTHS)}  # fmt: skip
     store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
-    for size in workload.cell_sizes:
-        about_cell = {"size": size, "steps": CELL_STEPS, "defaults": settings_digest(CELL_FIELD, {})}
-        store.get("cell", str(size), settings=about_cell, compute=partial(_cell, size))
     progress = Progress(len(names) * workload.fit_s[-1])
     for name in names:
         case = partial(_case, name, workload, close, exact, truth, progress)
@@ -218,11 +222,10 @@ def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, tr
 
 def table(figures: dict[str, Any]) -> str:
     """Three Markdown tables: depth, meshes, and meshes of the cell."""
-    facts = figures["scan"]
-    about = (
-        f"{facts['views']} images of {facts['size']} x {facts['size']} of `tile` from "
-        f"{facts['distance_m']:g} m. Target: {TARGET}."
-    )
+    about = f"Target: {TARGET}."
+    if facts := figures.get("scan"):
+        size = f"{facts['size']} x {facts['size']}"
+        about = f"{facts['views']} images of {size} of `tile` from {facts['distance_m']:g} m. {about}"
     fits = [(name, fit) for name, case in figures.get("cases", {}).items() for fit in case["fits"]]
     depths = []
     for name, fit in fits:
@@ -264,8 +267,5 @@ def table(figures: dict[str, Any]) -> str:
         "cell at|views|depth, median mm|chamfer mm (exact depth)|accuracy mm (median)|"
         "within 3 mm: surface (exact depth), mesh|seconds"
     )
-    tables = (
-        markdown_table(of_depth.split("|"), depths), markdown_table(of_mesh.split("|"), meshes),
-        markdown_table(of_cell.split("|"), cells),
-    )  # fmt: skip
-    return "\n\n".join((about, *tables))
+    every = ((of_depth, depths), (of_mesh, meshes), (of_cell, cells))
+    return "\n\n".join((about, *(markdown_table(head.split("|"), rows) for head, rows in every if rows)))

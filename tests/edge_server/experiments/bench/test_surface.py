@@ -38,5 +38,7 @@ def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     assert sharpened["chamfer_mm"] < rough["chamfer_mm"]
     assert "| exact |  | exact | tsdf | 8 |" in capsys.readouterr().out
     assert edge_server([*words, "--resume"]) == 0
+    assert edge_server([*words[:-1], str(tmp_path / "cell.json"), "--only", "cell", "--resume"]) == 0
+    assert json.loads((tmp_path / "cell.json").read_text())["surface"].keys() == {"cell"}
     again = json.loads((tmp_path / "s.json").read_text())["surface"]
     assert again["cases"] == found["cases"]
