@@ -151,8 +151,9 @@ def test_views_that_contradict_each_other(name: str) -> None:
     reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
+@pytest.mark.slow
 # The networks share their optimiser and their warm starts.
-@pytest.mark.parametrize("name", ["ngp", "splat", pytest.param("voxel", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ngp", "splat", "voxel"])
 def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)

@@ -263,6 +263,7 @@ def test_the_event_is_seen() -> None:
         assert worst_db < stage.median_db(-SCORED_S, 0.0)[0] - 2.0, name
 
 
+@pytest.mark.slow
 def test_a_slow_processor_makes_it_older_but_not_worse_than_standing_still() -> None:
     """Updates of 67, 133, 200 and 267 ms, from the first frame on."""
     known_db = [_begun(_walk, True).median_db(-SCORED_S, 0.0)[0]]
@@ -331,6 +332,7 @@ def test_ten_kilometres_away_it_is_shown_as_here() -> None:
     assert shown_db[0] > 18.0 and abs(shown_db[1] - shown_db[0]) < 0.5, shown_db
 
 
+@pytest.mark.slow
 def test_two_hundred_cameras_take_bounded_memory_and_time() -> None:
     field, cameras, seconds = LayeredField(SETTINGS), ring(200, 16), []
     tracemalloc.start()

@@ -91,6 +91,7 @@ def test_cameras_in_awkward_places(eye, target):
         assert image.shape == (48, 48, 3)
 
 
+@pytest.mark.slow
 def test_all_effects_at_once_for_a_thousand_frames():
     made = load_effects(EFFECTS, lambda name: np.random.default_rng(2))
     scene = make_scene("room", {"width": 16, "height": 16, "supersample": 1, "speed_m_per_s": 8.0})

@@ -133,6 +133,7 @@ def tiny_sweep(monkeypatch):
     return sweep
 
 
+@pytest.mark.slow
 def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0

@@ -169,6 +169,7 @@ def break_a_part(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(ChaosDeployment, "_do_policy", policy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "broken, seed, says, kind",
     [

@@ -15,6 +15,7 @@ from tests.edge_server.fields.small import HELD, SEEN, same_state
 from tests.edge_server.fields.voxel.small import SMALL
 
 
+@pytest.mark.slow
 def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
     few, others = SEEN[::2], SEEN[1::2]  # few views are soon known by heart
     gains = []

@@ -428,6 +428,7 @@ def _small(camera: int, frame: int) -> View:
     return replace(whole, image=image, intrinsics=whole.intrinsics.halved(1), whole=lambda: whole)
 
 
+@pytest.mark.slow
 def test_frames_taken_in_at_half_their_size_still_give_plates_at_full_resolution() -> None:
     def run(field: Any, frames: range, fine: bool) -> None:
         for frame in frames:
