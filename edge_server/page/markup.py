@@ -75,14 +75,14 @@ def status(s: Summary) -> str:
         f'min-height:1.4em">{escape(s.doing)}</div></div>'
     )
     names = {None: "held-out views", SELECTED: NOTHING_HELD_OUT}
-    on = f"dB on {names.get(s.scored_on, s.scored_on)}"
+    on = escape(f"PSNR on {names.get(s.scored_on, s.scored_on)}")
     tiles = (
-        ("PSNR", number(s.psnr_db, 1), escape(on)),
-        ("updates", str(s.updates), "of the field"),
+        (on, number(s.psnr_db, 1), "dB"),
+        ("updates", str(s.updates), ""),
         ("update", number(s.update_ms), "ms each"),
         ("mean age", number(s.mean_age_ms), "ms", s.mean_age_ms),
         ("worst age", number(s.worst_age_ms), "ms", s.worst_age_ms),
-        ("cameras", f"{s.reporting}/{s.cameras}", "reporting"),
+        ("cameras reporting", f"{s.reporting}/{s.cameras}", ""),
     )
     cells = "".join(_tile(*tile) for tile in tiles)
     grid = "display:grid;grid-template-columns:repeat(3,1fr);gap:.4em;padding:0 .9em .5em"

@@ -26,7 +26,7 @@ def shown(tmp_path_factory):
     try:
         with Browser(page.url, timeout_s=90.0) as browser:
             browser.wait_for_text("PSNR")
-            browser.wait_for_text(" dB on cam04")
+            browser.wait_for_text("PSNR on cam04")
             browser.close_notices()
             yield preview, page, browser
     finally:
