@@ -44,9 +44,9 @@ def draw_metrics(
     lines: (text, labels of the points) of each curve.
     levels: the same of each horizontal line.
     """
-    shown = [m for m in metrics if any(row.get(m) is not None for row in table.rows)]
-    with figure(path, len(shown), height_inch=2.3, sharex=True) as (_, axes):
-        for at, metric in zip(axes[:, 0], shown):
+    measured = [m for m in metrics if any(row.get(m) is not None for row in table.rows)]
+    with figure(path, len(measured), height_inch=2.3 if len(measured) < 6 else 1.8, sharex=True) as (_, axes):
+        for at, metric in zip(axes[:, 0], measured):
             for k, (label, labels) in enumerate(lines):
                 curve = table.curve(x, metric, **labels)
                 if curve:
@@ -56,10 +56,11 @@ def draw_metrics(
                 if level.count:
                     style = (":", "--", "-.")[k % 3]
                     at.axhline(level.mean, color=GREY, linestyle=style, linewidth=1.2, label=label)
-            last = metric == shown[-1]
+            last = metric == measured[-1]
             label_lines(
-                at, METRICS[metric].label, axis if last else None, title if metric == shown[0] else None
-            )
+                at, METRICS[metric].label.replace(", ", ",\n"), axis if last else None,
+                title if metric == measured[0] else None,
+            )  # fmt: skip
 
 
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:

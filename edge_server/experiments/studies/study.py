@@ -13,7 +13,7 @@ from edge_server.experiments.common.tables import number
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.trial import Row, Trial, recording
 from edge_server.report.machine import commit
-from edge_server.scheduler.learned.rewards import f_w
+from edge_server.scheduler.learned.rewards import W_S, f_w
 from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
@@ -33,10 +33,13 @@ LEAST_DB = 0.1
 METRICS = {
     "psnr_db": Metric("PSNR (dB)", False, 2, LEAST_DB),
     "psnr_moving_db": Metric("PSNR, moving pixels (dB)", False, 2, LEAST_DB),
+    "shown_psnr_db": Metric("PSNR as shown (dB)", False, 2, LEAST_DB),
+    "shown_psnr_moving_db": Metric("PSNR as shown, moving pixels (dB)", False, 2, LEAST_DB),
     "ssim": Metric("SSIM", False, 3, 0.002),
     "lpips": Metric("LPIPS", True, 3, 0.002),
     "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
     "f_w": Metric("F_w (6.37)", True, 3, 0.01),
+    "f_w_corrected": Metric("F_w with w_s = -0.2", True, 3, 0.01),
 }
 
 Curve = dict[float, dict[int, float | None]]
@@ -184,7 +187,8 @@ class Table:
 
     def __post_init__(self) -> None:
         self.rows = [
-            {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r)} for p, r in zip(self.points, self.results)
+            {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, -W_S)}
+            for p, r in zip(self.points, self.results)
         ]
 
     def where(self, **labels: Any) -> list[Row]:

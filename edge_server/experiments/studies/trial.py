@@ -25,9 +25,9 @@ from edge_server.experiments.virtual.from_scenario import build_deployment, buil
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer
+from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication
-from freshfield.scenario import Scenario, ScenarioError, load, parse
+from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
 WORLD_FPS = 100 / 3
@@ -36,6 +36,8 @@ SCENARIOS = {"room": "room19"}
 # Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096
+# Random instants at which a publication is looked at, one in each such part of the time that it is shown.
+_SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
 
 Row = dict[str, Any]
@@ -141,14 +143,20 @@ class Stage:
 def run_trial(trial: Trial, folders: Folders) -> Row:
     """Means over the trial's decisions.
 
-    psnr_db, psnr_moving_db, ssim, lpips: None where there are none. views: number of used views. aaoi_ms:
-    their mean age at publication (6.35). age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from
-    decision to publication. decisions: their number.
+    psnr_db, psnr_moving_db, ssim, lpips: at publication, the thesis's measure; None where there are none.
+    shown_psnr_db and so on: of what a deployment shows that decides anew at each publication
+    (``_shown_scores``). views: number of used views. aaoi_ms: their mean age at publication (6.35).
+    age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from decision to publication. decisions: their
+    number.
 
     Raises ScenarioError or DatasetError.
     """
     rows: list[Row] = []
-    deployment: VirtualDeployment = _deploy(trial, folders, lambda p: rows.append(_row(p, deployment)))
+
+    def published(publication: Publication) -> None:
+        rows.append(_row(publication, deployment) | _shown_scores(publication, deployment, trial.seed))
+
+    deployment = _deploy(trial, folders, published)
     _finish(deployment, trial)
     kept = rows[trial.settle : trial.settle + trial.decisions]
     if not kept:
@@ -161,8 +169,8 @@ def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDAr
     found: list[tuple[NDArray[np.uint8], NDArray[np.uint8], Row]] = []
 
     def look(publication: Publication) -> None:
-        truth, shown = _shown(trial, deployment, publication.published_ns)
-        found.append((truth, shown, _row(publication, deployment)))
+        truth, rendering = _rendered(trial, deployment, publication.published_ns)
+        found.append((truth, rendering, _row(publication, deployment)))
 
     deployment = _deploy(trial, folders, look)
     _finish(deployment, trial)
@@ -203,6 +211,24 @@ def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
     }
 
 
+def _shown_scores(publication: Publication, deployment: VirtualDeployment, seed: int) -> Row:
+    """``fidelity.scorer.SHOWN`` of the publication, carried on to seeded random instants until the next one.
+
+    The next one is as far away as this one was from its decision, computing included, and at least a capture
+    period: a policy that waits for more views is looked at for longer before it shows anything newer.
+    """
+    truth, began_ns = deployment.truth, publication.published_ns
+    if truth is None:
+        return {f"shown_{name}": None for name in SHOWN}
+    lasts_ns = max(began_ns - deployment.decided_ns, deployment.capture_period_ns)
+    snapshot = deployment.updates.field.snapshot(began_ns)
+    scores = []
+    for k, random in enumerate(np.random.default_rng(seed_sequence(seed, "shown")).random(_SHOWN_INSTANTS)):
+        at_ns = max(truth.nearest_ns(began_ns + round((k + random) / _SHOWN_INSTANTS * lasts_ns)), began_ns)
+        scores.append(truth.score(snapshot.at(at_ns), at_ns))
+    return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores if s]) for name in SHOWN}
+
+
 # A process keeps a few stages, because trials come grouped by their images.
 _STAGES: dict[tuple[str, Folders, bool], Stage] = {}
 _FIELDS: dict[str, Any] = {}
@@ -236,7 +262,7 @@ def _field(trial: Trial) -> Any:
     return made
 
 
-def _shown(
+def _rendered(
     trial: Trial, deployment: VirtualDeployment, present_ns: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """The held-out camera's truth and what the field shows of it."""

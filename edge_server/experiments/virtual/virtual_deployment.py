@@ -226,6 +226,11 @@ class VirtualDeployment:
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
+    @property
+    def capture_period_ns(self) -> int:
+        """Of the fastest camera."""
+        return round(1e9 / max(float(camera.fps) for camera in self._cameras.values()))
+
     def with_images(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
         """Frames of the buffer with their images and poses, made now; without those that a source cannot
         give. A frame that is used again stays the same object and is decoded once. Public for those who

@@ -112,17 +112,17 @@ REWARDS = {
 }
 
 
-def f_w(row: Mapping[str, Any]) -> float | None:
-    """F_w of (6.36) and (6.37) as printed, smaller is better; ages in slots of 1 ms. None where a metric is
-    missing.
+def f_w(row: Mapping[str, Any], w_s: float = W_S) -> float | None:
+    """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
 
     row: with psnr_db, ssim, lpips and aaoi_ms.
+    w_s: weight of SSIM, as printed unless given.
     """
     metrics = [row.get(name) for name in ("psnr_db", "ssim", "lpips", "aaoi_ms")]
     if any(value is None for value in metrics):
         return None
     psnr, ssim, lpips, age = (float(value) for value in metrics)  # type: ignore[arg-type]  # None was excluded
-    return W_P * psnr + W_S * ssim + W_L * lpips + W_T * age
+    return W_P * psnr + w_s * ssim + W_L * lpips + W_T * age
 
 
 def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:

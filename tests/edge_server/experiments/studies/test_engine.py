@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from edge_server.experiments.common.folders import Folders
@@ -51,6 +52,17 @@ def test_waiting_for_arrivals_takes_what_was_on_its_way_and_waiting_for_captures
     )
     assert arrived["wait_ms"] == pytest.approx(240.0) and arrived["views"] == 4.0
     assert generated["wait_ms"] > arrived["wait_ms"] and arrived["aaoi_ms"] > 200.0
+
+
+def test_who_waits_longer_shows_what_moves_older():
+    """Of the same views: nothing is delayed, and each wait takes all cameras."""
+    ideal = replace(TRIAL, channel={"preset": "ideal"}, policy="wait", steps=60, size=32, cameras=9)
+    lost = []
+    for value in (40.0, 400.0):
+        found = [run_trial(replace(ideal, value=value, seed=s), NO_DATA) for s in (1, 2, 3)]
+        assert all(row["views"] == 8.0 and row["shown_psnr_still_db"] is not None for row in found)
+        lost.append(np.median([row["psnr_moving_db"] - row["shown_psnr_moving_db"] for row in found]))
+    assert lost[1] > lost[0] + 0.5
 
 
 def test_nothing_is_old_where_nothing_is_delayed_and_flushing_frees_the_links():

@@ -46,6 +46,7 @@ def invented(tmp_path: Path, rule) -> Invented:
 def figures(quality: float, age: float, views: float = 9.0) -> dict[str, Any]:
     return {
         "psnr_db": 20.0 + quality, "psnr_moving_db": 18.0 + quality, "ssim": 0.8 + quality / 50,
+        "shown_psnr_db": 20.0 + quality, "shown_psnr_moving_db": 18.0 + quality,
         "lpips": 0.2 - quality / 50, "views": views, "aaoi_ms": age, "age_sum_ms": 18 * age, "wait_ms": 0.0,
         "decisions": 1,
     }  # fmt: skip
@@ -204,8 +205,16 @@ def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
     assert found["room, high traffic, wait, PSNR (dB)"] == "holds"
     assert found["room, high traffic, wait-flush, PSNR (dB)"] == "does not hold"
     assert found["room, high traffic, wait, F_w (6.37)"] == "does not hold", "age outweighs all else"
+    assert (tmp_path / "omega-room-high-parallel.png").stat().st_size > 10_000
 
 
+@pytest.fixture
+def no_curves(monkeypatch):
+    """Drawing takes seconds, and another test of omega looks at what it draws."""
+    monkeypatch.setattr("edge_server.experiments.studies.age.omega.draw_metrics", lambda *a: None)
+
+
+@pytest.mark.usefixtures("no_curves")
 @pytest.mark.parametrize(("gain", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
 def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: Path):
     def rule(trial):
@@ -214,7 +223,22 @@ def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: 
 
     found = [v for v in judged("omega", tmp_path, rule) if "that arrive meanwhile" in v.claim]
     assert {v.verdict for v in found} == {said}
-    assert all("wait-arrived" in v.about for v in found) and len(found) == 10
+    assert all("wait-arrived" in v.about for v in found)
+    states = ("high traffic", "low traffic", "high parallel traffic")
+    assert {v.about.split(", ")[1] for v in found} == set(states) and len(found) == 8 * len(states)
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_the_sign_of_ssim_in_f_w_can_turn_what_is_better(tmp_path: Path):
+    def rule(trial):
+        row = figures(noise(trial.seed, 1.0), 50.0)
+        return {**row, "ssim": 0.9 if trial.policy == "wait-arrived" else 0.5}
+
+    found = {
+        v.about.rpartition(", ")[2]: v.verdict
+        for v in judged("omega", tmp_path, rule) if "arrive meanwhile" in v.claim and "F_w" in v.about
+    }  # fmt: skip
+    assert found == {"F_w (6.37)": "does not hold", "F_w with w_s = -0.2": "holds"}
 
 
 def test_images_judges_both_directions(tmp_path: Path):
