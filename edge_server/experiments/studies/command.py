@@ -142,8 +142,8 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
             raise StudyError(f"--scene {scene}: its camera moves, which studies do not simulate")
     if set(names) <= set(LEARNING) and (request.scenes or ray):
         raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
-    if set(names) <= set(CAPTURING) and (ray or (request.scenes and "preferences" in names)):
-        raise StudyError("--scene and --ray: captures are made here, and those of preferences of tile")
+    if set(names) <= set(CAPTURING) and ray:
+        raise StudyError("--ray: captures are made in this process")
     own = {*LEARNING, *CAPTURING, "metrics", "representations"}
     if set(names) <= own and request.field != "splat":
         raise StudyError(f"--field: {', '.join(names)} has representations of its own, or none")
@@ -180,8 +180,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--scene",
         metavar="NAME,...",
-        help="shipped scenarios with fixed cameras, as kitchen or dynerf (viewpoints: cell too); "
-        "room: room19 [the study's own]",
+        help="shipped scenarios with fixed cameras, as kitchen or dynerf (viewpoints and preferences: cell "
+        "too); room: room19 [the study's own]",
     )
     add("--field", choices=field_names(), default="splat",
         help="representation, where the study names none [%(default)s]")  # fmt: skip

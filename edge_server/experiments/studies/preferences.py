@@ -9,11 +9,11 @@ import numpy as np
 
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import interval, paired
+from edge_server.experiments.common.statistics import interval, negated, paired
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
-from edge_server.experiments.studies.trial import Row
+from edge_server.experiments.studies.trial import Row, scenario_of
 from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Workload, plan
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
@@ -43,12 +43,32 @@ class Preferences(Study):
     title = "What preferences of simulated experts teach (figure 4.6, tables 4.2, 4.3)"
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        work = QUICK if request.quick else FULL
-        stage = open_stage("tile", work.candidates, work.size)
+        rows: list[Row] = []
+        captures: list[Row] = []
+        verdicts: list[Verdict] = []
+        parts = ["# " + self.title, ""]
         store = ResultStore.in_lines(request.out / "trials" / "preferences.jsonl")
+        for scene in request.scenes_here(("tile",)):
+            answered, captured, text = self._of_scene(request, scene, store)
+            verdicts += judge_answers(scene, answered) + judge_captures(scene, captured)
+            rows += [{"scene": scene, **row} for row in answered]
+            captures += [{"scene": scene, **row} for row in captured]
+            parts += [f"## {scene}", "", text, "", answer_table(answered), "", capture_table(captured), ""]
+        store.close()
+        write_csv(request.out / "preferences.csv", rows)
+        write_csv(request.out / "preferences-captures.csv", captures)
+        write_text(request.out / "preferences-tables.md", "\n".join(parts))
+        return verdicts
+
+    def _of_scene(
+        self, request: StudyRequest, scene: str, store: ResultStore
+    ) -> tuple[list[Row], list[Row], str]:
+        """Rows of answers and of captures of one scene, and what was done."""
+        work = QUICK if request.quick else FULL
+        stage = open_stage(str(scenario_of(scene).path), work.candidates, work.size, request.folders.data)
         pool = []
         for k in range(_POOL[request.quick]):
-            key = content_key(["pool", k, vars(work), source_digest()], 40)
+            key = content_key(["pool", scene, k, vars(work), source_digest()], 40)
             pool.append(store.get(key, compute=partial(reconstruct, stage, k, work)))
         steps = StepFeatures(stage.candidates)
         features = np.stack([steps.trajectory(item["order"]) for item in pool])
@@ -58,21 +78,15 @@ class Preferences(Study):
             row for taste in TASTES for habit in HABITS for seed in seeds
             for row in question(features, scores[taste], taste, habit, seed)
         ]  # fmt: skip
-        write_csv(request.out / "preferences.csv", rows)
-        verdicts = judge_answers(rows)
         captures, curves = self._policies(request, stage, work, features, scores, store)
-        store.close()
-        write_csv(request.out / "preferences-captures.csv", captures)
-        verdicts += judge_captures(captures)
-        draw(request.out / "preferences.png", rows, curves)
-        about = (
-            f"Simulated experts only. {len(pool)} reconstructions of {JUDGED} views of `tile`, {work.size} x "
-            f"{work.size} pixels; a third of them kept for {_UNSEEN} unseen pairs. {len(seeds)} seeds. Means "
-            "with 95 % intervals over seeds."
+        draw(request.out / f"preferences-{scene}.png", rows, curves)
+        lens = stage.candidates.lens
+        text = (
+            f"Simulated experts only. {len(pool)} reconstructions of {JUDGED} views, {lens.width} x "
+            f"{lens.height} pixels; a third of them kept for {_UNSEEN} unseen pairs. {len(seeds)} seeds. "
+            "Means with 95 % intervals over seeds."
         )
-        parts = ["# " + self.title, "", about, "", answer_table(rows), "", capture_table(captures), ""]
-        write_text(request.out / "preferences-tables.md", "\n".join(parts))
-        return verdicts
+        return rows, captures, text
 
     def _policies(
         self, request: StudyRequest, stage: Stage, work: Workload, features: np.ndarray,
@@ -83,14 +97,14 @@ class Preferences(Study):
         captures: list[Row] = []
         curves: dict[str, dict[float, dict[int, float | None]]] = {}
         config = PolicyConfig(views=JUDGED, updates=_UPDATES[request.quick])
-        embed, missing = open_embedder()
+        embed, missing = open_embedder(stage.background)
         if missing:
             print(f"  embeddings are left out: {missing}")
         pictures = [stage.take(k).image for k in range(len(stage.candidates))]
         seen = embed(pictures).astype(np.float64) if embed else None
         for seed in request.repeats(3, 5):
             for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
-                key = content_key([arm, seed, vars(work), source_digest()], 40)
+                key = content_key([arm, stage.name, seed, vars(work), source_digest()], 40)
                 run = partial(_capture, stage, arm, seed, work)
                 captures.append({"arm": arm, "seed": seed, **store.get(key, compute=run)})
             for taste, embedded in [*((t, False) for t in TASTES), *([(_EMBEDDED, True)] if embed else [])]:
@@ -104,7 +118,7 @@ class Preferences(Study):
                     of_seed = curves.setdefault(label, {}).setdefault(float(n), {})
                     of_seed[seed] = float(np.mean(returns[n : n + 5]))
                 if seed == 0:
-                    policy.save(request.out / f"policy-{label.replace(', ', '-')}.npz")
+                    policy.save(request.out / f"policy-{stage.name}-{label.replace(', ', '-')}.npz")
                 # The seed draws the same first view as for the others.
                 made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
                 measured = _measured(stage, made, work, seed)
@@ -178,37 +192,42 @@ def _of(rows: list[Row], metric: str, **labels: object) -> dict[int, float | Non
     return {r["seed"]: r[metric] for r in rows if all(r[k] == v for k, v in labels.items())}
 
 
-def judge_answers(rows: list[Row]) -> list[Verdict]:
+def judge_answers(scene: str, rows: list[Row]) -> list[Verdict]:
+    """Verdicts on what the reward model learned in a scene."""
     verdicts = []
     for taste in TASTES:
         here = _of(rows, "agreement", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
         itself = _of(rows, "with_itself", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
         share = interval([a / b for s in here if (a := here[s]) is not None and (b := itself[s])])
         verdicts.append(Verdict(
-            f"simulated expert, {taste}, 10 % wrong",
+            f"{scene}, simulated expert, {taste}, 10 % wrong",
             f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
             f"{share.text(3)} of it, on unseen pairs.", share.above(0.9), share,
         ))  # fmt: skip
     unsure = [not r["knows"] for r in rows if r["habit"] == "contradicting" and r["answers"] == ASKED[-1]]
     sure = [r["knows"] for r in rows if r["habit"] == "careful" and r["answers"] == ASKED[-1]]
     verdicts.append(Verdict(
-        "simulated experts, contradicting", "the model says that it does not know.",
+        f"{scene}, simulated experts, contradicting", "the model says that it does not know.",
         f"it says so in {sum(unsure)} of {len(unsure)} cases; of careful experts it says that it knows in "
         f"{sum(sure)} of {len(sure)}.", sum(unsure) >= 0.9 * len(unsure),
     ))  # fmt: skip
     return verdicts
 
 
-def judge_captures(captures: list[Row]) -> list[Verdict]:
+def judge_captures(scene: str, captures: list[Row]) -> list[Verdict]:
+    """Verdicts on the captures of a scene by trained policies: quality and way."""
     verdicts = []
     for arm in [a for a in dict.fromkeys(c["arm"] for c in captures) if a.startswith("policy")]:
         for other in ("random", "FisherRF"):
             gain = paired(_of(captures, "psnr_db", arm=arm), _of(captures, "psnr_db", arm=other))
             way = paired(_of(captures, "path_m", arm=arm), _of(captures, "path_m", arm=other))
-            verdicts.append(Verdict(
-                f"{arm}, {JUDGED} views", f"better than {other} (table 4.3).",
-                f"{gain.text(2)} dB, with a path {way.text(2)} m longer.", gain.above(0.0), gain,
-            ))  # fmt: skip
+            about = f"{scene}, {arm}, {JUDGED} views"
+            verdicts += [
+                Verdict(about, f"better than {other} (table 4.3).", f"{gain.text(2)} dB.",
+                        gain.above(0.0), gain),
+                Verdict(f"{about}, path", f"shorter than {other}'s (table 4.3).", f"{way.text(2)} m longer.",
+                        negated(way.above(0.0)), way),
+            ]  # fmt: skip
     return verdicts
 
 

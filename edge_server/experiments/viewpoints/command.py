@@ -65,10 +65,13 @@ def _run(args: argparse.Namespace) -> None:
     folders = folders_of(args)
     budget = read_budget(args.budget)
     learned = args.selector.startswith("ppo:")
-    selector = make_selector(args.selector, **({"embed": open_embedder()[0]} if learned else {}))
+    if not learned:
+        selector = make_selector(args.selector)  # refused before anything is rendered
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
+    if learned:
+        selector = make_selector(args.selector, embed=open_embedder(stage.background)[0])
     show = None
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)

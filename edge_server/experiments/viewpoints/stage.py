@@ -16,10 +16,11 @@ from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene
-from edge_server.fidelity.images import BLACK, Color
+from edge_server.fidelity.images import BLACK, Color, to_unit
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
+from edge_server.live.scoring_thread import to_bytes
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
 from edge_server.viewpoints.policy import Embed
 from freshfield.scenario import Scenario, load
@@ -137,9 +138,18 @@ def _render(scene: Scene, name: str, candidates: Candidates, k: int) -> View:
     return View(name, scene.view(candidates.lens, pose).image(0.0), pose, candidates.lens)
 
 
-def open_embedder() -> tuple[Embed | None, str | None]:
-    """(pictures to embeddings by the shipped YOLO backbone (4.8), None), or (None, why there is none)."""
+def open_embedder(background: Color) -> tuple[Embed | None, str | None]:
+    """(pictures to embeddings by the shipped YOLO backbone (4.8), None), or (None, why there is none).
+
+    background: under transparent pictures.
+    """
     try:
-        return make_embedder(EmbeddingConfig(dim=_EMBEDDING)).embed, None
+        embedder = make_embedder(EmbeddingConfig(dim=_EMBEDDING))
     except EmbeddingError as error:
         return None, str(error)
+
+    def embed(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        over = [to_unit(p, background=background).astype(np.float32) for p in pictures]
+        return embedder.embed([to_bytes(picture) for picture in over])
+
+    return embed, None

@@ -38,8 +38,24 @@ def test_verdicts_of_preferences_follow_the_figures():
             for t in preferences.TASTES for h in preferences.HABITS for s in range(4)
         ]  # fmt: skip
 
-    assert {v.verdict for v in preferences.judge_answers(answers(0.95, False))} == {"holds"}
-    assert {v.verdict for v in preferences.judge_answers(answers(0.85, True))} == {"does not hold"}
+    assert {v.verdict for v in preferences.judge_answers("tile", answers(0.95, False))} == {"holds"}
+    assert {v.verdict for v in preferences.judge_answers("tile", answers(0.85, True))} == {"does not hold"}
+
+
+def test_a_policy_is_judged_by_quality_and_by_its_way():
+    captures = [
+        {"arm": arm, "seed": s, "psnr_db": db + 0.01 * s, "path_m": m + 0.01 * s * (arm == "random")}
+        for arm, db, m in (("random", 20.0, 5.0), ("FisherRF", 22.0, 2.0), ("policy, edges", 21.0, 3.0))
+        for s in range(4)
+    ]
+    found = {(v.about, v.claim): v.verdict for v in preferences.judge_captures("tile", captures)}
+    about = "tile, policy, edges, 8 views"
+    assert found == {
+        (about, "better than random (table 4.3)."): "holds",
+        (about, "better than FisherRF (table 4.3)."): "does not hold",
+        (f"{about}, path", "shorter than random's (table 4.3)."): "holds",
+        (f"{about}, path", "shorter than FisherRF's (table 4.3)."): "does not hold",
+    }
 
 
 @pytest.mark.slow
@@ -58,4 +74,4 @@ def test_both_studies_run_whole(tmp_path, monkeypatch):
     assert {r["arm"] for r in table} == set(viewpoints.ARMS) and len(table) == len(viewpoints.ARMS) * 2 * 2
     first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage" and r["views"] == "3"}
     assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
-    assert (tmp_path / "policy-edges.npz").exists() and (tmp_path / "viewpoints-tile-paths.png").exists()
+    assert (tmp_path / "policy-tile-edges.npz").exists() and (tmp_path / "viewpoints-tile-paths.png").exists()
