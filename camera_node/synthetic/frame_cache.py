@@ -34,9 +34,12 @@ from freshfield import payload
 # A sequence with more different frames counts as not repeating: it is rendered as it goes and not kept.
 MAX_FRAMES = 3000
 MAX_DISK_BYTES = 2 << 30
+# Written by a process before it looks again at how much there is: that reads the whole folder.
+_PRUNE_EVERY_BYTES = MAX_DISK_BYTES // 16
 MAX_MEMORY_BYTES = 32 << 20
 _MAGIC = b"FFC1"
 _NAME = re.compile("[0-9a-f]{32}")  # of the folder of one camera's frames
+_written: dict[Path, int] = {}  # root -> bytes that this process wrote since it looked
 # Files here that do not decide what a frame looks like.
 _NOT_RENDERING = ("frame_cache.py", "effect_costs.py", "preview.py", "source.py")
 
@@ -86,7 +89,7 @@ class FrameCache:
         self._memory: dict[int, bytes] = {}
         self._memory_bytes = 0
         self._lock = threading.Lock()
-        self._pruned = False
+        self._touched = False
         self._folder: Path | None = None
         if on_disk and self.repeats_after is not None:
             self._root = folder or default_folder()
@@ -206,10 +209,10 @@ class FrameCache:
             return
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            if not self._pruned:
-                self._pruned = True
+            if not self._touched:
+                self._touched = True
                 os.utime(self._folder)
-                prune(self._root, keep=self._folder)
+            _prune_now_and_then(self._root, self._folder, len(data))
             # Another process may write the same entry: each writes its own file and renames it.
             handle, name = tempfile.mkstemp(dir=self._folder, prefix=".new-")
             try:
@@ -244,6 +247,15 @@ def renderer_version() -> str:
     for path in files:
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _prune_now_and_then(root: Path, keep: Path, new_bytes: int) -> None:
+    """``prune`` at a process's first frame for ``root``, and each time so much more was written."""
+    written = _written.get(root, _PRUNE_EVERY_BYTES) + new_bytes
+    if written >= _PRUNE_EVERY_BYTES:
+        prune(root, keep)
+        written = 0
+    _written[root] = written
 
 
 def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTES) -> int:

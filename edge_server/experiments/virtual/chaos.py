@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.capture import Camera
 from edge_server.experiments.common.arguments import at_least, command_parser
 from edge_server.experiments.common.result_store import ResultStore, content_key, processor
 from edge_server.experiments.common.source_digest import source_digest
@@ -37,6 +38,7 @@ from edge_server.experiments.virtual.virtual_deployment import Compute, RunSetti
 from edge_server.report.frame_accounting import FrameCounts, account_frames
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA
 from freshfield.machine_load import usable_cores
+from freshfield.scenario import Scenario
 
 DESCRIPTION = """\
 Run small deployments in virtual time, each with faults that its seed draws: processes that crash and stall,
@@ -66,10 +68,11 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
     Returns {seed, problems: one line each, faults, digest, recovery_ms, counts: of the ledgers' accounting}.
     """
     scenario = scenario_of(seed)
+    cameras = training_cameras(scenario)  # of both runs: each frame is rendered once
     faults = [f for f in draw_faults(seed, scenario.training) if only is None or f.number in only]
     found: dict[str, Any] = {"seed": seed, "faults": [str(f) for f in faults], "problems": []}
     try:
-        first, second = _run(seed, faults), _run(seed, faults)
+        first, second = (_run(scenario, cameras, faults) for _ in range(2))
     except Exception as error:  # a part of the program broke: that is what is looked for
         place = traceback.extract_tb(error.__traceback__)[-1]
         found["problems"] = [f"{type(error).__name__} in {Path(place.filename).name}, {place.name}: {error}"]
@@ -80,10 +83,9 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
     return found
 
 
-def _run(seed: int, faults: Sequence[Fault]) -> dict[str, Any]:
-    scenario = scenario_of(seed)
+def _run(scenario: Scenario, cameras: list[Camera], faults: Sequence[Fault]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, _warnings_are_expected():
-        deployment = ChaosDeployment(scenario, training_cameras(scenario), _SETTINGS, faults, Path(folder))
+        deployment = ChaosDeployment(scenario, cameras, _SETTINGS, faults, Path(folder))
         deployment.run(SECONDS)
         deployment.end()
         account = account_frames(Path(folder))

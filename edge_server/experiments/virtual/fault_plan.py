@@ -75,8 +75,9 @@ def scenario_of(seed: int) -> Scenario:
             "name": f"chaos-{seed}",
             "seed": seed,
             "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
+            # A motion of its own: frames that no other seed needs are not kept on disk.
             "source": {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
-                       "params": {"supersample": 1}},
+                       "motion_seed": seed, "params": {"supersample": 1}},
             "channel": channel,
             "edge": {"field": field, "field_options": _SMALL[field],
                      "policy": {"name": policy, "value": value}},

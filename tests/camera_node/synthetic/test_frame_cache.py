@@ -180,6 +180,18 @@ def test_prune_deletes_the_longest_unused_first_and_nothing_else(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{0:032x}", f"{3:032x}", "models"]
 
 
+def test_the_folder_is_looked_through_once_and_not_for_each_camera(tmp_path, monkeypatch):
+    looked: list[Path] = []
+    monkeypatch.setattr(cache_module, "prune", lambda root, keep: looked.append(root))
+    monkeypatch.setattr(cache_module, "_PRUNE_EVERY_BYTES", 10**6)
+    for camera in ("cam01", "cam02", "cam03"):
+        FrameCache(room(), camera, 15, folder=tmp_path).fill()
+    assert looked == [tmp_path]
+    monkeypatch.setattr(cache_module, "_PRUNE_EVERY_BYTES", 1)
+    FrameCache(room(), "cam04", 15, folder=tmp_path).fill()
+    assert len(looked) == 10, "after each of nine frames"
+
+
 def _fill(folder: str, out: multiprocessing.Queue[object]) -> None:
     c = FrameCache(room(), "cam01", 15, folder=Path(folder))
     c.fill()
