@@ -22,6 +22,7 @@ from edge_server.experiments.studies.trial import SCENARIOS, scenario_of
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fields.registry import field_names
+from edge_server.viewpoints.candidates import ViewpointError
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
@@ -34,7 +35,7 @@ STUDIES = {
                   "figure 5.8: the best maximum age against the mean delay"),
     "lambda": ("age.age_weight", "Weighing", "equation 5.8: the weight of timeliness"),
     "omega": ("age.omega", "Omega",
-              "figures 6.3, 6.4: threshold and wait in both readings, two traffic states, flush"),
+              "figures 6.3, 6.4: threshold and wait in both readings, by traffic and queue, flush"),
     "images": ("age.image_count", "Images", "figures 6.5, 6.6: LPIPS and age against the number of images"),
     "representations": ("age.representations", "Representations",
                         "figure 6.7: the same trade with other representations"),
@@ -104,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name in _checked(names.get(args.study, [args.study]), request, args.ray):
             _run(name, request, engine)
 
-    errors = (ScenarioError, DatasetError, StudyError, TrainingError)
+    errors = (ScenarioError, DatasetError, StudyError, TrainingError, ViewpointError)
     stopped = f"what is finished is in {engine.folder}: the same command goes on"
     return run_command("study", work, errors, stopped)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import interval, negated, paired
+from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
@@ -78,7 +78,7 @@ class Preferences(Study):
             row for taste in TASTES for habit in HABITS for seed in seeds
             for row in question(features, scores[taste], taste, habit, seed)
         ]  # fmt: skip
-        captures, curves = self._policies(request, stage, work, features, scores, store)
+        captures, curves = self._policies(request, scene, stage, work, features, scores, store)
         draw(request.out / f"preferences-{scene}.png", rows, curves)
         lens = stage.candidates.lens
         text = (
@@ -89,7 +89,7 @@ class Preferences(Study):
         return rows, captures, text
 
     def _policies(
-        self, request: StudyRequest, stage: Stage, work: Workload, features: np.ndarray,
+        self, request: StudyRequest, scene: str, stage: Stage, work: Workload, features: np.ndarray,
         scores: dict[str, np.ndarray], store: ResultStore,
     ) -> tuple[list[Row], dict[str, dict[float, dict[int, float | None]]]]:  # fmt: skip
         """Captures by a policy trained for each taste, and by others, with the same first views; and each
@@ -104,7 +104,7 @@ class Preferences(Study):
         seen = embed(pictures).astype(np.float64) if embed else None
         for seed in request.repeats(3, 5):
             for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
-                key = content_key([arm, stage.name, seed, vars(work), source_digest()], 40)
+                key = content_key([arm, scene, seed, vars(work), source_digest()], 40)
                 run = partial(_capture, stage, arm, seed, work)
                 captures.append({"arm": arm, "seed": seed, **store.get(key, compute=run)})
             for taste, embedded in [*((t, False) for t in TASTES), *([(_EMBEDDED, True)] if embed else [])]:
@@ -118,7 +118,7 @@ class Preferences(Study):
                     of_seed = curves.setdefault(label, {}).setdefault(float(n), {})
                     of_seed[seed] = float(np.mean(returns[n : n + 5]))
                 if seed == 0:
-                    policy.save(request.out / f"policy-{stage.name}-{label.replace(', ', '-')}.npz")
+                    policy.save(request.out / f"policy-{scene}-{label.replace(', ', '-')}.npz")
                 # The seed draws the same first view as for the others.
                 made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
                 measured = _measured(stage, made, work, seed)
@@ -145,7 +145,7 @@ def _capture(stage: Stage, arm: str, seed: int, work: Workload) -> Row:
 
 def _measured(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
     """Quality on the views held out, path, milliseconds of a choice, and the score of each taste."""
-    score = stage.score(stage.fit(made.views, work.steps, seed), Scorer())
+    score = stage.score(stage.fit(made.views, work.steps, seed), Scorer(background=stage.background))
     choice_ms = 1e3 * float(np.mean([stop.seconds for stop in made.stops[1:]]))
     return {
         "psnr_db": score.psnr_db, "ssim": score.ssim, "path_m": made.path_m, "choice_ms": choice_ms,
@@ -220,13 +220,13 @@ def judge_captures(scene: str, captures: list[Row]) -> list[Verdict]:
     for arm in [a for a in dict.fromkeys(c["arm"] for c in captures) if a.startswith("policy")]:
         for other in ("random", "FisherRF"):
             gain = paired(_of(captures, "psnr_db", arm=arm), _of(captures, "psnr_db", arm=other))
-            way = paired(_of(captures, "path_m", arm=arm), _of(captures, "path_m", arm=other))
+            way = paired(_of(captures, "path_m", arm=other), _of(captures, "path_m", arm=arm))
             about = f"{scene}, {arm}, {JUDGED} views"
             verdicts += [
                 Verdict(about, f"better than {other} (table 4.3).", f"{gain.text(2)} dB.",
                         gain.above(0.0), gain),
-                Verdict(f"{about}, path", f"shorter than {other}'s (table 4.3).", f"{way.text(2)} m longer.",
-                        negated(way.above(0.0)), way),
+                Verdict(f"{about}, path", f"shorter than {other}'s (table 4.3).", f"{way.text(2)} m shorter.",
+                        way.above(0.0), way),
             ]  # fmt: skip
     return verdicts
 

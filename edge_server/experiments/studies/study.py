@@ -39,7 +39,7 @@ METRICS = {
     "lpips": Metric("LPIPS", True, 3, 0.002),
     "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
     "f_w": Metric("F_w (6.37)", True, 3, 0.01),
-    "f_w_corrected": Metric("F_w with w_s = -0.2", True, 3, 0.01),
+    "f_w_corrected": Metric(f"F_w with w_s = {-W_S:g}", True, 3, 0.01),
 }
 
 Curve = dict[float, dict[int, float | None]]

@@ -152,9 +152,12 @@ def run_trial(trial: Trial, folders: Folders) -> Row:
     Raises ScenarioError or DatasetError.
     """
     rows: list[Row] = []
+    rng = np.random.default_rng(seed_sequence(trial.seed, "shown"))  # the same instants for every policy
 
     def published(publication: Publication) -> None:
-        rows.append(_row(publication, deployment) | _shown_scores(publication, deployment, trial.seed))
+        counts = trial.settle <= len(rows) < trial.settle + trial.decisions
+        shown = _shown_scores(publication, deployment, rng) if counts else {}
+        rows.append(_row(publication, deployment) | shown)
 
     deployment = _deploy(trial, folders, published)
     _finish(deployment, trial)
@@ -211,11 +214,15 @@ def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
     }
 
 
-def _shown_scores(publication: Publication, deployment: VirtualDeployment, seed: int) -> Row:
-    """``fidelity.scorer.SHOWN`` of the publication, carried on to seeded random instants until the next one.
+def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: np.random.Generator) -> Row:
+    """``fidelity.scorer.SHOWN`` of the publication, carried on to random instants until the next one.
 
-    The next one is as far away as this one was from its decision, computing included, and at least a capture
-    period: a policy that waits for more views is looked at for longer before it shows anything newer.
+    A deployment that decides again as soon as it has published shows a picture for as long as the next one
+    takes: its wait and its computing. A policy that waits for more views is looked at for longer before it
+    shows anything newer. We assume at most one publication a capture period: without it a policy that does
+    not wait would publish at every arrival, and be some ms fresher than this says.
+
+    Instants are random where the truth is known at any; of a recording they are those of its frames.
     """
     truth, began_ns = deployment.truth, publication.published_ns
     if truth is None:
@@ -223,7 +230,7 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, seed:
     lasts_ns = max(began_ns - deployment.decided_ns, deployment.capture_period_ns)
     snapshot = deployment.updates.field.snapshot(began_ns)
     scores = []
-    for k, random in enumerate(np.random.default_rng(seed_sequence(seed, "shown")).random(_SHOWN_INSTANTS)):
+    for k, random in enumerate(rng.random(_SHOWN_INSTANTS)):
         at_ns = max(truth.nearest_ns(began_ns + round((k + random) / _SHOWN_INSTANTS * lasts_ns)), began_ns)
         scores.append(truth.score(snapshot.at(at_ns), at_ns))
     return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores if s]) for name in SHOWN}

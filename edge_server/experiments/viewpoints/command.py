@@ -23,6 +23,7 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.experts import TASTES
 from edge_server.viewpoints.plan import Budget, plan_capture
+from edge_server.viewpoints.policy import CandidatePolicy
 from edge_server.viewpoints.preferences import PERSON
 from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
@@ -64,14 +65,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> None:
     folders = folders_of(args)
     budget = read_budget(args.budget)
-    learned = args.selector.startswith("ppo:")
-    if not learned:
-        selector = make_selector(args.selector)  # refused before anything is rendered
+    selector = make_selector(args.selector)  # refused before anything is rendered
     if args.travel < 0.0:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
-    if learned:
-        selector = make_selector(args.selector, embed=open_embedder(stage.background)[0])
+    if isinstance(selector, CandidatePolicy):
+        selector.embed = open_embedder(stage.background)[0]
     show = None
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)

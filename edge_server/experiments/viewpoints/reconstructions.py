@@ -37,7 +37,8 @@ def varied_plan(stage: Stage, k: int, views: int) -> Plan:
     candidates = stage.candidates
     if k % 3 == 1:
         angle = candidates.directions @ candidates.directions[rng.integers(len(candidates))]
-        nearest = np.argsort(-angle)[: int(rng.integers(len(candidates) // 5, len(candidates) // 2))]
+        least = max(views, len(candidates) // 5)
+        nearest = np.argsort(-angle)[: int(rng.integers(least, max(least + 1, len(candidates) // 2)))]
         candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
     name = ("random", "random", "farthest", "random", "coverage", "uniform")[k % 6]
     weight = float(rng.choice([0.0, 0.0, 0.5]))

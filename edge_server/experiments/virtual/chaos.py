@@ -68,10 +68,10 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
     Returns {seed, problems: one line each, faults, digest, recovery_ms, counts: of the ledgers' accounting}.
     """
     scenario = scenario_of(seed)
-    cameras = training_cameras(scenario)  # of both runs: each frame is rendered once
     faults = [f for f in draw_faults(seed, scenario.training) if only is None or f.number in only]
     found: dict[str, Any] = {"seed": seed, "faults": [str(f) for f in faults], "problems": []}
     try:
+        cameras = training_cameras(scenario)  # of both runs: each frame is rendered once
         first, second = (_run(scenario, cameras, faults) for _ in range(2))
     except Exception as error:  # a part of the program broke: that is what is looked for
         place = traceback.extract_tb(error.__traceback__)[-1]

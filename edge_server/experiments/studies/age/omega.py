@@ -1,4 +1,4 @@
-"""Figures 6.3 and 6.4: threshold and wait against omega, in two traffic states and without a queue."""
+"""Figures 6.3 and 6.4: threshold and wait against omega, in two traffic states, and where frames overtake."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from edge_server.experiments.studies.trial import recording
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (15.0, 45.0, 75.0, 120.0, 240.0)
-# Channel; the optimum of threshold and the plateau of wait that the thesis names (6.5). Its two traffic
-# states, and the high one as 6.4.2 describes it literally: every frame is transmitted at once.
-STATES: dict[str, tuple[dict[str, Any], float, float]] = {
-    "high": ({"preset": "ch6-high"}, 50.0, 62.0),
-    "low": ({"preset": "ch6-low"}, 72.0, 105.0),
-    "high parallel": ({"preset": "ch6-high", "discipline": "parallel"}, 50.0, 62.0),
+# In words; channel; the optimum of threshold and the plateau of wait that the thesis names (6.5). Its two
+# traffic states, and the high one as 6.4.2 describes it literally: every frame is transmitted at once.
+STATES: dict[str, tuple[str, dict[str, Any], float, float]] = {
+    "high": ("high traffic", {"preset": "ch6-high"}, 50.0, 62.0),
+    "low": ("low traffic", {"preset": "ch6-low"}, 72.0, 105.0),
+    "parallel": ("high traffic, parallel", {"preset": "ch6-high", "discipline": "parallel"}, 50.0, 62.0),
 }
 POLICIES = ("threshold", "wait", "wait-arrived", "wait-flush")
 SHOWN = (30.0, 60.0, 120.0)
@@ -47,7 +47,7 @@ _NEAR = {
 
 class Omega(SceneStudy):
     name = "omega"
-    title = "Threshold and wait against omega in two traffic states (figures 6.3, 6.4)"
+    title = "Threshold and wait against omega, by traffic and queue (figures 6.3, 6.4)"
 
     scenes = ("room", "kitchen")
 
@@ -55,7 +55,7 @@ class Omega(SceneStudy):
         ours = recording(scene) is None
         states = [
             ({"state": state}, {"channel": channel, "every_ms": 2400.0})
-            for state, (channel, _, _) in STATES.items() if ours or not request.quick or state == "high"
+            for state, (_, channel, _, _) in STATES.items() if ours or not request.quick or state == "high"
         ]  # fmt: skip
         omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
         seeds = request.repeats(6 if ours else 3, 40)
@@ -65,11 +65,10 @@ class Omega(SceneStudy):
         verdicts = []
         states = [s for s in STATES if table.where(scene=scene, state=s)]
         for state in states:
-            file = f"omega-{scene}-{state.replace(' ', '-')}.png"
             draw_metrics(
-                request.out / file, table, "omega_ms", "omega (ms)", _METRICS,
+                request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
                 [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
-                f"{scene}, {state} traffic: from scratch, scored at the present",
+                f"{scene}, {STATES[state][0]}: from scratch",
                 [("use all", {"scene": scene, "state": state, "policy": "all"}),
                  ("no delay", {"scene": scene, "policy": "no delay"})],
             )  # fmt: skip
@@ -90,8 +89,8 @@ class Omega(SceneStudy):
             f"best at {best.x:g} ms{best.spread}, {best.over_last.text(digits)} better than the largest "
             f"omega; {table.no_delay_gain(metric, scene=scene, state=state)}."
         )
-        claim = f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1)."
-        about = f"{scene}, {state} traffic, threshold, {name}"
+        claim = f"there is an optimum between few and stale views, at {STATES[state][2]:g} ms (6.5.1)."
+        about = f"{scene}, {STATES[state][0]}, threshold, {name}"
         return [Verdict(about, claim, text, best.interior(least), best.over_last)]
 
     def _wait(self, table: Table, scene: str, state: str, metric: str, policy: str) -> list[Verdict]:
@@ -106,14 +105,14 @@ class Omega(SceneStudy):
         top = max(sign * m for m in means.values())
         plateau = next(x for x, m in means.items() if top - sign * m <= _NEAR[metric])
         loss, over = best.over_last, _best_against(table, metric, policy, labels)
-        about = f"{scene}, {state} traffic, {policy}, {name}"
+        about = f"{scene}, {STATES[state][0]}, {policy}, {name}"
         if metric.startswith("f_w"):
             claim = "has an optimum inside once freshness counts (6.5.2)."
             answer = best.interior(least)
         else:
             claim = (
                 f"waiting longer never makes it worse by more than {_NEAR[metric]:g} "
-                f"(a plateau from {STATES[state][2]:g} ms on, 6.5.2)."
+                f"(a plateau from {STATES[state][3]:g} ms on, 6.5.2)."
             )
             # It is not enough that no fall is seen: the loss at the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))

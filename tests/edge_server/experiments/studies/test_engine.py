@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.studies import engine as engine_module
+from edge_server.experiments.studies import trial as trial_module
 from edge_server.experiments.studies.engine import Engine, StudyError, content_key, run_task
 from edge_server.experiments.studies.trial import Trial, last_images, run_trial
 from freshfield.scenario import ScenarioError
@@ -63,6 +65,36 @@ def test_who_waits_longer_shows_what_moves_older():
         assert all(row["views"] == 8.0 and row["shown_psnr_still_db"] is not None for row in found)
         lost.append(np.median([row["psnr_moving_db"] - row["shown_psnr_moving_db"] for row in found]))
     assert lost[1] > lost[0] + 0.5
+
+
+def shown_after_ms(trial: Trial, monkeypatch) -> list[float]:
+    """How long after their publication a trial's pictures are looked at."""
+    after_ms: list[float] = []
+    scores = trial_module._shown_scores
+
+    def noted(publication, deployment, rng):
+        truth = deployment.truth
+        deployment.truth = SimpleNamespace(
+            nearest_ns=truth.nearest_ns,
+            score=lambda shown, at_ns: after_ms.append((at_ns - publication.published_ns) / 1e6),
+        )
+        found = scores(publication, deployment, rng)
+        deployment.truth = truth
+        return found
+
+    with monkeypatch.context() as patched:
+        patched.setattr(trial_module, "_shown_scores", noted)
+        run_trial(trial, NO_DATA)
+    return after_ms
+
+
+def test_a_picture_is_looked_at_until_the_next_could_come(monkeypatch):
+    free = shown_after_ms(replace(TRIAL, policy="all", value=None), monkeypatch)
+    assert [int(ms // 10) for ms in free] == [0, 1, 2], "a capture period, where nothing takes time"
+    charged = shown_after_ms(replace(TRIAL, compute={"ms_per_step": 75.0}), monkeypatch)
+    assert [int(ms // 100) for ms in charged] == [0, 1, 2]
+    two = shown_after_ms(replace(TRIAL, scratch=False, decisions=2, settle=1), monkeypatch)
+    assert len(two) == len(set(two)) == 6, "of the decisions that count, at instants of their own"
 
 
 def test_nothing_is_old_where_nothing_is_delayed_and_flushing_frees_the_links():

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.experiments.studies import preferences, viewpoints
 from edge_server.experiments.studies.engine import Engine
 from edge_server.experiments.studies.study import StudyRequest, run_study
+from edge_server.experiments.viewpoints.reconstructions import varied_plan
+from edge_server.fields import Rendering, View
+from edge_server.viewpoints.candidates import half_hemisphere
+from freshfield.geometry import Pinhole
 
 TINY = viewpoints.Workload((3, 8), 16, 3, 24)
 
@@ -56,6 +62,32 @@ def test_a_policy_is_judged_by_quality_and_by_its_way():
         (f"{about}, path", "shorter than random's (table 4.3)."): "holds",
         (f"{about}, path", "shorter than FisherRF's (table 4.3)."): "does not hold",
     }
+
+
+def test_a_capture_of_a_transparent_object_is_scored_over_the_scenes_background():
+    """A perfect reconstruction of a picture that is nearly all transparent."""
+    lens, pose = Pinhole(32, 32, 30.0, 30.0, 16.0, 16.0), np.eye(4)
+    image = np.zeros((32, 32, 4), np.uint8)
+    image[10:20, 10:20] = (200, 50, 50, 255)
+
+    class Perfect:
+        def render(self, *camera):
+            color = np.where(image[..., 3:] > 0, image[..., :3] / 255.0, 1.0).astype(np.float32)
+            return Rendering(color, np.ones((32, 32), np.float32), np.ones((32, 32), np.float32))
+
+    view = View("test", image, pose, lens)
+    stage = SimpleNamespace(
+        background=(1.0, 1.0, 1.0), held_out=(view,), fit=lambda *_: Perfect(),
+        score=lambda made, scorer: score_views(made, (view,), scorer)[0],
+    )  # fmt: skip
+    made = SimpleNamespace(views=[view], stops=[SimpleNamespace(seconds=0.0)] * 2, path_m=1.0)
+    assert preferences._measured(stage, made, TINY, 0)["psnr_db"] > 60.0
+
+
+def test_plans_to_compare_have_the_views_asked_for_where_candidates_are_few():
+    some = half_hemisphere(np.zeros(3), 1.0, Pinhole(16, 16, 15.0, 15.0, 8.0, 8.0), 16)
+    stage = SimpleNamespace(candidates=some, take=lambda k: k)
+    assert {len(varied_plan(stage, k, 8).order) for k in range(12)} == {8}
 
 
 @pytest.mark.slow

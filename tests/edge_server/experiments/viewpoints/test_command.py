@@ -12,7 +12,7 @@ from edge_server.cli import main
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.viewpoints.command import read_budget
 from edge_server.experiments.viewpoints.reconstructions import viewing_path
-from edge_server.experiments.viewpoints.stage import open_stage
+from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.candidates import half_hemisphere
 from edge_server.viewpoints.plan import Budget
@@ -37,6 +37,7 @@ def test_a_capture_is_planned_and_written(tmp_path, capsys):
         (["tile", "--budget", "0"], "at least 1 view"),
         (["tile", "--budget", "4", "--selector", "best"], "no selector is called"),
         (["tile", "--budget", "4", "--travel", "-1"], "--travel"),
+        (["tile", "--budget", "4", "--selector", "ppo:none.npz"], "not a viewpoint policy"),
         (["nowhere", "--budget", "4"], "nowhere"),
         (["tower", "--budget", "4"], "its cameras look outward"),
     ],
@@ -60,6 +61,17 @@ def test_an_arm_says_which_candidates_it_reaches():
     assert stage.take(int(np.flatnonzero(reached)[0])).image.shape == (16, 16, 3)
     far = np.linalg.norm(stage.candidates.poses[:, :3, 3] - stage.candidates.target, axis=1)
     np.testing.assert_allclose(far, 0.34)
+
+
+def test_a_transparent_picture_is_embedded_as_it_looks_over_the_background():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (64, 64, 4), dtype=np.uint8)
+    picture[..., 3] = 255 * (picture[..., 3] > 127)
+    over_white = np.where(picture[..., 3:] > 0, picture[..., :3], 255).astype(np.uint8)
+    white, black = open_embedder((1.0, 1.0, 1.0))[0], open_embedder((0.0, 0.0, 0.0))[0]
+    assert white is not None and black is not None
+    np.testing.assert_array_equal(white([picture]), black([over_white]))
+    assert np.abs(white([picture]) - black([picture])).max() > 0.0
 
 
 @pytest.mark.slow
