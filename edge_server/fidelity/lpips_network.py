@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from edge_server.torch_threads import one_torch_thread
+
 # ImageNet's statistics, restated by the authors for inputs in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -38,7 +40,7 @@ class Network:
     def distances(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
         """Of image pairs (N, H, W, 3), floating in [0, 1]: (N,)."""
         n = len(renderings)
-        with torch.inference_mode():
+        with torch.inference_mode(), one_torch_thread():
             x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)
             pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
             pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)

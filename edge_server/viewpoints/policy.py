@@ -38,14 +38,15 @@ class PolicyConfig:
     """How a policy is trained.
 
     views: of an episode. updates, episodes: of training, and of each update.
-    way: cost of a metre, in standard deviations of the reward of a step.
+    way: cost of a way as long as the candidates' mean distance from the target, in standard deviations of
+        the reward of a step: the same plan for a large scene as for a small one.
     gamma: discount of (4.14). Others as in ``learner_spec.Spec``.
     """
 
     views: int = 8
     updates: int = 60
     episodes: int = 16
-    way: float = 0.5
+    way: float = 0.4
     gamma: float = 1.0
     hidden: int = 32
     learning_rate: float = 3e-3
@@ -65,7 +66,8 @@ class Rows:
         self.steps = StepFeatures(candidates)
         self.embeddings, self.layout = embeddings, layout
         at = candidates.poses[:, :3, 3] - candidates.target
-        at = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
+        self.far_m = max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
+        at = at / self.far_m
         turns = np.stack([so3_log(pose[:3, :3]) for pose in candidates.poses])
         self._poses = np.column_stack([at, turns])
 
@@ -156,6 +158,8 @@ def train_policy(
     """
     import torch
 
+    from edge_server.torch_threads import one_torch_thread
+
     usable = np.flatnonzero(candidates.reachable)
     if not 2 <= config.views <= len(usable):
         raise ViewpointError(
@@ -174,16 +178,12 @@ def train_policy(
     critic = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_value(spec, rng).items()}
     parameters = [*actor.values(), *critic.values()]
     adam = torch.optim.Adam(parameters, lr=config.learning_rate)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the thread count changes the last bits
     returns: list[float] = []
-    try:
+    with one_torch_thread():
         for _ in range(config.updates):
             batch = _episodes(rows, reward, scale, config, _numpy(actor), _numpy(critic), spec, rng)
             returns.append(batch["mean"])
             _improve(batch, actor, critic, parameters, adam, spec, config, rng)
-    finally:
-        torch.set_num_threads(threads)
     return CandidatePolicy(spec, _numpy(actor), embed), returns
 
 
@@ -206,7 +206,7 @@ def _episodes(
         logps = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         chosen = np.argmax(logps + rng.gumbel(size=logps.shape), axis=1)
         taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
-        gained = reward(taken) / scale - config.way * taken[:, way]
+        gained = reward(taken) / scale - config.way * taken[:, way] / rows.far_m
         values = networks.value(np, spec, critic, features)
         kept.append((features, closed, chosen, logps[np.arange(count), chosen], gained, values))
         for order, k in zip(orders, chosen):

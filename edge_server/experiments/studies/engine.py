@@ -48,11 +48,6 @@ def run_task(task: Task, folders: Folders, kind: str | None = None) -> list[Row]
         raise StudyError(
             f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor"
         )
-    if folders.lpips is not None:
-        import torch
-
-        # The thread count changes the last bits of a convolution.
-        torch.set_num_threads(1)
     return [run_trial(Trial(**mapping), folders) for mapping in task]
 
 

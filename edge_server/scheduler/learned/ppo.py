@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
+from edge_server.torch_threads import one_torch_thread
 
 # Bounds exp: larger ratios are far outside the clip anyway.
 _MAX_LOG_RATIO = 20.0
@@ -186,7 +186,7 @@ class Learner:
         if len(cameras):
             self._cameras_seen += len(cameras)
             self._mean_features += (cameras - self._mean_features).sum(axis=0) / self._cameras_seen
-        with _one_thread():
+        with one_torch_thread():
             done = self._passes(
                 torch.tensor(batch.features[usable]),
                 torch.tensor(batch.actions[usable]),
@@ -406,14 +406,3 @@ class _RunningMeanStd:
 
     def as_json(self) -> dict[str, Any]:
         return {"count": self.count, "mean": self.mean, "variance": self.variance}
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sum in one order on any machine, without threads that compete with the field's."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -58,6 +58,28 @@ def test_a_batch_gives_what_single_pairs_give(network):
     assert lpips.batch(a, b) == pytest.approx([lpips(x, y) for x, y in zip(a, b)], abs=1e-6)
 
 
+def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
+    """Two that spin for each other take forty times as long on a busy machine, and may round otherwise."""
+    import torch
+
+    from edge_server.fidelity import lpips_network
+
+    lpips, used, conv2d = metric("alex"), [], torch.nn.functional.conv2d
+
+    def noted(*args):
+        used.append(torch.get_num_threads())
+        return conv2d(*args)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        monkeypatch.setattr(lpips_network.F, "conv2d", noted)
+        lpips(example("p0"), example("ref"))
+        assert set(used) == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("network", GOLDEN)
 def test_the_smallest_image_works_and_a_smaller_one_is_refused_with_the_limit(network):
     lpips = metric(network)

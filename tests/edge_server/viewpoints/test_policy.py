@@ -56,6 +56,13 @@ def test_the_way_is_a_cost():
     assert np.mean(ways[0]) < 0.7 * np.mean(ways[1])
 
 
+def test_a_large_scene_is_gone_round_as_a_small_one():
+    short = PolicyConfig(views=4, updates=4, episodes=6, hidden=8, way=3.0)
+    large = half_hemisphere((0, 0, 0), 8.0, LENS, 30)  # a power of two rounds nothing otherwise
+    (small, a), (big, b) = (train_policy(c, height, short, seed=3) for c in (DOME, large))
+    assert a == b and all(np.array_equal(small.weights[k], big.weights[k]) for k in small.weights)
+
+
 def test_training_repeats_by_seed_and_unreachable_candidates_are_never_taken():
     half = DOME.within(np.arange(30) % 2)
     short = PolicyConfig(views=4, updates=2, episodes=6, hidden=8)
