@@ -226,6 +226,11 @@ class VirtualDeployment:
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
+    def flush(self) -> None:
+        """Abort transmissions now (thesis 6.5: nothing is considered to be in transit)."""
+        for link in self._links.values():
+            self._take(link.flush(self.clock.now_ns() - self._channel_origin_ns))
+
     @property
     def capture_period_ns(self) -> int:
         """Of the fastest camera."""
@@ -325,10 +330,6 @@ class VirtualDeployment:
             if event.kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
                 self._deliver(event.transit.item, event.transit.flips)
 
-    def _flush(self, now_ns: int) -> None:
-        """Abort transmissions (thesis 6.5: nothing is considered to be in transit)."""
-        for link in self._links.values():
-            self._take(link.flush(now_ns - self._channel_origin_ns))
 
     def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> str | None:
         """A frame arrives at the edge; the reason if it is refused."""
@@ -385,7 +386,7 @@ class VirtualDeployment:
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
             if plan.flush:
-                self._flush(decided_ns)
+                self.flush()
             while (selection := updates.select(plan, self.clock.now_ns(), most_new=most_new)) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL

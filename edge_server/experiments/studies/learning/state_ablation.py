@@ -24,7 +24,7 @@ from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.scheduler.learned.learner_spec import Action
 
 EPISODES = {True: 100, False: 600}
-WHICH_VIEWS, CHAPTER_6 = "which views", "chapter 6"
+WHICH_VIEWS, CHAPTER_6, FLUSHED = "which views", "chapter 6", "chapter 6, flushed"
 # name -> parts of the state
 VARIANTS = {
     "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
@@ -45,7 +45,7 @@ class Ablation(TrainingStudy):
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
     def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
-        cases = {WHICH_VIEWS: self._which_views, CHAPTER_6: self._chapter_6}
+        cases = {WHICH_VIEWS: self._which_views, CHAPTER_6: self._chapter_6, FLUSHED: self._flushed}
         for case in request.chosen(list(cases), [WHICH_VIEWS]):
             yield cases[case](trainer, request)
 
@@ -63,18 +63,34 @@ class Ablation(TrainingStudy):
 
     def _chapter_6(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
         variants = usable(LEFT_OUT)
+        evaluation = self._omegas(trainer, request, KINDS, variants)
+        return judge_chapter_6(evaluation, list(variants)), rows(evaluation, channel="ch6")
+
+    def _flushed(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
+        variants = usable(LEFT_OUT)
+        fullest = {name: variants[name] for name in list(variants)[:1]}
+        # Nothing is on its way at a decision: what arrives later was generated later, and both readings agree.
+        flushed = self._omegas(trainer, request, ("wait",), variants, flush=True)
+        kept = self._omegas(trainer, request, ("wait",), fullest)
+        found = judge_flushed(flushed, kept, list(variants))
+        return found, [*rows(flushed, channel="ch6, flushed"), *rows(kept, channel="ch6")]
+
+    def _omegas(
+        self, trainer: StudyTrainer, request: StudyRequest, kinds: Sequence[Action],
+        variants: dict[str, tuple[str, ...]], flush: bool = False,
+    ) -> Evaluation:  # fmt: skip
+        """Omega by every variant of the state, and all fixed ones."""
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
-        setting = room("ch6", held_out=FOUR_VIEWPOINTS, parts=parts)
+        setting = room("ch6", held_out=FOUR_VIEWPOINTS, parts=parts, flush=flush)
         reward = dataclasses.replace(trainer.reward("corrected"), age=THESIS_AGE)
         candidates: dict[str, Candidate] = {}
-        for kind in KINDS:
+        for kind in kinds:
             candidates |= simple_policies(kind)
             for name, used in variants.items():
                 config = trainer.config(kind, reward, EPISODES, layout_of(setting, used), tries=3)
-                folder = f"{self.name}-ch6-{kind}-{name.replace(', ', '-')}"
+                folder = f"{self.name}-ch6-{kind}{'-flushed' * flush}-{name.replace(', ', '-')}"
                 candidates |= trainer.actors(learnt(kind, name), folder, setting, config)
-        evaluation = trainer.evaluate(setting, candidates, reward, len(request.repeats(16, 100)))
-        return judge_chapter_6(evaluation, list(variants)), rows(evaluation, channel="ch6")
+        return trainer.evaluate(setting, candidates, reward, len(request.repeats(16, 100)))
 
 
 def usable(variants: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
@@ -92,19 +108,7 @@ def learnt(kind: str, variant: str) -> str:
 
 def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
     """Verdicts on omega as each variant of the state chooses it, and on the two readings of wait."""
-    found = []
-    for kind in KINDS:
-        best, text = evaluation.best_fixed(kind)[0], fixed_of(evaluation, kind)
-        trained = {name: evaluation.runs(learnt(kind, name)) for name in variants}
-        about = f"room, ch6, {kind}"
-        found += [
-            better(f"{about}, by {name}", "better than the best fixed omega.", runs, best,
-                   f"against {text}; ") for name, runs in trained.items()
-        ]  # fmt: skip
-        found += [
-            better(about, f"better by {WHOLE} than by {name}.", trained[WHOLE], runs)
-            for name, runs in trained.items() if WHOLE in trained and name != WHOLE
-        ]  # fmt: skip
+    found = [v for kind in KINDS for v in _left_out(evaluation, variants, kind, f"room, ch6, {kind}")]
     fullest = variants[0]
     arrived, generated = (evaluation.runs(learnt(k, fullest)) for k in ("wait-arrived", "wait"))
     claim = "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5)"
@@ -114,6 +118,32 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
         better("room, ch6, both learnt", f"{claim}.", arrived, generated),
         better("room, ch6, both at their best fixed omega", f"{claim}.", best_arrived, best_generated),
     ]
+
+
+def _left_out(evaluation: Evaluation, variants: Sequence[str], kind: str, about: str) -> list[Verdict]:
+    """Verdicts on one kind: against its best fixed omega, and by the whole state against by its parts."""
+    best, text = evaluation.best_fixed(kind)[0], fixed_of(evaluation, kind)
+    trained = {name: evaluation.runs(learnt(kind, name)) for name in variants}
+    found = [
+        better(f"{about}, by {name}", "better than the best fixed omega.", runs, best, f"against {text}; ")
+        for name, runs in trained.items()
+    ]
+    return found + [
+        better(about, f"better by {WHOLE} than by {name}.", trained[WHOLE], runs)
+        for name, runs in trained.items() if WHOLE in trained and name != WHOLE
+    ]  # fmt: skip
+
+
+def judge_flushed(flushed: Evaluation, kept: Evaluation, variants: Sequence[str]) -> list[Verdict]:
+    """Verdicts on wait where what is on its way at a decision is broken off, and against where it is not."""
+    fullest, claim = variants[0], "a flush before the wait serves better than none (6.5)."
+    return [
+        *_left_out(flushed, variants, "wait", "room, ch6, flushed, wait"),
+        better("room, ch6, both learnt", claim,
+               flushed.runs(learnt("wait", fullest)), kept.runs(learnt("wait", fullest))),
+        better("room, ch6, both at their best fixed omega", claim,
+               flushed.best_fixed("wait")[0], kept.best_fixed("wait")[0]),
+    ]  # fmt: skip
 
 
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:

@@ -17,7 +17,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from edge_server.config import read_config
+from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
@@ -143,23 +143,32 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("policies", nargs="+", metavar="NAME[:VALUE]")
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="[%(default)s]")
     parser.add_argument("--seconds", type=float, default=SPAN_MS / 1e3, help="that are scored [%(default)g]")
+    parser.add_argument("--costs", type=Path, metavar="FILE",
+        help="of `edge-server costs` [edge.compute of the scenario]")  # fmt: skip
+    parser.add_argument("--slower", type=float, default=1.0, metavar="K",
+        help="an edge on which all computing takes K times as long [%(default)g]")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes [%(default)s]")
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="finished runs: beside it")
     add_folders(parser)
     args = parser.parse_args(argv)
     scenario = load(args.scenario)
-    scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
+    edge = {**scenario.edge, "policy": {"name": "all"}}
+    if args.costs:
+        edge["compute"] = str(args.costs.resolve())
+    scenario = dataclasses.replace(scenario, edge=edge)
+    charged = dataclasses.asdict(read_config(scenario).compute)
+    compute = ComputeConfig(**{name: args.slower * ms for name, ms in charged.items()})
     setting = Setting(
-        scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=read_config(scenario).compute,
-        parts=STATE_PARTS,
-    )  # fmt: skip
+        scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=compute, parts=STATE_PARTS
+    )
     args.json.parent.mkdir(parents=True, exist_ok=True)
     with WorkerPool(folders_of(args), args.jobs) as pool:
         seeds = seeds_of(scenario.seed, "test", args.seeds)
         found = compare(setting, pool, seeds, args.policies, args.json.with_suffix(".jsonl"))
     write_json(args.json, {
         "scenario": scenario.name, "seeds": args.seeds, "lead_s": LEAD_MS / 1e3, "seconds": args.seconds,
-        "judged_from": setting.scoring, "commit": commit(), "policies": found,
+        "judged_from": setting.scoring, "compute": dataclasses.asdict(compute), "commit": commit(),
+        "policies": found,
     }, indent=1)  # fmt: skip
 
 

@@ -101,7 +101,7 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
 
     settings = RunSettings(
         steps=edge.steps, compute=setting.compute, grace_ms=edge.grace_ms,
-        epoch_ms=0.0 if edge.updates == "arrivals" else edge.update_ms,
+        epoch_ms=edge.update_ms,
         score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS,
     )  # fmt: skip
     deployment = build_deployment(

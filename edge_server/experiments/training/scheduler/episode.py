@@ -1,7 +1,8 @@
 """Episodes: run a virtual deployment, draw decisions from it, and evaluate choices with field fits.
 
 The channel does not depend on the edge's decisions, so one recorded run serves every action at every
-decision, and the record gives the buffer at any instant. Each choice gets its own field fit, from nothing or
+decision, and the record gives the buffer at any instant. (Where a decision flushes the links, it has a record
+of its own, whose one flush every action shares.) Each choice gets its own field fit, from nothing or
 from a copy of the same warm field, so actions of one decision are comparable (thesis 5.4, algorithm 1; 6.3,
 algorithm 2).
 """
@@ -250,38 +251,48 @@ class Episode:
     def __init__(self, factory: EpisodeFactory, seed: int) -> None:
         began_s = time.process_time()
         self._factory, setting = factory, factory.setting
-        scenario = replace(factory.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
-        stage = factory.stage(seed)
-        self._truth = stage.truth
-        heard = tuple(c for c in scenario.cameras if c not in setting.silent)
-        self._deployment: VirtualDeployment = build_deployment(
-            replace(scenario, cameras=heard),
-            RunSettings(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
-            field=factory.field(seed),
-            cameras=[camera for camera in stage.cameras if camera.name in heard],
-            data=factory.folders.data,
-            truth=stage.truth,
-        )
-        recorder = _Recorder([c for c in scenario.training if c in heard])
-        self._deployment.updates.buffer = recorder
-        rng = scenario.rng("decisions")
+        self.seed = seed
+        self._truth = factory.stage(seed).truth
+        rng = factory.scenario(seed).rng("decisions")
         lead, span = setting.lead_ms / GRID_MS, setting.span_ms / GRID_MS
         at = np.sort(rng.integers(round(lead), round(lead + span), setting.decisions))
         self.instants_ns = [int(tick) * GRID_MS * 10**6 for tick in at]
         self._until_ns = self.instants_ns[-1] + round(setting.horizon_ms * 1e6)
-        self._deployment.run(self._until_ns / 1e9)
-        self._record = [
-            Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in recorder.record
-        ]
-        self._frames = {(b.frame.camera, b.frame.sequence): b for b in recorder.record}
+        self._frames: dict[tuple[str, int], BufferedFrame] = {}
+        self._deployment, self._record = self._recorded()
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
-        self.seed = seed
         self._embeddings = factory.embeddings()
         self.moments = tuple(self._moment(number) for number in range(setting.decisions))
         self.spent_s = 0.0
         """Processor time of all evaluations so far; the first includes the episode's construction."""
         self._owed_s = time.process_time() - began_s
+
+    def _recorded(self, flush_ns: int | None = None) -> tuple[VirtualDeployment, list[Arrival]]:
+        """The deployment run to the record's end, and what arrived. flush_ns: when its links are flushed."""
+        factory, setting = self._factory, self._factory.setting
+        scenario, stage = factory.scenario(self.seed), factory.stage(self.seed)
+        heard = tuple(c for c in scenario.cameras if c not in setting.silent)
+        edge = {**setting.scenario.edge, "policy": {"name": "all"}}
+        deployment: VirtualDeployment = build_deployment(
+            replace(scenario, cameras=heard, edge=edge),
+            RunSettings(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
+            field=factory.field(self.seed),
+            cameras=[camera for camera in stage.cameras if camera.name in heard],
+            data=factory.folders.data,
+            truth=stage.truth,
+        )
+        recorder = _Recorder([c for c in scenario.training if c in heard])
+        deployment.updates.buffer = recorder
+        if flush_ns is not None:
+            deployment.run(flush_ns / 1e9)
+            deployment.flush()
+        deployment.run((self._until_ns - deployment.clock.now_ns()) / 1e9)
+        record = recorder.record
+        self._frames |= {(b.frame.camera, b.frame.sequence): b for b in record}
+        return deployment, [
+            Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record
+        ]
 
     def evaluate(self, number: int, choice: Choice) -> Outcome:
         """Fit the choice at a decision and score it at publication on the setting's scoring cameras. An empty
@@ -324,10 +335,11 @@ class Episode:
         return Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
 
     def _moment(self, number: int) -> DecisionPoint:
-        now_ns = self.instants_ns[number]
+        setting, now_ns = self._factory.setting, self.instants_ns[number]
+        record = self._recorded(now_ns)[1] if setting.flush else self._record
         before: dict[str, list[Arrival]] = {}
         after: list[Arrival] = []
-        for arrival in self._record:
+        for arrival in record:
             if arrival.received_ns > now_ns:
                 after.append(arrival)
                 continue
@@ -336,7 +348,6 @@ class Episode:
         known = sorted((a for kept in before.values() for a in kept), key=lambda a: a.received_ns)
         reported = [max(kept, key=lambda a: a.generated_ns) for kept in before.values()]
         newest = {item.frame.camera: item for item in self._exposed(reported)}
-        setting = self._factory.setting
         cameras = setting.scenario.training
         state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
         return DecisionPoint(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)

@@ -50,6 +50,7 @@ class Setting:
     repeat: number of the fields' random stream, to measure the variance of repeated fits. compute: virtual
     time charged per update. parts: of the state (6.33); only "semantics" embeds frames, as the scenario's
     ``edge.embedding`` configures. silent: cameras that never send.
+    flush: what is on its way at each decision is broken off (6.5), whatever is chosen.
     """
 
     scenario: Scenario
@@ -68,6 +69,7 @@ class Setting:
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     parts: tuple[str, ...] = ("age", "pose")
     silent: tuple[str, ...] = ()
+    flush: bool = False
 
     def __post_init__(self) -> None:
         if not self.scenario.held_out:

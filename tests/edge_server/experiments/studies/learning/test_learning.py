@@ -191,6 +191,19 @@ def test_chapter_6_holds_if_and_only_if_the_whole_state_and_arrivals_are_better(
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_a_flush_holds_if_and_only_if_it_serves_better_learnt_and_fixed(gap, said):
+    kept: dict[str, float] = {**FIXED, **runs(state_ablation.learnt("wait", state_ablation.WHOLE), 3.0)}
+    flushed = {**kept, **{name: level + gap for name, level in kept.items()}}
+    for name in list(state_ablation.LEFT_OUT)[1:]:
+        flushed |= runs(state_ablation.learnt("wait", name), 2.0)
+    verdicts = state_ablation.judge_flushed(
+        evaluation_of(flushed), evaluation_of(kept), list(state_ablation.LEFT_OUT)
+    )
+    assert len(verdicts) == 7 + 2 and answers(verdicts, "a flush before") == {said}
+    assert answers(verdicts, "better by Z, age, pose than") == {HOLDS}
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
     found = evaluation_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
     for moves in (True, False):

@@ -61,6 +61,7 @@ def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
         "threshold:70",
         "wait:60",
         "wait-arrived:60",
+        "wait-flush:60",
         "freshest-k:2",
         "freshen",
         "periodic:400",
@@ -72,7 +73,8 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
         learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
         learner.save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
-    factory = EpisodeFactory(setting(compute=Compute(5.0)), NOTHING)
+    flush = policy.startswith("wait-flush")
+    factory = EpisodeFactory(setting(compute=Compute(5.0), flush=flush), NOTHING)
     moment = factory.episode(5).moments[0]
     choice = choose(named(policy)(np.random.default_rng(0)), moment)
     found = factory.episode(5).evaluate(0, choice)
