@@ -277,7 +277,7 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     for module in (command, contest):
         monkeypatch.setattr(module, "LEAD_MS", 1200.0)
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
-    edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals"}
+    edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals", "update_ms": 20}
     asked = (
         "--kind threshold --hold 200 --omegas 50,200 --episodes 2 --batch 1 --decisions 3 --size 0 --test 1"
     )
@@ -310,11 +310,15 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
             "2",
             "--seconds",
             "0.6",
+            "--slower",
+            "3",
             "--json",
             str(compared),
         ]
     )
-    shown = json.loads(compared.read_text())["policies"]
+    found = json.loads(compared.read_text())
+    assert (found["compute"]["ms_per_step"], found["compute"]["ms_per_view"]) == (6.0, 3.0)
+    shown = found["policies"]
     assert shown["all"]["psnr_db_over_all"] == [0.0, 0.0, 0.0] and shown["all"]["views"][0] > 3.0
     for name in ("aoii:2", "covariance:2"):
         assert shown[name]["views"][0] == 2.0 and shown[name]["psnr_db"][0] > 5.0
