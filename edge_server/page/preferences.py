@@ -17,7 +17,7 @@ from typing import Any
 from edge_server.live.output.guarded_http import CALLER, serve_guarded
 from edge_server.page import PageError, page_url
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.preferences import PreferenceSession
+from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.access import CHANGE
 from freshfield.transport import Transport
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.reward import Answer
+from edge_server.viewpoints.preference_model import Answer
 
 Picture = NDArray[np.float32]
 _OBJECT = 0.08  # difference of a color from the background's, from which a pixel shows the object

@@ -7,11 +7,11 @@ import pytest
 
 from edge_server.fields import View
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
+from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.features import StepFeatures
-from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
+from edge_server.viewpoints.preference_model import Answer, fit_reward, next_pair
 from edge_server.viewpoints.registry import make_selector
-from edge_server.viewpoints.reward import Answer, fit_reward, next_pair
 from freshfield.geometry import Pinhole, look_at
 
 LENS = Pinhole.from_fov(16, 16, 50.0)

@@ -19,11 +19,11 @@ from edge_server.experiments.viewpoints.reconstructions import taste_score, vari
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
 from edge_server.fidelity.scorer import Scorer
 from edge_server.report.style import figure, label_lines
+from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import TASTES, SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
-from edge_server.viewpoints.plan import Budget, Plan, plan_capture
 from edge_server.viewpoints.policy import PolicyConfig, train_policy
-from edge_server.viewpoints.reward import RewardModel, fit_reward, next_pair
+from edge_server.viewpoints.preference_model import RewardModel, fit_reward, next_pair
 from freshfield.files import write_csv, write_text
 
 ASKED = (10, 20, 40, 60)

@@ -29,7 +29,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.live.scoring_thread import to_bytes
 from edge_server.report.style import figure, label_lines
-from edge_server.viewpoints.plan import Budget, Plan, plan_capture
+from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.registry import make_selector
 from freshfield.files import write_csv, write_text
 

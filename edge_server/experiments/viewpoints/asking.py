@@ -19,11 +19,11 @@ from edge_server.experiments.viewpoints.reconstructions import (
 )
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.capture_planner import Plan
 from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
-from edge_server.viewpoints.plan import Plan
 from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
-from edge_server.viewpoints.preferences import PERSON, PreferenceSession
+from edge_server.viewpoints.preference_session import PERSON, PreferenceSession
 from freshfield.files import write_json
 from freshfield.transport import Transport
 

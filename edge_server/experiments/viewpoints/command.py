@@ -21,10 +21,10 @@ from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.experts import TASTES
-from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.policy import CandidatePolicy
-from edge_server.viewpoints.preferences import PERSON
+from edge_server.viewpoints.preference_session import PERSON
 from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
 from freshfield.files import write_json

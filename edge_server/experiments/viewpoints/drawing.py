@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.report.style import CYCLE, GREY, INK, figure
-from edge_server.viewpoints.plan import Plan
+from edge_server.viewpoints.capture_planner import Plan
 
 _A_ROW = 3  # plans
 

@@ -16,8 +16,8 @@ from edge_server.fidelity.images import to_unit
 from edge_server.fields import Field
 from edge_server.live.scoring_thread import to_bytes
 from edge_server.viewpoints.candidates import Candidates
+from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import judge
-from edge_server.viewpoints.plan import Budget, Plan, plan_capture
 from edge_server.viewpoints.registry import make_selector
 from freshfield.files import write_bytes, write_json
 from freshfield.geometry import so3_exp

@@ -330,7 +330,6 @@ class VirtualDeployment:
             if event.kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
                 self._deliver(event.transit.item, event.transit.flips)
 
-
     def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> str | None:
         """A frame arrives at the edge; the reason if it is refused."""
         now_ns = self.clock.now_ns()

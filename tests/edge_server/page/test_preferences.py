@@ -12,7 +12,7 @@ import pytest
 
 from edge_server.page import PageError
 from edge_server.page.preferences import MAX_BODY_BYTES, PreferencePage
-from edge_server.viewpoints.preferences import PreferenceSession
+from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
 

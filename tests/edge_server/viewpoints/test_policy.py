@@ -9,8 +9,8 @@ import pytest
 
 from edge_server.fields import View
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
+from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.features import GEOMETRY
-from edge_server.viewpoints.plan import Budget, plan_capture
 from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
 from edge_server.viewpoints.registry import CaptureState, make_selector
 from freshfield.geometry import Pinhole

@@ -69,7 +69,7 @@ class Ablation(TrainingStudy):
     def _flushed(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
         variants = usable(LEFT_OUT)
         fullest = {name: variants[name] for name in list(variants)[:1]}
-        # Nothing is on its way at a decision: what arrives later was generated later, and both readings agree.
+        # Nothing is on its way at a decision: what arrives was generated later, and both readings agree.
         flushed = self._omegas(trainer, request, ("wait",), variants, flush=True)
         kept = self._omegas(trainer, request, ("wait",), fullest)
         found = judge_flushed(flushed, kept, list(variants))

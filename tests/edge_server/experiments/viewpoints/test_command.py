@@ -15,7 +15,7 @@ from edge_server.experiments.viewpoints.reconstructions import viewing_path
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.candidates import half_hemisphere
-from edge_server.viewpoints.plan import Budget
+from edge_server.viewpoints.capture_planner import Budget
 from freshfield.geometry import Pinhole
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.fields import View
 from edge_server.viewpoints.candidates import ViewpointError, from_poses, half_hemisphere
-from edge_server.viewpoints.plan import Budget, plan_capture
+from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.registry import SELECTORS, CaptureState, make_selector
 from freshfield.geometry import Pinhole
 

@@ -8,7 +8,7 @@ import pytest
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.experts import TASTES, SimulatedExpert, judge
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
-from edge_server.viewpoints.reward import Answer, fit_reward, next_pair
+from edge_server.viewpoints.preference_model import Answer, fit_reward, next_pair
 from freshfield.geometry import Pinhole
 
 DOME = half_hemisphere((0, 0, 0), 1.0, Pinhole.from_fov(16, 16, 50.0), 40)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.preferences import REPEAT_EVERY, PreferenceSession, Question
-from edge_server.viewpoints.reward import Answer, fit_reward
+from edge_server.viewpoints.preference_model import Answer, fit_reward
+from edge_server.viewpoints.preference_session import REPEAT_EVERY, PreferenceSession, Question
 
 FEATURES = np.random.default_rng(0).normal(size=(20, 4))
 ORDERS = tuple((k, k + 1) for k in range(20))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.reward import Answer, RewardModel, fit_reward, next_pair
+from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_reward, next_pair
 
 KIND: Literal["freshfield preference answers"] = "freshfield preference answers"
 PERSON = "person"
