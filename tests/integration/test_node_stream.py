@@ -166,6 +166,7 @@ def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
         assert sequences == sorted(set(sequences))  # nothing is ever sent twice
 
 
+@pytest.mark.slow  # waits out two timeouts
 def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link_is_given_time(tmp_path):
     async def scene():
         peer = await Peer().start()

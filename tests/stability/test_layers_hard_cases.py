@@ -243,7 +243,13 @@ def _begun(before: Callable[[float], Balls], spread: bool) -> Stage:
     return stage
 
 
-@pytest.mark.parametrize("name", CASES)
+# What begins otherwise than the others: their beginnings are long.
+OF_THEIR_OWN = ("two cross", "one enters and leaves")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(c, marks=[pytest.mark.slow] if c in OF_THEIR_OWN else []) for c in CASES]
+)
 def test_what_moves_is_shown_as_well_as_before_half_a_second_after(name: str) -> None:
     case = CASES[name]
     stage = _begun(case.before, case.spread).going_on_as(case)

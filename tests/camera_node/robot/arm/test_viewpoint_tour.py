@@ -91,6 +91,7 @@ def test_a_way_is_the_shortest_of_those_that_are_free():
     assert under.shortest_path(home, {0, 1, 2}) is None
 
 
+@pytest.mark.slow  # plans the whole tour twice
 def test_the_tour_begins_where_it_can_be_begun():
     free = cells_tour().stops[0]
     again = plan_tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]

@@ -92,6 +92,7 @@ def _curve(name, still, planned_s, seeds, lpips):
     return {"seeds": seeds, "series": series, "seconds_to_db": to_db, "best_db": 25.0, "outside_cores": 0.25}
 
 
+@pytest.mark.slow  # 9 s
 def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, asked, few_cameras):
     rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
              "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip

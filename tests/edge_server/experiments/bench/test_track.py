@@ -103,6 +103,7 @@ def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, monkeypatch, 
     assert fresh["psnr_db"] == fresh["not_updated_psnr_db"] and fresh["fitted_s"] == 15.0
 
 
+@pytest.mark.slow  # 9 s of updates
 def test_drift_is_the_same_at_length_and_kept_apart(tmp_path, flat):
     path = tmp_path / "bench.json"
     assert bench(path, "--field", "ngp") == 0
