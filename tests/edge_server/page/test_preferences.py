@@ -162,7 +162,9 @@ def grey(browser):
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("width", "height"), [(1200, 900), pytest.param(360, 740, marks=pytest.mark.slow)], ids=["wide", "narrow"])
+@pytest.mark.parametrize(
+    ("width", "height"), [(1200, 900), pytest.param(360, 740, marks=pytest.mark.slow)], ids=["wide", "narrow"]
+)
 def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
     page, url, kept = asked
     with Browser(url, width, height) as browser:
