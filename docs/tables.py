@@ -291,7 +291,7 @@ def card() -> str:
 
 
 def compared(file: str) -> str:
-    """What policies without learning show in the scenario card, and minus the first, over seeds."""
+    """What policies without learning show in a scenario, and minus the first of them, over seeds."""
     found = measured(f"docs/results/learning/{file}.json")
     first = next(iter(found["policies"]))
     columns = ("psnr_db", f"psnr_db_over_{first}", "psnr_moving_db", f"psnr_moving_db_over_{first}")
@@ -302,9 +302,15 @@ def compared(file: str) -> str:
     ]  # fmt: skip
     less = f"minus `{first}`"
     head = ("policy", "shown, dB", less, "moving, dB", less, "views an update", "their mean age, ms")
+    # A recording has one motion: its seeds differ in the channel alone.
+    of_each = "channel" if found["scenario"] == "kitchen" else "channel and motion"
+    charged = ""
+    if costs := found.get("compute"):
+        step, update, view = (f"{costs[f'ms_per_{part}']:.2g}" for part in ("step", "update", "view"))
+        charged = f" Computing: {step} ms a step, {update} an update, {view} a frame."
     return table(head, rows) + (
-        f"\n\n{found['seeds']} seeds, each with a motion of its own; {found['seconds']:g} s after "
-        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds."
+        f"\n\n{found['seeds']} seeds, each with a {of_each} of its own; {found['seconds']:g} s after "
+        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds.{charged}"
     )
 
 
@@ -562,6 +568,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "card": card,
     "compared": lambda: compared("policies"),
     "hindsight": lambda: compared("hindsight"),
+    "hindsight-overload": lambda: compared("hindsight-overload"),
+    "hindsight-kitchen": lambda: compared("hindsight-kitchen"),
     "figures": figures,
     "verdicts": verdicts,
     "masks": masks,
