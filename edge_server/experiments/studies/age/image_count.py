@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from edge_server.experiments.common.statistics import interval, negated, paired
+from edge_server.experiments.common.statistics import interval, negated, optimum, paired
 from edge_server.experiments.studies.drawing import draw_metrics
 from edge_server.experiments.studies.study import (
     METRICS,
+    Curve,
     Point,
     SceneStudy,
     StudyRequest,
@@ -61,4 +62,17 @@ class Images(SceneStudy):
             )
             answer = change.above(0.0) if rises else negated(change.above(0.0))
             verdicts.append(Verdict(f"{scene}, {name}", claim, text, answer, change))
+            if metric != "aaoi_ms":
+                verdicts.append(_best_count(f"{scene}, {name}", metric, curve))
         return verdicts
+
+
+def _best_count(about: str, metric: str, curve: Curve) -> Verdict:
+    """Whether fewer images than all are best, and more than the fewest."""
+    _, lower, digits, least = METRICS[metric]
+    best = optimum(curve, lower)
+    found = (
+        f"best with {best.x:g} images{best.spread}, {best.over_last.text(digits)} better than all of them."
+    )
+    claim = "there is an optimum between few and stale images (6.5.1)."
+    return Verdict(about, claim, found, best.interior(least), best.over_last)

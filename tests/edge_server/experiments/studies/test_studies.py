@@ -253,6 +253,17 @@ def test_images_judges_both_directions(tmp_path: Path):
         assert set(verdicts("images", tmp_path, rule).values()) == {answer}
 
 
+def test_images_finds_an_optimum_between_few_and_stale(tmp_path: Path):
+    for best, answer in ((8.0, "holds"), (18.0, "does not hold")):
+
+        def rule(trial, best=best):
+            count = trial.value or 18.0
+            return figures(2.0 - abs(math.log(count / best)) + noise(trial.seed, count), 30.0 * count)
+
+        found = [v for v in judged("images", tmp_path, rule) if "optimum" in v.claim]
+        assert len(found) == 3 and {v.verdict for v in found} == {answer}
+
+
 def test_representations_asks_all_of_them(tmp_path: Path):
     def rule(trial):
         return peak(75.0 if trial.field == "splat" else 9000.0)(trial)
