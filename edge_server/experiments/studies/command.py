@@ -82,6 +82,7 @@ with one training an arm; without it, with three and more episodes, most of a da
 
   edge-server study ppo-select --quick --case priced --episodes 600
   edge-server study drift --quick --case bursts --case dies
+  edge-server study ablation --quick --case flush --episodes 60
 
 Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs on one
 kind of processor. Results are kept in OUT/trials by content and processor; after Ctrl-C the same command goes

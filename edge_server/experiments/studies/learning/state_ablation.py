@@ -24,7 +24,7 @@ from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.scheduler.learned.learner_spec import Action
 
 EPISODES = {True: 100, False: 600}
-WHICH_VIEWS, CHAPTER_6, FLUSHED = "which views", "chapter 6", "chapter 6, flushed"
+WHICH_VIEWS, CHAPTER_6, FLUSHED = "which views", "chapter 6", "wait after a flush"
 # name -> parts of the state
 VARIANTS = {
     "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
@@ -73,7 +73,7 @@ class Ablation(TrainingStudy):
         flushed = self._omegas(trainer, request, ("wait",), variants, flush=True)
         kept = self._omegas(trainer, request, ("wait",), fullest)
         found = judge_flushed(flushed, kept, list(variants))
-        return found, [*rows(flushed, channel="ch6, flushed"), *rows(kept, channel="ch6")]
+        return found, [*rows(flushed, channel="ch6, flushed"), *rows(kept, channel="ch6, beside flushed")]
 
     def _omegas(
         self, trainer: StudyTrainer, request: StudyRequest, kinds: Sequence[Action],

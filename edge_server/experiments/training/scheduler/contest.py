@@ -6,6 +6,8 @@ what hindsight of each second would win with these thresholds:
 
     python -m edge_server.experiments.training.scheduler.contest card all whittle:1 hindsight:100,250,1000
         --json FILE
+
+Also on a machine of other costs: --costs, --slower.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import interval, paired
+from edge_server.experiments.common.statistics import at_its_best, interval, paired
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.training.scheduler.deployed import Hindsight, Judged
 from edge_server.experiments.training.scheduler.setting import Setting
@@ -31,7 +33,7 @@ from edge_server.report.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from freshfield.files import write_json
-from freshfield.scenario import load
+from freshfield.scenario import ScenarioError, load
 
 LEARNT = "learnt"
 REFERENCE = "all"
@@ -118,7 +120,8 @@ def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
 def compare(
     setting: Setting, pool: WorkerPool, seeds: range, names: Sequence[str], known: Path
 ) -> dict[str, dict[str, Any]]:
-    """What each policy shows, mean and interval over seeds, and minus the first of them, paired.
+    """What each policy shows, mean and interval over seeds, and minus the first of them, paired; hindsight
+    also minus the fixed policy that is best on other seeds.
 
     names: policies without learning, and their values; ``hindsight:`` and its thresholds. known: as in
     ``contest``.
@@ -127,7 +130,15 @@ def compare(
     for seed in seeds:  # of one motion after the other: its pictures are rendered once
         for name in names:
             runs[name] += _runs(setting, pool, range(seed, seed + 1), _named(name), "", known)
-    return _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
+    found = _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
+    fixed = [name for name in names if not name.startswith(HINDSIGHT)]
+    for metric in _SHOWN:
+        shown = {name: dict(zip(seeds, [run[metric] for run in of])) for name, of in runs.items()}
+        best = at_its_best({float(k): shown[name] for k, name in enumerate(fixed)})
+        for name in names:
+            if name.startswith(HINDSIGHT):
+                found[name][f"{metric}_over_fixed"] = paired(shown[name], best).rounded(4)
+    return found
 
 
 def _named(name: str) -> Judged:
@@ -138,9 +149,18 @@ def _named(name: str) -> Judged:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=compare.__doc__)
-    parser.add_argument("scenario")
-    parser.add_argument("policies", nargs="+", metavar="NAME[:VALUE]")
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {__spec__.name}",
+        description="What policies without learning show in a scenario in virtual time, over seeds, each "
+        "minus the first; and what hindsight of each second would win.",
+    )
+    parser.add_argument(
+        "scenario", help="scenario file, or the name of a shipped one, with computing charged"
+    )
+    parser.add_argument(
+        "policies", nargs="+", metavar="NAME[:VALUE]",
+        help="as edge.policy; hindsight:MS,MS,... takes each second the threshold that will show most",
+    )  # fmt: skip
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="[%(default)s]")
     parser.add_argument("--seconds", type=float, default=SPAN_MS / 1e3, help="that are scored [%(default)g]")
     parser.add_argument("--costs", type=Path, metavar="FILE",
@@ -151,25 +171,37 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="finished runs: beside it")
     add_folders(parser)
     args = parser.parse_args(argv)
-    scenario = load(args.scenario)
-    edge = {**scenario.edge, "policy": {"name": "all"}}
-    if args.costs:
-        edge["compute"] = str(args.costs.resolve())
-    scenario = dataclasses.replace(scenario, edge=edge)
-    charged = dataclasses.asdict(read_config(scenario).compute)
-    compute = ComputeConfig(**{name: args.slower * ms for name, ms in charged.items()})
-    setting = Setting(
-        scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=compute, parts=STATE_PARTS
-    )
+    try:
+        scenario = load(args.scenario)
+        edge = {**scenario.edge, "policy": {"name": "all"}}
+        if args.costs:
+            edge["compute"] = str(args.costs.resolve())
+        scenario = dataclasses.replace(scenario, edge=edge)
+        compute = _slower(read_config(scenario).compute, args.slower)
+        setting = Setting(
+            scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=compute, parts=STATE_PARTS
+        )
+    except (ScenarioError, ValueError) as error:
+        parser.error(str(error))
     args.json.parent.mkdir(parents=True, exist_ok=True)
     with WorkerPool(folders_of(args), args.jobs) as pool:
         seeds = seeds_of(scenario.seed, "test", args.seeds)
         found = compare(setting, pool, seeds, args.policies, args.json.with_suffix(".jsonl"))
     write_json(args.json, {
         "scenario": scenario.name, "seeds": args.seeds, "lead_s": LEAD_MS / 1e3, "seconds": args.seconds,
-        "judged_from": setting.scoring, "compute": dataclasses.asdict(compute), "commit": commit(),
-        "policies": found,
+        "judged_from": setting.scoring, "motions": setting.draws_motions,
+        "compute": dataclasses.asdict(compute), "commit": commit(), "policies": found,
     }, indent=1)  # fmt: skip
+
+
+def _slower(costs: ComputeConfig, times: float) -> ComputeConfig:
+    """``costs`` of a slower machine. ValueError: it would make no difference."""
+    charged = dataclasses.asdict(costs)
+    if not times > 0.0 or (times != 1.0 and not any(charged.values())):
+        raise ValueError(
+            f"--slower {times:g}: expected more than 0, and a scenario or --costs that charge something"
+        )
+    return ComputeConfig(**{name: times * ms for name, ms in charged.items()})
 
 
 if __name__ == "__main__":

@@ -289,6 +289,7 @@ class Episode:
             deployment.flush()
         deployment.run((self._until_ns - deployment.clock.now_ns()) / 1e9)
         record = recorder.record
+        # For their images alone: when a frame was received depends on the record.
         self._frames |= {(b.frame.camera, b.frame.sequence): b for b in record}
         return deployment, [
             Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record
@@ -369,7 +370,7 @@ class Episode:
         setting, field = self._factory.setting, self._factory.field(self.seed)
         while len(self._warm) <= number:
             moment = self.moments[len(self._warm)]
-            # The deployment's record has every delivery by then; the decision's record does not.
+            # The record has every delivery by then; a decision keeps only each camera's last two.
             then_ns = moment.now_ns - round(setting.refresh_ms * 1e6)
             if self._warm:
                 field.load_state(self._warm[-1])

@@ -12,11 +12,18 @@ import numpy as np
 import pytest
 import yaml
 
+from edge_server.config import ComputeConfig
 from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.training.scheduler import command, contest
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
-from edge_server.experiments.training.scheduler.deployed import Decided, Hindsight, judge, sibling_advantages
+from edge_server.experiments.training.scheduler.deployed import (
+    Decided,
+    Hindsight,
+    _run,
+    judge,
+    sibling_advantages,
+)
 from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
@@ -322,7 +329,25 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     assert shown["all"]["psnr_db_over_all"] == [0.0, 0.0, 0.0] and shown["all"]["views"][0] > 3.0
     for name in ("aoii:2", "covariance:2"):
         assert shown[name]["views"][0] == 2.0 and shown[name]["psnr_db"][0] > 5.0
-    assert shown["hindsight:50,200"]["psnr_db"][0] > 5.0
+    ahead = shown["hindsight:50,200"]
+    assert ahead["psnr_db"][0] > 5.0 and len(ahead["psnr_db_over_fixed"]) == 3
+    with pytest.raises(SystemExit):
+        contest.main([words[0], "all", "--slower", "0", "--json", str(compared)])
+    assert "--slower 0: expected more than 0" in capsys.readouterr().err
+
+
+def test_a_running_deployment_decides_as_often_as_an_update_lasts_and_takes_in_what_it_has_time_for():
+    """As ``edge-server simulate`` does where updates follow arrivals."""
+    costs = ComputeConfig(ms_per_step=2.0, ms_per_view=1.0)
+    small = setting(compute=costs, lead_ms=400.0, span_ms=1200.0)
+    edge = {**small.scenario.edge, "updates": "arrivals", "update_ms": 50.0, "steps": 2, "grace_ms": 0.0}
+    small = dataclasses.replace(small, scenario=dataclasses.replace(small.scenario, edge=edge))
+    deployment, _ = _run(
+        EpisodeFactory(small, NOTHING), 5, make_policy("all", None, np.random.default_rng(0))
+    )
+    decided_ms = [p.published_ns / 1e6 - p.update_ms for p in deployment.publications]
+    assert len(decided_ms) > 10 and np.median(np.diff(decided_ms)) == pytest.approx(50.0)
+    assert deployment.settings.most_new == 96
 
 
 def test_hindsight_with_one_decision_shows_what_the_best_threshold_shows():
