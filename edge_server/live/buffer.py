@@ -14,6 +14,8 @@ from freshfield.frame import BufferedFrame, Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 
 MOST_UNSELECTED = 8  # frames of a camera that wait for a field that wants every frame
+LONGEST_WAIT = 16  # takes without a frame of a camera that has one
+_AS_YOUNG_NS = 1_000_000  # about what clocks agree to: frames no further apart are equally young
 
 
 class FrameBuffer:
@@ -95,14 +97,15 @@ class FrameBuffer:
         """Which of the newest frames ``selected`` to use, and which others of their cameras that have arrived
         up to then, in the order of their arrival. ``selected`` and none without ``keep_every_frame``.
 
-        most: number of frames that have not been taken before. The newest of each camera come first, of these
-        those of the cameras that have waited longest; then the second newest of each, and so on. What exceeds
-        it is dropped and counted in ``shed``, except for a camera's newest frame, which waits on. Frames of
-        other cameras are dropped.
+        most: number of frames that have not been taken before. The newest of each camera come first: of these
+        those of cameras that have waited for ``LONGEST_WAIT`` takes, then the youngest, and of equally young
+        ones those of the cameras that have waited longest. Then the second newest of each, and so on. What
+        exceeds it is dropped and counted in ``shed``, except for a camera's newest frame, which waits on.
+        Frames of other cameras are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.frame.camera: item for item in selected}
-        ranked: list[tuple[int, int, int, BufferedFrame]] = []
+        ranked: list[tuple[tuple[int, bool, int, int, int], BufferedFrame]] = []
         with self._arrived:
             if self._unselected is None:
                 self.held_back = 0
@@ -115,8 +118,11 @@ class FrameBuffer:
                 if camera in own:
                     arrived.sort(key=lambda item: (-item.generated_ns, item is not own[item.frame.camera]))
                     last = self._last_take[camera]
-                    ranked += [(k, last, -item.generated_ns, item) for k, item in enumerate(arrived)]
-            ordered = [item for *_, item in sorted(ranked, key=lambda one: one[:3])]
+                    patient = self._takes - last <= LONGEST_WAIT
+                    for k, item in enumerate(arrived):
+                        at_ns = item.generated_ns
+                        ranked.append(((k, patient, -(at_ns // _AS_YOUNG_NS), last, -at_ns), item))
+            ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
             for item in taken:
                 self._last_take[item.frame.camera] = self._takes
