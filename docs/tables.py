@@ -575,7 +575,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared": lambda: compared("policies"),
     "hindsight": lambda: compared("hindsight"),
     "hindsight-overload": lambda: compared("hindsight-overload"),
-    "hindsight-kitchen": lambda: compared("hindsight-kitchen"),
     "figures": figures,
     "verdicts": verdicts,
     "masks": masks,
