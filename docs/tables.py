@@ -300,7 +300,8 @@ def compared(file: str) -> str:
         if any(c in row for row in found["policies"].values())
     ]  # fmt: skip
     rows = [
-        [f"`{name}`", *("" if name == first and "over" in c else _interval(row.get(c)) for c in columns),
+        [f"`{name}`",
+         *("" if c not in row or (name == first and "over" in c) else _interval(row[c]) for c in columns),
          f"{row['views'][0]:.1f}", f"{row['aaoi_ms'][0]:.0f}"]
         for name, row in found["policies"].items()
     ]  # fmt: skip
@@ -574,6 +575,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "card": card,
     "compared": lambda: compared("policies"),
     "hindsight": lambda: compared("hindsight"),
+    "hindsight-kitchen": lambda: compared("hindsight-kitchen"),
     "hindsight-overload": lambda: compared("hindsight-overload"),
     "figures": figures,
     "verdicts": verdicts,
