@@ -311,13 +311,14 @@ def compared(file: str) -> str:
     ]
     head = ("policy", *less, "views an update", "their mean age, ms")
     of_each = "channel and motion" if found.get("motions", True) else "channel"
+    best = " Best fixed: on the other half of the seeds." if any(c.endswith("fixed") for c in columns) else ""
     charged = ""
     if costs := found.get("compute"):
         step, update, view = (f"{costs[f'ms_per_{part}']:.2g}" for part in ("step", "update", "view"))
         charged = f" Computing: {step} ms a step, {update} an update, {view} a frame."
     return table(head, rows) + (
         f"\n\n{found['seeds']} seeds, each with a {of_each} of its own; {found['seconds']:g} s after "
-        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds.{charged}"
+        f"{found['lead_s']:g}; commit {found['commit']}. Differences are paired over seeds.{best}{charged}"
     )
 
 

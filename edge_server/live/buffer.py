@@ -14,8 +14,8 @@ from freshfield.frame import BufferedFrame, Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 
 MOST_UNSELECTED = 8  # frames of a camera that wait for a field that wants every frame
-LONGEST_WAIT = 16  # takes without a frame of a camera that has one
-_AS_YOUNG_NS = 1_000_000  # about what clocks agree to: frames no further apart are equally young
+LONGEST_WAIT = 16  # takes since the last frame of a camera: its next one goes first, also after a blackout
+_AS_YOUNG_NS = 1_000_000  # frames of as many nanoseconds, counted from the youngest, are equally young
 
 
 class FrameBuffer:
@@ -40,7 +40,7 @@ class FrameBuffer:
         self.held_back = 0
         self._unselected: dict[str, deque[BufferedFrame]] | None = None
         self._takes = 0
-        self._last_take = dict.fromkeys(self.cameras, 0)  # that took a frame of a camera
+        self._last_take = dict.fromkeys(self.cameras, 0.0)  # that took a frame of a camera
 
     def put(self, frame: Frame, received_ns: int) -> None:
         """Keep ``frame`` unless a newer one of its camera is here.
@@ -98,14 +98,15 @@ class FrameBuffer:
         up to then, in the order of their arrival. ``selected`` and none without ``keep_every_frame``.
 
         most: number of frames that have not been taken before. The newest of each camera come first: of these
-        those of cameras that have waited for ``LONGEST_WAIT`` takes, then the youngest, and of equally young
-        ones those of the cameras that have waited longest. Then the second newest of each, and so on. What
-        exceeds it is dropped and counted in ``shed``, except for a camera's newest frame, which waits on.
-        Frames of other cameras are dropped.
+        those of cameras of which ``LONGEST_WAIT`` takes have had none, by how long that is; then the
+        youngest, and of equally young ones those of the cameras that have waited longest. Then the second
+        newest of each, and so on. What exceeds it is dropped and counted in ``shed``, except for a camera's
+        newest frame, which waits on. Frames of other cameras are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.frame.camera: item for item in selected}
-        ranked: list[tuple[tuple[int, bool, int, int, int], BufferedFrame]] = []
+        youngest_ns = max((item.generated_ns for item in selected), default=0)
+        ranked: list[tuple[tuple[float, ...], BufferedFrame]] = []
         with self._arrived:
             if self._unselected is None:
                 self.held_back = 0
@@ -118,14 +119,14 @@ class FrameBuffer:
                 if camera in own:
                     arrived.sort(key=lambda item: (-item.generated_ns, item is not own[item.frame.camera]))
                     last = self._last_take[camera]
-                    patient = self._takes - last <= LONGEST_WAIT
+                    waits_on = self._takes - last <= LONGEST_WAIT
                     for k, item in enumerate(arrived):
-                        at_ns = item.generated_ns
-                        ranked.append(((k, patient, -(at_ns // _AS_YOUNG_NS), last, -at_ns), item))
+                        older = (youngest_ns - item.generated_ns) // _AS_YOUNG_NS if waits_on else 0
+                        ranked.append(((k, waits_on, older, last, -item.generated_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
-            for item in taken:
-                self._last_take[item.frame.camera] = self._takes
+            for k, item in enumerate(taken):  # of those of one take, whoever came first waits longest
+                self._last_take[item.frame.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
             self.held_back = 0
             for item in left:

@@ -185,8 +185,8 @@ class UpdateLoop:
             return
         if buffer.shed > shed:
             log.warning(
-                "%d of %d frames were left out, the oldest first: the field has no time for them. Send fewer "
-                "or smaller ones, or give updates more (edge.update_ms)",
+                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send "
+                "fewer or smaller ones, or give updates more (edge.update_ms)",
                 buffer.shed - shed, buffer.arrivals - arrived,
             )  # fmt: skip
         self._warned_of = (buffer.shed, buffer.arrivals, now_s)

@@ -41,7 +41,7 @@ _TEXT = (
     "layers on arrivals, one seed) one factor is varied at a time. Virtual time: "
     f"{FREE_S:g} s in which computing is free and its processor time is measured, {SETTLING_S:g} s in which "
     f"it is charged, and {SCORED_S:g} s in which what is shown is scored at seeded random instants. As live, "
-    "an update takes in no more new frames than it has time for, and sheds the oldest. Following cores: "
+    "an update takes in no more new frames than it has time for, and sheds others. Following cores: "
     "share of the time that one core updates what moves; at 1 updates follow each other without a pause. "
     "Static cores: the training of the static field beside it, 5 steps an update here; live it takes what is "
     "left. 18 cameras at 30 frames a second send what 36 send at 15 (the room has 18 viewpoints beside the "
