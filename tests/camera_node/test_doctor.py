@@ -60,6 +60,7 @@ def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path, host):
     assert 3 <= reached < 0.6 * 51 and sum(map(int, rings.groups())) == reached
 
 
+@pytest.mark.slow  # 6 s
 def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path, host):
     _, parts = examined(capsys, cell_at(tmp_path, host, simulated=False))
     assert parts["hand-eye"][0] is False and "still the example's" in parts["hand-eye"][1]

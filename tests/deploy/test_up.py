@@ -126,7 +126,10 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     assert not leftovers(run.out)
 
 
-@pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
+@pytest.mark.parametrize(
+    "name, role",
+    [pytest.param("node", "the camera node", marks=pytest.mark.slow), ("edge", "the edge server")],
+)
 def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(
     up: Callable[..., Up], name: str, role: str
 ) -> None:

@@ -58,7 +58,7 @@ def check(found: Fit, true: dict[str, float]) -> None:
         assert interval is not None and interval[1] / interval[0] < 3.5
 
 
-@pytest.mark.parametrize("seed", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_recovers_a_slow_chain_from_delays_alone(tmp_path: Path, seed: int) -> None:
     found = fit(write_trace(tmp_path / "t.jsonl", GILBERT, seed, cameras=2, seconds=120))
     assert found.arrivals == "periodic" and found.bic[2] < found.bic[1] - 100
@@ -77,6 +77,7 @@ def test_recovers_the_thesis_channel_from_delays_and_arrivals(
     check(found, true)
 
 
+@pytest.mark.slow  # 5 s
 def test_recovers_rates_from_frames_that_arrivals_sampled(tmp_path: Path) -> None:
     """As on a live link: cameras offer every 33 ms, the arrivals take the newest frame or none."""
     path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6-slow"}, 4, cameras=2, seconds=120,
@@ -362,6 +363,7 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
                 assert value.interval is None or value.interval[0] <= value.value <= value.interval[1]
 
 
+@pytest.mark.slow  # 7 s
 def test_faults_leave_the_estimates_alone(tmp_path: Path) -> None:
     """Frames lost, doubled, damaged and cut off by resets, on a link whose arrivals sample frames."""
     chance = {"probability": 0.1}

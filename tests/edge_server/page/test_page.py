@@ -252,6 +252,7 @@ def test_a_picture_of_what_is_newer_takes_no_longer_than_its_share_of_an_update(
     assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s
 
 
+@pytest.mark.slow  # 6 s
 def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
     """200 publications a second and a restless visitor: images, text and pictures keep their rates."""
     with preview_page(tmp_path, cameras=9) as (preview, page), Visitor(page.port) as visitor:

@@ -98,6 +98,7 @@ def rig() -> tuple[list[DepthMap], list[np.ndarray], list[np.ndarray]]:
     return maps, [picture for _, picture in shown], [d for d, _ in shown]
 
 
+@pytest.mark.slow  # 8 s
 def test_depth_moves_to_where_the_pictures_agree(rig):
     maps, pictures, exact = rig
     found = refine_depth(maps, pictures, POOL)

@@ -64,6 +64,7 @@ def rolled(quarters):
     return turn
 
 
+@pytest.mark.slow  # 5 to 7 s
 def test_what_no_straight_way_leads_to_is_reached_by_way_of_others():
     """All that the arm could stand at without touching anything."""
     found = cells_tour()
@@ -180,6 +181,7 @@ def test_a_wrong_file_is_refused_by_name(changed, says):
         arm_model(scenario, source_config(scenario).arm)
 
 
+@pytest.mark.slow  # 5 to 7 s
 def test_a_camera_that_may_roll_comes_to_more_viewpoints():
     """A camera beside the flange's axis has its arm on one side at one roll, on the other at another."""
     reached = [
@@ -195,6 +197,7 @@ def test_rolls_that_are_none_are_refused(rolls):
         PathConfig(rolls_deg=rolls)
 
 
+@pytest.mark.slow  # 5 to 7 s
 def test_reachable_viewpoints_are_those_with_a_free_posture():
     """Every stop of a tour is reachable; what lies beyond the arm, or in the floor, is not."""
     poses = viewpoints(ARM.path)
