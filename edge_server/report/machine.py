@@ -43,7 +43,7 @@ def commit() -> str | None:
 
 
 def machine(proc: Path = _PROC) -> dict[str, Any]:
-    """{cpu, cores (usable by this process), memory_gb, system, kernel}."""
+    """{cpu, cores (usable by this process), memory_gb, system, kernel, gpus (NVIDIA's, by name)}."""
     memory_kb = _field(proc / "meminfo", "MemTotal")
     return {
         "cpu": _field(proc / "cpuinfo", "model name") or platform.processor() or None,
@@ -51,6 +51,7 @@ def machine(proc: Path = _PROC) -> dict[str, Any]:
         "memory_gb": round(int(memory_kb.split()[0]) * 1024 / 1e9, 1) if memory_kb else None,
         "system": platform.system(),
         "kernel": platform.release(),
+        "gpus": [_field(path, "Model") for path in sorted(proc.glob("driver/nvidia/gpus/*/information"))],
     }
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.bench.run import SCENES, BenchError, BenchRun
 from edge_server.experiments.common.arguments import command_parser, parse_options
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
@@ -25,6 +25,7 @@ Measure this machine. Figures are medians; outside_cores says how many cores oth
 
   edge-server bench                       # all parts but those marked below, hours
   edge-server bench field --quick
+  edge-server bench field --field ngp,splat --option device=cuda --json gpu.json
   edge-server bench track --scene room --field ngp
   edge-server bench field track options --json docs/results/field.json
   edge-server bench ingest --json ingest.json
@@ -61,12 +62,13 @@ MORE = ("embed", "foreground", "peer", "shown", "growth", "surface", "scanned")
 # Parts that store each figure as it comes, and skip what is known.
 _RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
 _MODULES = {"growth": "shown.growth", "drift": "track"}  # where a part is in no module of its own name
-_FOLLOWING, _FOLLOWED = ("track", "drift"), ("room", "kitchen")
+# The scenes that parts have to choose from; shown finds others, too.
+_SCENES = {"field": SCENES, "track": ("room", "kitchen"), "drift": ("room", "kitchen")}
 # Flags of some parts only.
 _ONLY_OF = {
     "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
-    "only": ("options", "surface"), "scene": (*_FOLLOWING, "shown"),
-    "option": _FOLLOWING, "model": ("embed",),
+    "only": ("options", "surface"), "scene": (*_SCENES, "shown"),
+    "option": tuple(_SCENES), "model": ("embed",),
 }  # fmt: skip
 
 
@@ -87,8 +89,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for flag, of in _ONLY_OF.items():
         if getattr(args, flag) and not set(parts) & set(of):
             parser.error(f"--{flag.replace('_', '-')} is for {', '.join(of)}; asked for: {', '.join(parts)}")
-    if set(parts) & set(_FOLLOWING) and (unknown := set(args.scene) - set(_FOLLOWED)):
-        parser.error(f"--scene {', '.join(unknown)}: {', '.join(_FOLLOWING)} know {', '.join(_FOLLOWED)}")
+    for part in parts:
+        if unknown := set(args.scene) - set(_SCENES.get(part, args.scene)):
+            parser.error(f"--scene {', '.join(unknown)}: {part} knows {', '.join(_SCENES[part])}")
     try:
         args.option = parse_options(args.option)
         for name in args.field or field_names():
@@ -142,11 +145,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--model", type=Path, metavar="FILE", help="of embed: a YOLO ONNX [the shipped ones]")
     add("--scene", action="append", default=[], metavar="NAME",
-        help=f"of track, drift: {', '.join(_FOLLOWED)} [track: both; drift: room]; of shown: a row of its "
-        "table, or any scenario of a synthetic world [all rows]")  # fmt: skip
-    track = parser.add_argument_group("of track and drift")
-    add = track.add_argument
-    add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
+        help=f"of field: {', '.join(_SCENES['field'])} [all]; of track, drift: "
+        f"{', '.join(_SCENES['track'])} [track: both; drift: room]; of shown: a row of its table, or any "
+        "scenario of a synthetic world [all rows]")  # fmt: skip
+    add("--option", action="append", default=[], metavar="KEY=VALUE",
+        help="of field, track, drift: setting of the representation, device=cuda for one")  # fmt: skip
     return parser
 
 
@@ -219,8 +222,9 @@ def _conditions(figures: dict[str, Any]) -> str:
     m, v = figures["machine"], figures["versions"]
     known = ", ".join(f"{name} {version}" for name, version in v.items() if version is not None)
     runs = "one run" if figures["runs"] == 1 else f"{figures['runs']} runs"
+    gpus = "".join(f"{name}, " for name in m["gpus"])
     return (
-        f"{m['cpu']}, {m['cores']} cores, {m['memory_gb']} GB, {m['system']} {m['kernel']}; {known}. "
+        f"{gpus}{m['cpu']}, {m['cores']} cores, {m['memory_gb']} GB, {m['system']} {m['kernel']}; {known}. "
         f"Measured in {runs}; outside cores: what others kept busy meanwhile."
     )
 

@@ -13,14 +13,22 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import BenchRun, open_recording, result_settings
+from edge_server.experiments.bench.run import (
+    SCENES,
+    SYNTHETIC,
+    BenchError,
+    BenchRun,
+    label,
+    open_recording,
+    result_settings,
+)
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
 from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import grouped, markdown_table, median_or_none, number
@@ -43,8 +51,7 @@ VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
 
 
-# Recordings, and by what their images are divided.
-_SCALES = {"kitchen": 1.0, "lego": 1.0, "fox": 2.0}
+_SCALES = {"fox": 2.0}  # by which a recording's images are divided
 
 
 @dataclass(frozen=True)
@@ -67,39 +74,50 @@ QUICK = Workload(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
 
 def measure(run: BenchRun) -> dict[str, Any]:
     """{start: {FIELD: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series, seconds_to_db,
-    ...}}}; recorded scenes where FRESHFIELD_DATA names their folder."""
+    ...}}}; recorded scenes where FRESHFIELD_DATA names their folder. FIELD: with the options that change it,
+    with which a start is not measured. BenchError: a scene that was asked for cannot be had."""
     workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
     lpips, missing = open_lpips(run.lpips)
     store.results["lpips_missing"] = missing
-    for name in names:
+    for name in () if run.options else names:
         start = partial(_start_up, name, run.quick, run.folder / name)
         settings = {"cold": not run.quick, "defaults": settings_digest(name)}
         store.get("start", name, compute=start, settings=settings)
-    stills = {scene: synthetic_still(scene, cameras=VIEWS + 1, size=SIZE) for scene in ("tile", "room")}
-    for scene, still in (*stills.items(), *_recorded_stills()):
+    for scene, still in _stills(run.scenes):
         base = partial(mean_baselines, still.training, still.held_out, still.background)
         store.get(scene, "baseline", compute=base)
         store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
         for name in names:
-            if scene in stills:
-                work = partial(_curve_and_rates, name, still, workload, lpips)
+            make = partial(make_field, name, run.options)
+            text = label(name, run.options)
+            title = name if text == "default" else f"{name}, {text}"
+            if scene in SYNTHETIC:
+                work = partial(_curve_and_rates, title, make, still, workload, lpips)
             else:
-                work = partial(_curve, name, still, workload.recorded_s, 1, lpips)
-            settings = result_settings(workload, name, lpips=lpips is not None)
-            store.get(scene, name, compute=work, settings=settings)
+                work = partial(_curve, title, make, still, workload.recorded_s, 1, lpips)
+            settings = result_settings(workload, name, run.options, lpips=lpips is not None)
+            store.get(scene, title, compute=work, settings=settings)
     return store.results
 
 
-def _curve_and_rates(name: str, still: MultiviewStill, workload: Workload, lpips: Any) -> dict[str, Any]:
-    curve = _curve(name, still, workload.planned_s, workload.seeds, lpips)
-    return {**curve, **_rates(name, still, workload.rate_repeats)}
+def _curve_and_rates(
+    title: str, make: Callable[..., Field], still: MultiviewStill, workload: Workload, lpips: Any
+) -> dict[str, Any]:
+    curve = _curve(title, make, still, workload.planned_s, workload.seeds, lpips)
+    return {**curve, **_rates(make, still, workload.rate_repeats)}
 
 
-def _recorded_stills() -> Iterable[tuple[str, MultiviewStill]]:
-    for scene, scale in _SCALES.items():
+def _stills(asked: Sequence[str]) -> Iterable[tuple[str, MultiviewStill]]:
+    """The scenes that were asked for, or all that can be had."""
+    for scene in asked or SCENES:
+        if scene in SYNTHETIC:
+            yield scene, synthetic_still(scene, cameras=VIEWS + 1, size=SIZE)
+            continue
         try:
-            yield scene, open_recording(scene, scale)
+            yield scene, open_recording(scene, _SCALES.get(scene, 1.0))
         except DatasetError as error:
+            if asked:
+                raise BenchError(f"{scene}: {error}") from None
             print(f"  {scene} left out: {error}", flush=True)
 
 
@@ -134,21 +152,26 @@ def _child(field: str, cache: Path | None, *words: str) -> dict[str, float]:
 
 
 def _curve(
-    field: str, still: MultiviewStill, planned_s: Sequence[float], seeds: int, lpips: Any
+    title: str,
+    make: Callable[..., Field],
+    still: MultiviewStill,
+    planned_s: Sequence[float],
+    seeds: int,
+    lpips: Any,
 ) -> dict[str, Any]:
     """Fidelity against seconds from scratch: medians over seeds, and the first planned time whose median
     reaches each quality (None: none did)."""
-    make_field(field).warm_up()
+    make().warm_up()
     load, speed, series = LoadMeter(), MachineSpeed(), []
     for seconds in planned_s:
         speed.sample()
-        points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
+        points = [_point(make(seed=seed), still, seconds, lpips) for seed in range(seeds)]
         row: dict[str, Any] = {"seconds": seconds}
         for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
             row[name] = median_or_none(p[name] for p in points)
         row["psnr_db_range"] = max(p["psnr_db"] for p in points) - min(p["psnr_db"] for p in points)
         series.append(row)
-        print(f"  {field:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)
+        print(f"  {title:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)
     speed.close()
     return {
         "seeds": seeds,
@@ -168,8 +191,7 @@ def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | Non
     }
 
 
-def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
-    model = make_field(field, seed=seed)
+def _point(model: Field, still: MultiviewStill, seconds: float, lpips: Any) -> dict[str, Any]:
     report = model.fit(still.training, Budget(seconds=seconds))
     score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     return {
@@ -178,9 +200,9 @@ def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: 
     }  # fmt: skip
 
 
-def _rates(field: str, still: MultiviewStill, repeats: int) -> dict[str, Any]:
+def _rates(make: Callable[..., Field], still: MultiviewStill, repeats: int) -> dict[str, Any]:
     """Rates of a converged field, and milliseconds of a rendering."""
-    model = make_field(field)
+    model = make()
     model.fit(still.training, Budget(seconds=3.0))
     load, speed, reports = LoadMeter(), MachineSpeed(), []
     for _ in range(repeats):
@@ -272,7 +294,7 @@ def table(figures: dict[str, Any]) -> str:
         "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak MB|cores busy|the machine": starts,
     }
     texts = [markdown_table(head.split("|"), rows) for head, rows in tables.items() if rows]
-    if any(name == "splat" for _, name, *_ in rates):
+    if any(name.startswith("splat") for _, name, *_ in rates):
         texts.append(
             "Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels."
         )

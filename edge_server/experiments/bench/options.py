@@ -15,7 +15,7 @@ from functools import cache, partial
 from typing import Any
 
 from edge_server.experiments.bench.option_ablation import MOVING, OPTIONS, SCENES, Scene, missing
-from edge_server.experiments.bench.run import BenchError, BenchRun, result_settings
+from edge_server.experiments.bench.run import BenchError, BenchRun, label, result_settings
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.tables import markdown_table, median_or_none
 from edge_server.experiments.common.tables import number as _db
@@ -97,15 +97,6 @@ def measure(run: BenchRun) -> dict[str, Any]:
     finally:  # Ctrl-C, too
         store.results["rows"] = rows(store.results.get("points", {}))
     return store.results
-
-
-def label(name: str, options: Mapping[str, Any]) -> str:
-    """Settings of a representation as text, without those at their default. ValueError for unknown settings
-    or values."""
-    usual = getattr(make_field(name), "settings", None)
-    chosen = getattr(make_field(name, options), "settings", None)
-    different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
-    return ", ".join(f"{k}={v}" for k, v in different.items()) or "default"
 
 
 def _point(

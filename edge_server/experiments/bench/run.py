@@ -12,6 +12,7 @@ from typing import Any
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
+from edge_server.fields.registry import make_field
 
 # Recordings below the data folder: what is opened, and what is held out.
 RECORDINGS = {
@@ -19,6 +20,8 @@ RECORDINGS = {
     "lego": ("lego_synthetic", "8"),
     "fox": ("fox/transforms_2.json", "8"),
 }
+SYNTHETIC = ("tile", "room")
+SCENES = (*SYNTHETIC, *RECORDINGS)
 
 
 class BenchError(RuntimeError):
@@ -34,7 +37,7 @@ class BenchRun:
     lpips: folder of LPIPS weights; None: that of the environment.
     fields: the representations to measure; none: all there are.
     store: results of this part, those of an earlier run among them.
-    scenes, options: of track and drift, see the command; none: the part's own.
+    scenes, options: of field, track and drift, see the command; none: the part's own.
     only: names of options to try; none: all.
     model: a YOLO ONNX file instead of the shipped ones.
     """
@@ -58,6 +61,15 @@ def result_settings(
     workload: a dataclass. name, options: of the representation.
     """
     return {**dataclasses.asdict(workload), "defaults": settings_digest(name, options), **more}
+
+
+def label(name: str, options: Mapping[str, Any]) -> str:
+    """Settings of a representation as text, without those at their default. ValueError for unknown settings
+    or values."""
+    usual = getattr(make_field(name), "settings", None)
+    chosen = getattr(make_field(name, options), "settings", None)
+    different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
+    return ", ".join(f"{k}={v}" for k, v in different.items()) or "default"
 
 
 def data_file(name: str) -> Path:

@@ -193,7 +193,14 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         return partial(self._one_step, data), 0, 0
 
     def _run_kernels(self, pool: Pool) -> None:
-        """Nothing to compile."""
+        """Nothing to compile, but a device's libraries load when first used, which takes seconds."""
+        camera, pose = Pinhole.from_fov(8, 8, 60.0), np.eye(4)
+        pose[2, 3] = -3.0
+        tiny = replace(self.settings, rays=16, log2_table=8, cells=8, min_views=1)
+        field = NgpTorchField(tiny, self.device)
+        views = [View(f"warm-up {k}", np.full((8, 8, 3), 128, np.uint8), pose, camera) for k in range(3)]
+        field.fit(views, Budget(steps=1))
+        field.render(pose, camera)
 
     def _counters(self) -> dict[str, Any]:
         counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}

@@ -8,7 +8,9 @@ oracle in place of gsplat; with gsplat itself, on a GPU, it has not been run.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.fields import View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, TIME
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import step_key
@@ -34,6 +36,7 @@ from edge_server.fields.splat.kernels.project import (
 )
 from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import Pinhole
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
@@ -52,6 +55,16 @@ class GsplatField(SplatField):
             raise ValueError("splat: dssim needs device cpu; device cuda has loss mse or l1 alone")
         super().__init__(settings, pool)
         self._rasterize, self._device = rasterize, torch.device(device)
+
+    def warm_up(self) -> float:
+        """Also a step on the device: gsplat compiles its kernels when first used, which takes minutes."""
+        seconds, start = super().warm_up(), time.perf_counter()
+        camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
+        pose[2, 3] = -3.0
+        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, contracted=False)
+        view = View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera)
+        GsplatField(tiny, self._rasterize, str(self._device)).fit([view], Budget(steps=1))
+        return seconds + time.perf_counter() - start
 
     def _ingest(self, views: Sequence[View]) -> SceneChange | None:
         for view in views:

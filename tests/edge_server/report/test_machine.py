@@ -17,4 +17,11 @@ def test_machine_knows_itself():
 
 def test_a_machine_without_proc_is_unknown_and_no_error(tmp_path):
     found = machine(tmp_path)
-    assert found["memory_gb"] is None and found["cores"] >= 1
+    assert found["memory_gb"] is None and found["cores"] >= 1 and found["gpus"] == []
+
+
+def test_gpus_are_named(tmp_path):
+    gpu = tmp_path / "driver/nvidia/gpus/0000:01:00.0/information"
+    gpu.parent.mkdir(parents=True)
+    gpu.write_text("Model: \t\t NVIDIA H100 80GB HBM3\nIRQ:   \t\t 42\n")
+    assert machine(tmp_path)["gpus"] == ["NVIDIA H100 80GB HBM3"]

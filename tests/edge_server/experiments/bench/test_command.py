@@ -77,15 +77,15 @@ def asked(monkeypatch):
     """What is asked for of ``bench field``, where nothing is measured."""
     found = []
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: found.append(name) or _curve(name, *rest))
-    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: {})
+    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: found.append(name) or _curve(*rest))
+    monkeypatch.setattr(bench_field, "_rates", lambda make, still, repeats: {})
     monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: found.append(f"start {name}") or {})
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
     monkeypatch.setattr(bench_field, "SIZE", 24)
     return found
 
 
-def _curve(name, still, planned_s, seeds, lpips):
+def _curve(make, still, planned_s, seeds, lpips):
     """What ``bench field`` measures, without measuring: of two seeds, a dB more every point."""
     series = {f"{s:g}_s": {"seconds": s, "fitted_s": s, "psnr_db": 24.0 + k} for k, s in enumerate(planned_s)}
     to_db = {f"{db}_db": 0.5 if db < 25 else None for db in bench_field.TARGETS_DB}
@@ -98,7 +98,7 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, ask
              "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
     starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
               "jit_cached_cpu_s": 0.25, "peak_rss_mb": 456.0}  # fmt: skip
-    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: dict(rates))
+    monkeypatch.setattr(bench_field, "_rates", lambda make, still, repeats: dict(rates))
     monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
     path = tmp_path / "results" / "field.json"
     found = bench("field", path, "--field", "ngp")
@@ -126,6 +126,11 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, ask
     assert "## field" in text and "## decide" in text
     ms = more["decide"]["wait, 3 cameras"]["state_ms_p50"]
     assert f"| wait, 3 cameras.state_ms_p50 | {ms:.3g} |" in text
+    # With an option of the representation, on one scene: a row of its own, its start is not measured.
+    other = ["--field", "ngp", "--scene", "room", "--option", "levels=4"]
+    assert edge_server(["bench", "field", "--quick", "--json", str(path), "--resume", *other]) == 0
+    assert asked[4:] == ["ngp, levels=4"] and json.loads(path.read_text())["field"]["room"]["ngp, levels=4"]
+
     # A part that is one figure is skipped as a whole.
     before = more["decide"]
     assert edge_server(["bench", *words]) == 0

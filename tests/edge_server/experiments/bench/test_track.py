@@ -187,8 +187,8 @@ def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monke
 
 def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
     with pytest.raises(SystemExit):
-        edge_server(["bench", "field", "--scene", "room"])
-    assert "--scene is for track, drift, shown; asked for: field" in capsys.readouterr().err
+        edge_server(["bench", "limits", "--scene", "room"])
+    assert "--scene is for field, track, drift, shown; asked for: limits" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         edge_server(["bench", "track", "--field", "voxel,ngp", "--option", "sizes=64"])
     assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err

@@ -86,6 +86,7 @@ def test_cuda_is_refused_where_there_is_none() -> None:
 @pytest.mark.skipif(not cuda_present(), reason="no CUDA device here")
 def test_the_same_on_cuda() -> None:
     cpu, gpu = NgpTorchField(SMALL, "cpu"), NgpTorchField(SMALL, "cuda")
+    assert gpu.warm_up() > 0.0 and gpu.step == 0
     cpu.fit(SEEN, Budget(steps=20))
     gpu.load_state(cpu.state())
     a, b = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (cpu, gpu))

@@ -61,6 +61,18 @@ def test_its_steps_are_those_of_the_kernels(harmonics: int) -> None:
     assert close.mean() > 0.95
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("harmonics", [1, 4])
+def test_on_a_gpu_its_steps_are_those_of_the_kernels(harmonics: int) -> None:
+    settings = replace(TINY, harmonics=harmonics, epsilon=1.0)
+    cpu, cuda = SplatField(settings), gsplat_field.make_cuda(settings)
+    losses = [field.fit(VIEWS, Budget(steps=4)).loss for field in (cpu, cuda)]
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
+    assert len(cpu.cloud) == len(cuda.cloud)
+    close = np.abs(cpu.cloud.params - cuda.cloud.params) < 1e-3
+    assert close.mean() > 0.95
+
+
 def test_it_weighs_pixels_as_the_kernels_do() -> None:
     views = [replace(v, generated_ns=-k * 10**8) for k, v in enumerate(VIEWS)]
     moments = []
@@ -76,6 +88,7 @@ def test_it_weighs_pixels_as_the_kernels_do() -> None:
 
 def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     cuda = GsplatField(TINY, rasterize, "cpu")
+    assert cuda.warm_up() > 0.0 and cuda.step == 0
     cuda.fit(VIEWS, Budget(steps=14))
     assert 24 < len(cuda.cloud) <= 40
     cpu = SplatField(TINY)
