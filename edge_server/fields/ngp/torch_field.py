@@ -53,6 +53,7 @@ from edge_server.fields.ngp.torch_model import (
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
+UNCHECKED_STEPS = 32  # between two looks whether any ray goes on: a look waits for the device
 KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "depth_guide")  # not implemented here
 
 
@@ -111,19 +112,24 @@ class TorchSnapshot(PixelSnapshot):
         enter = torch.minimum(a, b).amax(-1).clamp(min=box.near_m / box.radius_m)
         leave = torch.maximum(a, b).amin(-1)
         t = enter + jitter * step
-        ts, deltas = [], []
-        while bool((t < leave).any()):
-            m = (o + t[:, None] * d).abs().amax(-1)
-            delta = step * m.clamp(min=1.0).square() if box.contracted else torch.full_like(t, step)
-            ts.append(t)
-            deltas.append(delta)
-            t = torch.where(t < leave, t + delta, t)  # or steps that grow with distance overflow
-        if not ts:
-            ts, deltas = [t], [torch.zeros_like(t)]
-        t, delta = torch.stack(ts, -1), torch.stack(deltas, -1)
-        p = o[:, None] + t[..., None] * d[:, None]
         if box.contracted:
-            m = p.abs().amax(-1, keepdim=True).clamp(min=1.0)
+            last, ts, deltas = torch.maximum(t, leave), [], []
+            while not ts or bool((t < leave).any()):
+                for _ in range(UNCHECKED_STEPS):
+                    m = torch.linalg.vector_norm(torch.addcmul(o, t[:, None], d), torch.inf, dim=-1)
+                    deltas.append(step * m.clamp(min=1.0).square())
+                    ts.append(t)
+                    t = torch.minimum(t + deltas[-1], last)  # or steps that grow with distance overflow
+            t, delta = torch.stack(ts, -1), torch.stack(deltas, -1)
+            most = max(int((t < leave[:, None]).any(0).sum()), 1)
+            t, delta = t[:, :most], delta[:, :most]
+        else:
+            most = max(int(((leave - t).amax() / step).ceil()), 1)
+            t = t[:, None] + step * torch.arange(most, device=t.device)
+            delta = torch.full_like(t, step)
+        p = torch.addcmul(o[:, None], t[..., None], d[:, None])
+        if box.contracted:
+            m = torch.linalg.vector_norm(p, torch.inf, dim=-1, keepdim=True).clamp(min=1.0)
             p = p * (2.0 - 1.0 / m) / m * 0.5
         u = (p * 0.5 + 0.5).clamp(0.0, 0.9999999)
         cell = (u * s.cells).long()
@@ -314,14 +320,14 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
             moved = rng.choice(data.changed, count)
             pixel = np.where(rng.random(count) < self.settings.changed_share, moved, pixel)
         view = np.searchsorted(data.first, pixel, side="right") - 1
-        directions = np.empty((count, 3), np.float32)
-        for k in np.unique(view):
-            rows = np.flatnonzero(view == k)
-            local, width = pixel[rows] - data.first[k], int(data.size[k, 0])
-            fx, fy, cx, cy, k1, k2, p1, p2 = data.lens[k].tolist()
-            camera = Pinhole(width, int(data.size[k, 1]), fx, fy, cx, cy, (k1, k2, p1, p2))
-            rays = camera.rays(np.stack([local % width + 0.5, local // width + 0.5], axis=-1))
-            directions[rows] = rays @ data.rotation[k].T
+        local, width = pixel - data.first[view], data.size[view, 0]
+        middle = np.stack([local % width + 0.5, local // width + 0.5], axis=-1)
+        kinds, kind = np.unique(np.hstack([data.size, data.lens]), axis=0, return_inverse=True)
+        rays = np.empty((count, 3))
+        for k, (wide, high, fx, fy, cx, cy, *bent) in enumerate(kinds.tolist()):
+            rows = np.flatnonzero(kind.reshape(-1)[view] == k)
+            rays[rows] = Pinhole(int(wide), int(high), fx, fy, cx, cy, tuple(bent)).rays(middle[rows])
+        directions = (data.rotation[view] @ rays[..., None])[..., 0].astype(np.float32)
         rgb = data.pixels[pixel].astype(np.float32) / 255.0
         background = np.broadcast_to(self.view_store.background(), (count, 3))
         if self.settings.background == "random":
@@ -336,17 +342,17 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
     @torch.no_grad()
     def _refresh(self, model: TorchSnapshot, rng: np.random.Generator) -> None:
         o, cells = self._occupancy, self.settings.cells
-        k, j, i = np.meshgrid(*[np.arange(cells)] * 3, indexing="ij")
-        corner = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=-1)
-        u = ((corner + rng.random(corner.shape)) / cells).astype(np.float32)
-        fresh = np.empty(len(u), np.float32)
-        for a in range(0, len(u), 1 << 18):
-            x = torch.as_tensor(u[a : a + (1 << 18)], device=self.device)
+        axis = torch.arange(cells, device=self.device)
+        corner = torch.cartesian_prod(axis, axis, axis).flip(-1)  # x fastest
+        jitter = torch.as_tensor(rng.random(corner.shape, dtype=np.float32), device=self.device)
+        parts = []
+        for x in ((corner + jitter) / cells).split(1 << 18):
             raw = mlp(model.widths, model.net, encode(model.grid, model.levels, x))
-            fresh[a : a + (1 << 18)] = shade(raw, 1, x)[0].cpu().numpy()
+            parts.append(shade(raw, 1, x)[0])
+        fresh = torch.cat(parts)
         if o.contracted:
-            m = np.abs((corner + 0.5) * (4.0 / cells) - 2.0).max(axis=-1)
-            fresh *= np.where(m > 1.0, 1.0 / np.maximum(2.0 - m, 1e-6), 1.0) ** 2
-        fresh = np.where(np.isfinite(fresh), fresh, np.float32(1e3))
-        o.density[:] = np.where(o.seen >= o.needed, np.maximum(o.density * np.float32(FADE), fresh), 0.0)
+            m = ((corner + 0.5) * (4.0 / cells) - 2.0).abs().amax(-1)
+            fresh = fresh * torch.where(m > 1.0, 1.0 / (2.0 - m).clamp(min=1e-6), torch.ones_like(m)).square()
+        found = torch.where(torch.isfinite(fresh), fresh, torch.full_like(fresh, 1e3)).cpu().numpy()
+        o.density[:] = np.where(o.seen >= o.needed, np.maximum(o.density * np.float32(FADE), found), 0.0)
         o.update_occupied()

@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from edge_server.fields.common.kernels.hash_grid import Grid
+from edge_server.fields.common.kernels.hash_grid import FEATURES, Grid
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, RAW_HIGH, RAW_LOW
 
 PRIMES = (1, 2654435761, 805459861)
@@ -37,25 +37,22 @@ def to_torch(grid: Grid, device: str = "cpu", dtype: torch.dtype = torch.float32
 
 def encode(grid: TorchGrid, levels: int, x: Tensor) -> Tensor:
     """Points (N, 3) in the unit cube -> features (N, 2 L); levels from ``levels`` on are 0. Eq. 3.23."""
-    out = []
-    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=x.device)  # (8, 3)
-    for l, res in enumerate(grid.resolution):
-        if l >= levels:
-            out.append(torch.zeros_like(x[:, :2]).to(grid.table.dtype))
-            continue
-        scaled = x * res
-        cell = scaled.floor().clamp(0, res - 1)  # (N, 3)
-        fraction = (scaled - cell)[:, None, :]  # (N, 1, 3)
-        vertex = cell.long()[:, None, :] + corner  # (N, 8, 3)
-        size = grid.first[l + 1] - grid.first[l]
-        if grid.dense[l]:
-            row = vertex[..., 0] + (res + 1) * (vertex[..., 1] + (res + 1) * vertex[..., 2])
-        else:
-            mixed = (vertex * torch.tensor(PRIMES, device=x.device)) & 0xFFFFFFFF
-            row = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % size
-        weight = torch.where(corner == 1, fraction, 1 - fraction).prod(dim=-1)  # (N, 8)
-        out.append((weight[..., None] * grid.table[grid.first[l] + row]).sum(dim=1))
-    return torch.cat(out, dim=-1)
+    whole = {"dtype": torch.long, "device": x.device}
+    res = torch.tensor(grid.resolution[:levels], **whole)[:, None]  # (l, 1)
+    first = torch.tensor(grid.first[: levels + 1], **whole)
+    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], **whole)  # (8, 3)
+    scaled = x[:, None, :] * res  # (N, l, 3)
+    cell = torch.minimum(scaled.floor().clamp(min=0), (res - 1).to(x.dtype))
+    fraction = (scaled - cell)[:, :, None, :]
+    vertex = cell.long()[:, :, None, :] + corner  # (N, l, 8, 3)
+    mixed = (vertex * torch.tensor(PRIMES, **whole)) & 0xFFFFFFFF
+    hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % first.diff()[:, None]
+    plain = vertex[..., 0] + (res + 1) * (vertex[..., 1] + (res + 1) * vertex[..., 2])
+    dense = torch.tensor(grid.dense[:levels], device=x.device)[:, None]
+    row = first[:-1, None] + torch.where(dense, plain, hashed)  # (N, l, 8)
+    weight = torch.where(corner == 1, fraction, 1 - fraction).prod(dim=-1)
+    found = (weight[..., None] * grid.table[row]).sum(dim=2).flatten(1)
+    return torch.nn.functional.pad(found, (0, FEATURES * (len(grid.resolution) - levels)))
 
 
 def mlp(widths: Sequence[int], params: Tensor, x: Tensor) -> Tensor:
@@ -107,7 +104,8 @@ def ray_losses(
     weight, left = ray_weights(sigma, delta)
     rendered = (weight[..., None] * color).sum(dim=1) + left[:, None] * background
     error = (rendered - target).square().sum(dim=-1)
-    apart = (t[:, :, None] - t[:, None, :]).abs()
-    spread = (weight[:, :, None] * weight[:, None, :] * apart).sum(dim=(1, 2))
+    before = torch.nn.functional.pad(weight, (1, 0)).cumsum(dim=-1)[:, :-1]
+    moment = torch.nn.functional.pad(weight * t, (1, 0)).cumsum(dim=-1)[:, :-1]
+    spread = 2.0 * (weight * (t * before - moment)).sum(dim=-1)  # all pairs: t increases along a ray
     spread = spread + (weight.square() * delta).sum(dim=-1) / 3.0
     return error, error + distortion * spread
