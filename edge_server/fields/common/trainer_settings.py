@@ -46,7 +46,9 @@ class FieldSettings:
         "errors are learned: none is",
     )
     seed: int = option(0, "seed of initial values and of all sampling")
-    threads: int | None = option(None, "worker threads; results do not depend on it. None: all cores")
+    threads: int | None = option(
+        None, "worker threads; results do not depend on it. None: a core each, up to 8"
+    )
     nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
     device: str = option(
         "auto", "cpu, or cuda (``ngp`` and ``splat`` alone, only where asked for); auto: cpu"

@@ -113,7 +113,9 @@ class TorchSnapshot(PixelSnapshot):
         leave = torch.maximum(a, b).amin(-1)
         t = enter + jitter * step
         if box.contracted:
-            last, ts, deltas = torch.maximum(t, leave), [], []
+            last = torch.maximum(t, leave)
+            ts: list[Tensor] = []
+            deltas: list[Tensor] = []
             while not ts or bool((t < leave).any()):
                 for _ in range(UNCHECKED_STEPS):
                     m = torch.linalg.vector_norm(torch.addcmul(o, t[:, None], d), torch.inf, dim=-1)

@@ -37,15 +37,14 @@ def to_torch(grid: Grid, device: str = "cpu", dtype: torch.dtype = torch.float32
 
 def encode(grid: TorchGrid, levels: int, x: Tensor) -> Tensor:
     """Points (N, 3) in the unit cube -> features (N, 2 L); levels from ``levels`` on are 0. Eq. 3.23."""
-    whole = {"dtype": torch.long, "device": x.device}
-    res = torch.tensor(grid.resolution[:levels], **whole)[:, None]  # (l, 1)
-    first = torch.tensor(grid.first[: levels + 1], **whole)
-    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], **whole)  # (8, 3)
+    res = torch.tensor(grid.resolution[:levels], device=x.device)[:, None]  # (l, 1)
+    first = torch.tensor(grid.first[: levels + 1], device=x.device)
+    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=x.device)  # (8, 3)
     scaled = x[:, None, :] * res  # (N, l, 3)
     cell = torch.minimum(scaled.floor().clamp(min=0), (res - 1).to(x.dtype))
     fraction = (scaled - cell)[:, :, None, :]
     vertex = cell.long()[:, :, None, :] + corner  # (N, l, 8, 3)
-    mixed = (vertex * torch.tensor(PRIMES, **whole)) & 0xFFFFFFFF
+    mixed = (vertex * torch.tensor(PRIMES, device=x.device)) & 0xFFFFFFFF
     hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % first.diff()[:, None]
     plain = vertex[..., 0] + (res + 1) * (vertex[..., 1] + (res + 1) * vertex[..., 2])
     dense = torch.tensor(grid.dense[:levels], device=x.device)[:, None]

@@ -3,7 +3,7 @@
 Only the gradient of a step is computed here; ``SplatField`` does the rest: seeding, densification, motion,
 state, and snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied a step, at
 little cost beside a rasterization. The code around the rasterizer is tested on CPUs with the torch
-oracle in place of gsplat; with gsplat itself, on a GPU, it has not been run.
+oracle in place of gsplat; those with gsplat itself need a GPU.
 """
 
 from __future__ import annotations
@@ -61,9 +61,11 @@ class GsplatField(SplatField):
         seconds, start = super().warm_up(), time.perf_counter()
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
-        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, contracted=False)
-        view = View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera)
-        GsplatField(tiny, self._rasterize, str(self._device)).fit([view], Budget(steps=1))
+        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        image = np.full((32, 32, 3), 128, np.uint8)
+        image[8:16, 8:16] = 255  # or there would be no Gaussians to rasterize
+        field = GsplatField(tiny, self._rasterize, str(self._device))
+        field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
         return seconds + time.perf_counter() - start
 
     def _ingest(self, views: Sequence[View]) -> SceneChange | None:
@@ -124,7 +126,9 @@ class GsplatField(SplatField):
         back = torch.tensor(self.view_store.background(), device=self._device)
         if self.settings.background == "random":
             back = torch.tensor(self._rng(6).random(3), dtype=torch.float32, device=self._device)
-        color, _, info = self._rasterize(
+        # gsplat divides by the number of Gaussians: without any the whole process would end.
+        rasterize = self._rasterize if len(params) else _background
+        color, _, info = rasterize(
             means=params[:, :3] + float(cam[TIME]) * torch.tensor(self.cloud.velocity, device=self._device),
             quats=params[:, QUATERNION:OPACITY],
             scales=params[:, SCALE:QUATERNION].clamp(SCALE_LOW, SCALE_HIGH).exp(),
@@ -184,6 +188,15 @@ class GsplatField(SplatField):
         step[:, :SCALE] *= np.maximum(np.abs(cloud.params[drawn, :3]).max(axis=1), 1.0)[:, None]
         cloud.params[drawn] -= step
         clamp_gaussians(cloud.params, rule.largest, rule.thinnest)
+
+
+def _background(
+    *, means: Tensor, width: int, height: int, backgrounds: Tensor, **_: Any
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """What ``Rasterize`` returns where there are no Gaussians."""
+    color = backgrounds[:, None, None].expand(-1, height, width, -1)
+    none = means.new_zeros((1, 0, 2))
+    return color, means.new_zeros((1, height, width, 1)), {"means2d": none, "radii": none.int()}
 
 
 def make_cuda(settings: SplatSettings) -> SplatField:

@@ -39,6 +39,10 @@ from edge_server.fields.common.threads.work_queue import (
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
+# More workers than this make every field slower: they wait for each other to hold the GIL, once a job (on 16
+# cores, 8 workers make 1.1 to 1.9 times the steps of 16: docs/results/gpu.md).
+MOST_USEFUL = 8
+
 SERVER_NICE = 5  # of workers in a server that answers cameras meanwhile
 
 
@@ -79,13 +83,15 @@ class Pool:
     each worker, workers poll for jobs for a moment before they sleep.
 
     threads: number of workers; results do not depend on it. Default: the environment's FRESHFIELD_THREADS,
-        else the number of cores that this process may use.
+        else the number of cores that this process may use, up to ``MOST_USEFUL``.
     nice: the workers' priority where the system allows it (Linux has one per thread), so that threads that
         ingest frames go first. With 0, the caller's priority, the caller itself is worker 0.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 0) -> None:
-        self.threads = cores() if threads is None else int(threads)
+        if threads is None:
+            threads = cores() if os.environ.get(THREADS_VARIABLE) else min(cores(), MOST_USEFUL)
+        self.threads = int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice

@@ -86,6 +86,13 @@ def test_it_weighs_pixels_as_the_kernels_do() -> None:
     assert moments[1] < 0.7 * moments[0]
 
 
+def test_no_gaussians_are_not_rasterized() -> None:
+    field = GsplatField(replace(TINY, min_views=1), lambda **_: pytest.fail("gsplat ends the process"), "cpu")
+    gray = replace(VIEWS[0], image=np.full_like(VIEWS[0].image, 128))
+    report = field.fit([gray], Budget(steps=2))
+    assert len(field.cloud) == 0 and report.steps == 2 and report.dropped == 0
+
+
 def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     cuda = GsplatField(TINY, rasterize, "cpu")
     assert cuda.warm_up() > 0.0 and cuda.step == 0

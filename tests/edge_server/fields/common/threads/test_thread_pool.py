@@ -16,7 +16,13 @@ from numba import njit
 from edge_server.fields.common.kernels.jit import FAST, SOURCES
 from edge_server.fields.common.kernels.mlp import forward
 from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, fetch_add, log32, uniform
-from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
+from edge_server.fields.common.threads.thread_pool import (
+    MOST_USEFUL,
+    THREADS_VARIABLE,
+    CallerPool,
+    Pool,
+    shared_pool,
+)
 from edge_server.fields.common.threads.work_queue import WAKE_CALLER, poll_for_job
 
 
@@ -56,6 +62,14 @@ def test_no_threads_are_not_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv(THREADS_VARIABLE, "0")
     with pytest.raises(ValueError, match="at least one thread, not 0"):
         Pool()
+
+
+def test_more_threads_than_are_useful_are_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: 12)
+    monkeypatch.delenv(THREADS_VARIABLE, raising=False)
+    assert Pool().threads == MOST_USEFUL < 12 == Pool(12).threads
+    monkeypatch.setenv(THREADS_VARIABLE, "10")
+    assert Pool().threads == 10
 
 
 @pytest.mark.parametrize("nice", [0, 5])
