@@ -25,6 +25,15 @@ FIELDS = {
     "nerfacto": "hash grid, proposal sampling",
     "tensorf": "vector-matrix factors",
 }
+# Rows of docs/results/gpu/field.json, and what they are called.
+GPU_ROWS = {
+    "splat": "`splat`, 8 threads",
+    "splat, threads=16": "`splat`, 16 threads",
+    "splat, device=cuda": "`splat`, GPU (gsplat)",
+    "ngp": "`ngp`, 8 threads",
+    "ngp, threads=16": "`ngp`, 16 threads",
+    "ngp, device=cuda": "`ngp`, GPU (torch)",
+}
 # title, option as `bench options --only` knows it, and the cases (field, scene) with and without a need of it
 OPTIONS: tuple[tuple[str, tuple[tuple[str, str], ...], tuple[tuple[str, str], ...]], ...] = (
     ("contraction", (("ngp", "room"), ("splat", "room")), (("ngp", "tile"), ("splat", "tile"))),
@@ -121,6 +130,27 @@ def from_scratch(scene: str, seconds: Sequence[float]) -> str:
     return table(
         head, ([f"`{f}`", *(found[f]["series"][f"{s:g}_s"]["psnr_db"] for s in seconds)] for f in FIELDS)
     )
+
+
+def gpu() -> str:
+    """From scratch on a GPU and on the cores beside it: dB after so many seconds, and steps a second."""
+    found = measured("docs/results/gpu/field.json")["field"]
+    rows = []
+    for name, words in GPU_ROWS.items():
+        room, lego = (found[scene].get(name, {}) for scene in ("room", "lego"))
+        cells = [of.get("series", {}).get(f"{s:g}_s", {}).get("psnr_db", "")
+                 for of, seconds in ((room, (0.5, 1, 2.5, 8)), (lego, (2, 5))) for s in seconds]  # fmt: skip
+        rate = f"{room['steps_per_s']:.0f}" if "steps_per_s" in room else ""
+        rows.append([words, *cells, rate])
+    head = ["", *(f"`room`, {s:g} s" for s in (0.5, 1, 2.5, 8)), *(f"`lego`, {s} s" for s in (2, 5))]
+    return table([*head, "steps a second, `room`"], rows)
+
+
+def threads() -> str:
+    """Milliseconds of an update of ``room`` by threads, on a machine of more cores."""
+    found = measured("docs/results/gpu/threads.json")
+    of = found["threads"]
+    return table(["threads", *of], [["ms an update", *(f"{row['median_ms']:.0f}" for row in of.values())]])
 
 
 def representations() -> str:
@@ -566,6 +596,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "lego": lambda: from_scratch("lego", (2, 5, 15, 60)),
     "fox": lambda: from_scratch("fox", (2, 5, 15, 60)),
     "baselines": baselines,
+    "gpu": gpu,
+    "threads": threads,
     "best-updates": best_updates,
     "all-updates": all_updates,
     "options": options,

@@ -243,6 +243,8 @@ def draw(figures: dict[str, Any], path: Path) -> None:
             known = [v for v in part["baseline"].values() if v is not None]
             ax.axhline(max(known), color=GREY, linestyle=":", linewidth=1.2, label="needs no field")
             ax.set_xscale("log")
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.xaxis.set_minor_formatter("{x:g}")
             last = scene == scenes[-1]
             label_lines(ax, "PSNR (dB)", "seconds of fitting from scratch" if last else None, part["scene"])
 

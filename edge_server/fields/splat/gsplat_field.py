@@ -1,9 +1,9 @@
 """The Gaussian field with gsplat's CUDA rasterizer (Ye et al. 2024): ``pip install "freshfield[cuda]"``.
 
 Only the gradient of a step is computed here; ``SplatField`` does the rest: seeding, densification, motion,
-state, and snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied a step, at
-little cost beside a rasterization. The code around the rasterizer is tested on CPUs with the torch
-oracle in place of gsplat; those with gsplat itself need a GPU.
+state, and snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied for each
+step. The code around the rasterizer is tested on CPUs with the torch oracle in place of gsplat; the tests
+with gsplat itself need a GPU.
 """
 
 from __future__ import annotations
