@@ -110,6 +110,7 @@ def leftovers(out: Path) -> list[str]:
     return found
 
 
+@pytest.mark.slow  # 11 s; make demo in CI ends so, too
 def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> None:
     run = up("--for", "6s")
     assert run.end(READY_S + 60.0) == 0, run.output

@@ -27,6 +27,7 @@ def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
     assert gains[0] > -0.25 and gains[1] < -0.5
 
 
+@pytest.mark.slow  # 6 s
 def test_a_diffused_grid_repeats_itself_and_shows_better_what_it_has_not_seen() -> None:
     few, others = SEEN[::2], SEEN[1::2]
     fields = [VoxelField(replace(SMALL, threads=n, diffuse=s)) for n, s in ((1, 1.0), (3, 1.0), (2, 0.0))]
