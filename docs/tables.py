@@ -29,9 +29,11 @@ FIELDS = {
 GPU_ROWS = {
     "splat": "`splat`, 8 threads",
     "splat, threads=16": "`splat`, 16 threads",
+    "splat, threads=2": "`splat`, 2 threads",
     "splat, device=cuda": "`splat`, GPU (gsplat)",
     "ngp": "`ngp`, 8 threads",
     "ngp, threads=16": "`ngp`, 16 threads",
+    "ngp, threads=2": "`ngp`, 2 threads",
     "ngp, device=cuda": "`ngp`, GPU (torch)",
 }
 # title, option as `bench options --only` knows it, and the cases (field, scene) with and without a need of it
@@ -138,19 +140,23 @@ def gpu() -> str:
     rows = []
     for name, words in GPU_ROWS.items():
         room, lego = (found[scene].get(name, {}) for scene in ("room", "lego"))
-        cells = [of.get("series", {}).get(f"{s:g}_s", {}).get("psnr_db", "")
+        cells = [of.get("series", {}).get(f"{s:g}_s", {}).get("psnr_db", "-")
                  for of, seconds in ((room, (0.5, 1, 2.5, 8)), (lego, (2, 5))) for s in seconds]  # fmt: skip
-        rate = f"{room['steps_per_s']:.0f}" if "steps_per_s" in room else ""
+        rate = f"{room['steps_per_s']:.0f}" if "steps_per_s" in room else "-"
         rows.append([words, *cells, rate])
     head = ["", *(f"`room`, {s:g} s" for s in (0.5, 1, 2.5, 8)), *(f"`lego`, {s} s" for s in (2, 5))]
     return table([*head, "steps a second, `room`"], rows)
 
 
 def threads() -> str:
-    """Milliseconds of an update of ``room`` by threads, on a machine of more cores."""
+    """Steps a second and milliseconds of an update of ``room``, by threads, on a machine of 16 cores."""
     found = measured("docs/results/gpu/threads.json")
-    of = found["threads"]
-    return table(["threads", *of], [["ms an update", *(f"{row['median_ms']:.0f}" for row in of.values())]])
+    of, updates = found["steps_per_s"], found["threads"]
+    names = [name for name in of["1"] if name != "empty_job_us"]
+    rows = [[f"steps a second, {name}", *(row[name] for row in of.values())] for name in names]
+    rows.append(["a kernel that does nothing, us", *(row["empty_job_us"] for row in of.values())])
+    took = [f"{updates[n]['median_ms']:.0f}" if n in updates else "-" for n in of]
+    return table(["threads", *of], [*rows, ["an update of the scenario `room`, ms", *took]])
 
 
 def representations() -> str:

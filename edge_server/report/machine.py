@@ -51,7 +51,11 @@ def machine(proc: Path = _PROC) -> dict[str, Any]:
         "memory_gb": round(int(memory_kb.split()[0]) * 1024 / 1e9, 1) if memory_kb else None,
         "system": platform.system(),
         "kernel": platform.release(),
-        "gpus": [_field(path, "Model") for path in sorted(proc.glob("driver/nvidia/gpus/*/information"))],
+        "gpus": [
+            name
+            for path in sorted(proc.glob("driver/nvidia/gpus/*/information"))
+            if (name := _field(path, "Model"))
+        ],
     }
 
 

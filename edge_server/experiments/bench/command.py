@@ -149,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
         f"{', '.join(_SCENES['track'])} [track: both; drift: room]; of shown: a row of its table, or any "
         "scenario of a synthetic world [all rows]")  # fmt: skip
     add("--option", action="append", default=[], metavar="KEY=VALUE",
-        help="of field, track, drift: setting of the representation, device=cuda for one")  # fmt: skip
+        help="of field, track, drift: a setting of the representation, for example device=cuda")  # fmt: skip
     return parser
 
 

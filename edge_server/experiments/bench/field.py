@@ -78,12 +78,13 @@ def measure(run: BenchRun) -> dict[str, Any]:
     with which a start is not measured. BenchError: a scene that was asked for cannot be had."""
     workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
     lpips, missing = open_lpips(run.lpips)
+    stills = list(_stills(run.scenes))
     store.results["lpips_missing"] = missing
     for name in () if run.options else names:
         start = partial(_start_up, name, run.quick, run.folder / name)
         settings = {"cold": not run.quick, "defaults": settings_digest(name)}
         store.get("start", name, compute=start, settings=settings)
-    for scene, still in _stills(run.scenes):
+    for scene, still in stills:
         base = partial(mean_baselines, still.training, still.held_out, still.background)
         store.get(scene, "baseline", compute=base)
         store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
@@ -236,10 +237,11 @@ def draw(figures: dict[str, Any], path: Path) -> None:
         for ax, scene in zip(axes[:, 0], scenes):
             part = figures[scene]
             names = [n for n, rows in part.items() if isinstance(rows, dict) and "series" in rows]
-            for colour, name in zip(CYCLE, names):
+            for k, name in enumerate(names):
                 rows = list(part[name]["series"].values())
                 x, y = ([r[key] for r in rows] for key in ("fitted_s", "psnr_db"))
-                ax.plot(x, y, ".-", color=colour, label=name)
+                line = ".-" if k < len(CYCLE) else ".--"
+                ax.plot(x, y, line, color=CYCLE[k % len(CYCLE)], label=name)
             known = [v for v in part["baseline"].values() if v is not None]
             ax.axhline(max(known), color=GREY, linestyle=":", linewidth=1.2, label="needs no field")
             ax.set_xscale("log")

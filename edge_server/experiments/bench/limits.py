@@ -35,7 +35,7 @@ from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, FitReport, View
 from edge_server.fields.common.kernels.hash_grid import FEATURES
-from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool, cores
 from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
@@ -87,7 +87,7 @@ class TimedPool(Pool):
 def measure(run: BenchRun) -> dict[str, Any]:
     """The limits of the machine and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share
     of a step, its milliseconds a step and the share of them that its floor explains."""
-    pool = TimedPool()
+    pool = TimedPool(cores())  # as many as the limits are measured with
     load = LoadMeter()
     limits = Limits(repeats=5 if run.quick else 15)
     figures: dict[str, Any] = {}
@@ -111,7 +111,7 @@ class Limits:
     """
 
     def __init__(self, repeats: int) -> None:
-        self.pool = Pool(nice=0)
+        self.pool = Pool(cores(), nice=0)
         self._repeats = repeats
         self._last = machine_limits(self.pool, repeats)
         self.highest = self._last

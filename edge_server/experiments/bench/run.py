@@ -12,7 +12,7 @@ from typing import Any
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
-from edge_server.fields.registry import make_field
+from edge_server.fields.registry import settings_of
 
 # Recordings below the data folder: what is opened, and what is held out.
 RECORDINGS = {
@@ -66,8 +66,7 @@ def result_settings(
 def label(name: str, options: Mapping[str, Any]) -> str:
     """Settings of a representation as text, without those at their default. ValueError for unknown settings
     or values."""
-    usual = getattr(make_field(name), "settings", None)
-    chosen = getattr(make_field(name, options), "settings", None)
+    usual, chosen = settings_of(name), settings_of(name, options)
     different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
     return ", ".join(f"{k}={v}" for k, v in different.items()) or "default"
 

@@ -23,7 +23,7 @@ from edge_server.experiments.common.machine_probe import (
     random_reads,
 )
 from edge_server.fields.common.kernels.hash_grid import FEATURES
-from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool, cores
 
 MEGABYTES = 4  # of the table that is read from: more than a core's own cache holds
 REPEATS = 3
@@ -40,7 +40,7 @@ class MachineSpeed:
     """
 
     def __init__(self) -> None:
-        self._pool = Pool(nice=0)
+        self._pool = Pool(cores(), nice=0)
         self._samples: list[tuple[float, float]] = []
         self.sample()  # compiles
         self._samples.clear()

@@ -10,17 +10,17 @@ from concurrent.futures import ProcessPoolExecutor
 
 import cv2
 
-from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
+from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
 
 
 def init_worker(threads: int) -> None:
     """Initializer of a worker process: give it its share of threads, leave Ctrl-C to the parent, and end it
     when the parent ends, however that happens.
 
-    threads: of our kernels and of OpenCV.
+    threads: of OpenCV and, up to ``MOST_USEFUL``, of our kernels.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ[THREADS_VARIABLE] = str(threads)
+    os.environ[THREADS_VARIABLE] = str(min(threads, MOST_USEFUL))
     cv2.setNumThreads(threads)
     if multiprocessing.parent_process() is not None:
         threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()

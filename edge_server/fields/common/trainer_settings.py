@@ -47,7 +47,8 @@ class FieldSettings:
     )
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(
-        None, "worker threads; results do not depend on it. None: a core each, up to 8"
+        None,
+        "worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or a core each, at most 8",
     )
     nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
     device: str = option(

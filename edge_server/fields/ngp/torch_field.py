@@ -53,6 +53,7 @@ from edge_server.fields.ngp.torch_model import (
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
+POINTS = 1 << 17  # encoded at a time where no gradient is wanted
 UNCHECKED_STEPS = 32  # between two looks whether any ray goes on: a look waits for the device
 KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "depth_guide")  # not implemented here
 
@@ -138,11 +139,17 @@ class TorchSnapshot(PixelSnapshot):
         inside = self.occupied[cell[..., 2], cell[..., 1], cell[..., 0]] > 0
         return t, delta, u, inside & (t < leave[:, None])
 
+    def evaluate(self, points: Tensor) -> Tensor:
+        """The network's output (N, outputs) for points (N, 3) in the unit cube."""
+        # A whole picture's points would take gigabytes; a step's gradients need them all at once anyway.
+        size = len(points) if torch.is_grad_enabled() else POINTS
+        parts = points.split(max(size, 1))
+        return torch.cat([mlp(self.widths, self.net, encode(self.grid, self.levels, part)) for part in parts])
+
     def query(self, d: Tensor, u: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
         """Density (R, S) and color (R, S, 3) of marched samples; 0 where not ``inside``."""
         direction = d[:, None].expand(-1, u.shape[1], -1)[inside]
-        raw = mlp(self.widths, self.net, encode(self.grid, self.levels, u[inside]))
-        sigma, color = shade(raw, self.settings.harmonics, direction)
+        sigma, color = shade(self.evaluate(u[inside]), self.settings.harmonics, direction)
         shape = inside.shape
         whole = torch.zeros(shape, device=u.device).masked_scatter(inside, sigma)
         colors = torch.zeros((*shape, 3), device=u.device)
@@ -179,14 +186,16 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
     shape = STATE_SHAPE
     settings: NgpSettings
 
-    def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
+    def __init__(
+        self, settings: NgpSettings | None = None, device: str = "cuda", pool: Pool | None = None
+    ) -> None:
         settings = settings or NgpSettings()
         if missing := unsupported_options(settings):
             raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
         self.device = device
         if self.device.startswith("cuda") and not cuda_present():
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use device cpu")
-        super().__init__(settings)
+        super().__init__(settings, pool)
 
     def _begin_fit(
         self, views: Sequence[View], step_budget: StepBudget, budget: Budget
@@ -201,11 +210,11 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         return partial(self._one_step, data), 0, 0
 
     def _run_kernels(self, pool: Pool) -> None:
-        """Nothing to compile, but a device's libraries load when first used, which takes seconds."""
+        """Those of the occupancy grid; and the device's libraries, which take seconds to load."""
         camera, pose = Pinhole.from_fov(8, 8, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         tiny = replace(self.settings, rays=16, log2_table=8, cells=8, min_views=1)
-        field = NgpTorchField(tiny, self.device)
+        field = NgpTorchField(tiny, self.device, pool)
         views = [View(f"warm-up {k}", np.full((8, 8, 3), 128, np.uint8), pose, camera) for k in range(3)]
         field.fit(views, Budget(steps=1))
         field.render(pose, camera)
@@ -347,11 +356,8 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
         axis = torch.arange(cells, device=self.device)
         corner = torch.cartesian_prod(axis, axis, axis).flip(-1)  # x fastest
         jitter = torch.as_tensor(rng.random(corner.shape, dtype=np.float32), device=self.device)
-        parts = []
-        for x in ((corner + jitter) / cells).split(1 << 18):
-            raw = mlp(model.widths, model.net, encode(model.grid, model.levels, x))
-            parts.append(shade(raw, 1, x)[0])
-        fresh = torch.cat(parts)
+        points = (corner + jitter) / cells
+        fresh = shade(model.evaluate(points), 1, points)[0]
         if o.contracted:
             m = ((corner + 0.5) * (4.0 / cells) - 2.0).abs().amax(-1)
             fresh = fresh * torch.where(m > 1.0, 1.0 / (2.0 - m).clamp(min=1e-6), torch.ones_like(m)).square()

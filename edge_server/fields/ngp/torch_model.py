@@ -6,7 +6,7 @@ tensors on any device.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -37,21 +37,28 @@ def to_torch(grid: Grid, device: str = "cpu", dtype: torch.dtype = torch.float32
 
 def encode(grid: TorchGrid, levels: int, x: Tensor) -> Tensor:
     """Points (N, 3) in the unit cube -> features (N, 2 L); levels from ``levels`` on are 0. Eq. 3.23."""
-    res = torch.tensor(grid.resolution[:levels], device=x.device)[:, None]  # (l, 1)
+    res = torch.tensor(grid.resolution[:levels], dtype=torch.long, device=x.device)[:, None]  # (l, 1)
     first = torch.tensor(grid.first[: levels + 1], device=x.device)
-    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=x.device)  # (8, 3)
+    dense = torch.tensor(grid.dense[:levels], dtype=torch.bool, device=x.device)[:, None]
     scaled = x[:, None, :] * res  # (N, l, 3)
     cell = torch.minimum(scaled.floor().clamp(min=0), (res - 1).to(x.dtype))
-    fraction = (scaled - cell)[:, :, None, :]
-    vertex = cell.long()[:, :, None, :] + corner  # (N, l, 8, 3)
-    mixed = (vertex * torch.tensor(PRIMES, device=x.device)) & 0xFFFFFFFF
-    hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % first.diff()[:, None]
-    plain = vertex[..., 0] + (res + 1) * (vertex[..., 1] + (res + 1) * vertex[..., 2])
-    dense = torch.tensor(grid.dense[:levels], device=x.device)[:, None]
-    row = first[:-1, None] + torch.where(dense, plain, hashed)  # (N, l, 8)
-    weight = torch.where(corner == 1, fraction, 1 - fraction).prod(dim=-1)
+    part = scaled - cell
+    weight = _corners(torch.mul, torch.stack([1 - part, part], dim=-1))
+    strides = torch.cat([torch.ones_like(res), res + 1, (res + 1) ** 2], dim=-1)
+    factor = torch.where(dense, strides, torch.tensor(PRIMES, device=x.device))  # (l, 3)
+    near = cell.long() * factor
+    sides = torch.stack([near, near + factor], dim=-1)
+    hashed = (_corners(torch.bitwise_xor, sides) & 0xFFFFFFFF) % first.diff()[:, None]
+    row = first[:-1, None] + torch.where(dense, _corners(torch.add, sides), hashed)  # (N, l, 8)
     found = (weight[..., None] * grid.table[row]).sum(dim=2).flatten(1)
     return torch.nn.functional.pad(found, (0, FEATURES * (len(grid.resolution) - levels)))
+
+
+def _corners(combine: Callable[[Tensor, Tensor], Tensor], sides: Tensor) -> Tensor:
+    """Of both sides of a cell along x, y and z (N, l, 3, 2) -> of its corners (N, l, 8), x fastest."""
+    x, y, z = sides.unbind(-2)
+    plane = combine(x[..., None, :], y[..., :, None])
+    return combine(plane[..., None, :, :], z[..., :, None, None]).flatten(2)
 
 
 def mlp(widths: Sequence[int], params: Tensor, x: Tensor) -> Tensor:
@@ -98,13 +105,13 @@ def ray_losses(
     sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor,
     distortion: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Color errors (R,) and losses (R,) of rays with samples (R, S): 3.22 and mip-NeRF 360's distortion
-    loss."""
+    """Color errors (R,) and losses (R,) of rays with samples (R, S), none nearer than the one before it: 3.22
+    and mip-NeRF 360's distortion loss."""
     weight, left = ray_weights(sigma, delta)
     rendered = (weight[..., None] * color).sum(dim=1) + left[:, None] * background
     error = (rendered - target).square().sum(dim=-1)
     before = torch.nn.functional.pad(weight, (1, 0)).cumsum(dim=-1)[:, :-1]
     moment = torch.nn.functional.pad(weight * t, (1, 0)).cumsum(dim=-1)[:, :-1]
-    spread = 2.0 * (weight * (t * before - moment)).sum(dim=-1)  # all pairs: t increases along a ray
+    spread = 2.0 * (weight * (t * before - moment)).sum(dim=-1)  # over all pairs
     spread = spread + (weight.square() * delta).sum(dim=-1) / 3.0
     return error, error + distortion * spread

@@ -57,11 +57,14 @@ class GsplatField(SplatField):
         self._rasterize, self._device = rasterize, torch.device(device)
 
     def warm_up(self) -> float:
-        """Also a step on the device: gsplat compiles its kernels when first used, which takes minutes."""
+        """Also a step on the device: gsplat compiles its kernels when first used, for a minute or more."""
         seconds, start = super().warm_up(), time.perf_counter()
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
-        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        tiny = replace(
+            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False, centre_m=None,
+            radius_m=None, near_m=None,
+        )  # fmt: skip
         image = np.full((32, 32, 3), 128, np.uint8)
         image[8:16, 8:16] = 255  # or there would be no Gaussians to rasterize
         field = GsplatField(tiny, self._rasterize, str(self._device))

@@ -24,4 +24,6 @@ def test_gpus_are_named(tmp_path):
     gpu = tmp_path / "driver/nvidia/gpus/0000:01:00.0/information"
     gpu.parent.mkdir(parents=True)
     gpu.write_text("Model: \t\t NVIDIA H100 80GB HBM3\nIRQ:   \t\t 42\n")
+    (other := gpu.parent.parent / "0000:02:00.0").mkdir()
+    (other / "information").write_text("IRQ:   \t\t 43\n")
     assert machine(tmp_path)["gpus"] == ["NVIDIA H100 80GB HBM3"]

@@ -39,8 +39,8 @@ from edge_server.fields.common.threads.work_queue import (
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
-# More workers make a field slower: each takes the GIL once a job. Of 1 to 16 tried on 16 cores, 8 were best,
-# or nearly, for splat and ngp on images of 128 and 400 pixels; 16 made 0.6 to 0.9 times their steps.
+# More workers gain nothing, or lose (docs/results/gpu/threads.json): each takes the GIL once a job, which alone
+# takes 0.1 ms with 8 and 0.3 ms with 16.
 MOST_USEFUL = 8
 
 SERVER_NICE = 5  # of workers in a server that answers cameras meanwhile
@@ -55,6 +55,11 @@ def cores() -> int:
             raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
         return int(given)
     return _own_cores()
+
+
+def default_threads() -> int:
+    """Workers of a pool that is not told: ``cores``, but of the machine's own at most ``MOST_USEFUL``."""
+    return cores() if os.environ.get(THREADS_VARIABLE) else min(_own_cores(), MOST_USEFUL)
 
 
 def _own_cores() -> int:
@@ -82,16 +87,13 @@ class Pool:
     Any number of Python threads may call ``run``: one job is done after the other. If there is a core for
     each worker, workers poll for jobs for a moment before they sleep.
 
-    threads: number of workers; results do not depend on it. Default: the environment's FRESHFIELD_THREADS,
-        else the number of cores that this process may use, up to ``MOST_USEFUL``.
+    threads: number of workers; results do not depend on it. Default: ``default_threads``.
     nice: the workers' priority where the system allows it (Linux has one per thread), so that threads that
         ingest frames go first. With 0, the caller's priority, the caller itself is worker 0.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 0) -> None:
-        if threads is None:
-            threads = cores() if os.environ.get(THREADS_VARIABLE) else min(cores(), MOST_USEFUL)
-        self.threads = int(threads)
+        self.threads = default_threads() if threads is None else int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice

@@ -77,12 +77,20 @@ def asked(monkeypatch):
     """What is asked for of ``bench field``, where nothing is measured."""
     found = []
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: found.append(name) or _curve(*rest))
+    monkeypatch.setattr(
+        bench_field, "_curve", lambda name, *rest: _ask(found, name, rest[0]) or _curve(*rest)
+    )
     monkeypatch.setattr(bench_field, "_rates", lambda make, still, repeats: {})
     monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: found.append(f"start {name}") or {})
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
     monkeypatch.setattr(bench_field, "SIZE", 24)
     return found
+
+
+def _ask(found, title, make):
+    found.append(title)
+    assert make(seed=1).settings.seed == 1
+    assert "levels" not in title or make(seed=1).settings.levels == 4
 
 
 def _curve(make, still, planned_s, seeds, lpips):
@@ -93,7 +101,7 @@ def _curve(make, still, planned_s, seeds, lpips):
 
 
 @pytest.mark.slow  # 9 s
-def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, asked, few_cameras):
+def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, capsys, monkeypatch, asked, few_cameras):
     rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
              "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
     starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
@@ -130,6 +138,10 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch, ask
     other = ["--field", "ngp", "--scene", "room", "--option", "levels=4"]
     assert edge_server(["bench", "field", "--quick", "--json", str(path), "--resume", *other]) == 0
     assert asked[4:] == ["ngp, levels=4"] and json.loads(path.read_text())["field"]["room"]["ngp, levels=4"]
+
+    # A recording that was asked for and is missing ends it before anything is measured.
+    assert edge_server(["bench", "field", "--quick", "--scene", "room", "--scene", "lego"]) == 1
+    assert len(asked) == 5 and "lego: set FRESHFIELD_DATA" in capsys.readouterr().err
 
     # A part that is one figure is skipped as a whole.
     before = more["decide"]

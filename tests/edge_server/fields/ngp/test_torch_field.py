@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.fields.ngp import torch_field
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.torch_field import NgpTorchField, cuda_present
+from edge_server.fields.ngp.torch_model import encode
 from tests.edge_server.fields.ngp.small import SMALL
 from tests.edge_server.fields.scenes import psnr, ring
 from tests.edge_server.fields.small import HELD, SEEN
@@ -76,6 +78,13 @@ def test_stale_pixels_that_moved_are_not_drawn_and_old_ones_count_less() -> None
     assert np.isfinite(field.fit(after, Budget(steps=2)).loss)
 
 
+def test_warming_up_takes_a_step_of_a_field_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    points: list[int] = []
+    monkeypatch.setattr(torch_field, "encode", lambda *a: points.append(len(a[2])) or encode(*a))
+    field = NgpTorchField(SMALL, "cpu")
+    assert field.warm_up() > 0.0 and max(points) > 0 and field.step == 0
+
+
 def test_cuda_is_refused_where_there_is_none() -> None:
     if cuda_present():
         pytest.skip("this machine has a CUDA device")
@@ -86,7 +95,7 @@ def test_cuda_is_refused_where_there_is_none() -> None:
 @pytest.mark.skipif(not cuda_present(), reason="no CUDA device here")
 def test_the_same_on_cuda() -> None:
     cpu, gpu = NgpTorchField(SMALL, "cpu"), NgpTorchField(SMALL, "cuda")
-    assert gpu.warm_up() > 0.0 and gpu.step == 0
+    gpu.warm_up()
     cpu.fit(SEEN, Budget(steps=20))
     gpu.load_state(cpu.state())
     a, b = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (cpu, gpu))

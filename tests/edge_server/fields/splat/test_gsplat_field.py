@@ -1,4 +1,4 @@
-"""The gsplat field's own code, with the torch oracle in place of gsplat; needs no GPU."""
+"""The gsplat field's own code, with the torch oracle in place of gsplat, which needs a GPU."""
 
 from __future__ import annotations
 
@@ -86,6 +86,13 @@ def test_it_weighs_pixels_as_the_kernels_do() -> None:
     assert moments[1] < 0.7 * moments[0]
 
 
+@pytest.mark.parametrize("placed", [{}, {"near_m": 5.0}, {"centre_m": (5.0, 0.0, 0.0), "radius_m": 0.5}])
+def test_warming_up_reaches_the_rasterizer(placed: dict[str, Any]) -> None:
+    calls: list[Any] = []
+    field = GsplatField(replace(TINY, **placed), lambda **k: calls.append(k) or rasterize(**k), "cpu")
+    assert field.warm_up() > 0.0 and calls and field.step == 0
+
+
 def test_no_gaussians_are_not_rasterized() -> None:
     field = GsplatField(replace(TINY, min_views=1), lambda **_: pytest.fail("gsplat ends the process"), "cpu")
     gray = replace(VIEWS[0], image=np.full_like(VIEWS[0].image, 128))
@@ -95,7 +102,6 @@ def test_no_gaussians_are_not_rasterized() -> None:
 
 def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     cuda = GsplatField(TINY, rasterize, "cpu")
-    assert cuda.warm_up() > 0.0 and cuda.step == 0
     cuda.fit(VIEWS, Budget(steps=14))
     assert 24 < len(cuda.cloud) <= 40
     cpu = SplatField(TINY)

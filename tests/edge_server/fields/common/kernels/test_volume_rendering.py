@@ -22,6 +22,19 @@ from edge_server.fields.ngp import torch_model
 SAMPLES = 24
 
 
+def test_the_oracles_distortion_is_the_sum_over_all_pairs() -> None:
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.random((5, SAMPLES)), axis=1)
+    t[:, -4:] = t[:, -4:-3]  # where a ray has ended its samples stay where they are
+    delta = np.diff(t, axis=1, append=t[:, -1:])
+    sigma, color = (torch.as_tensor(rng.random(shape)) for shape in ((5, SAMPLES), (5, SAMPLES, 3)))
+    at, step, black = torch.as_tensor(t), torch.as_tensor(delta), torch.zeros((5, 3), dtype=torch.float64)
+    error, loss = torch_model.ray_losses(sigma, color, at, step, black, black, 1.0)
+    w = torch_model.ray_weights(sigma, step)[0].numpy()
+    pairs = (w[:, :, None] * w[:, None, :] * np.abs(t[:, :, None] - t[:, None, :])).sum(axis=(1, 2))
+    np.testing.assert_allclose((loss - error).numpy(), pairs + (w**2 * delta).sum(axis=1) / 3, rtol=1e-12)
+
+
 def _ray(seed: int, density: float, harmonics: int = 1):
     rng = np.random.default_rng(seed)
     rows = (1 + 3 * harmonics + 3) // 4 * 4
