@@ -39,8 +39,8 @@ from edge_server.fields.common.threads.work_queue import (
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
-# More workers gain nothing, or lose: each takes the GIL once a job, which alone takes 0.1 ms with 8 and 0.3 ms
-# with 16 (docs/results/gpu/threads.json).
+# More workers gain nothing, or lose: each takes the GIL once a job. That alone takes 0.1 ms with 8 and
+# 0.3 ms with 16 (docs/results/gpu/threads.json).
 MOST_USEFUL = 8
 
 SERVER_NICE = 5  # of workers in a server that answers cameras meanwhile
