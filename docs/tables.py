@@ -106,6 +106,10 @@ VERDICTS = (
     ("images", "tower, mean age of used views (ms)", ""),
     ("representations", "room, threshold, PSNR (dB)", ""),
     ("representations", "room, threshold, PSNR, moving pixels (dB)", ""),
+    ("ppo-select", "room, ch5, whole, one viewpoint, from nothing, judged from the cameras that rewarded", ""),
+    ("ppo-select", "room, ch5, whole, one viewpoint, from nothing", "better than random"),
+    ("ppo-select", "room, ch5, whole, one viewpoint, from nothing", "fixed threshold"),
+    ("ppo-select", "room, ch5, whole, one viewpoint, from nothing", "better than all"),
     ("metrics", "LPIPS", ""),
     ("metrics", "SSIM", "lowest"),
 )
