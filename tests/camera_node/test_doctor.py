@@ -42,6 +42,7 @@ def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     assert parts["network"][0] is None and parts["scenario"][0] is None
 
 
+@pytest.mark.slow  # 7 s
 def test_an_arm_that_is_well(capsys, tmp_path, host):
     with simulated_arm(host):
         _, parts = examined(capsys, cell_at(tmp_path, host, frequency_hz=10))

@@ -18,6 +18,7 @@ def found(out):
     return "\n".join(problems(out))
 
 
+@pytest.mark.slow  # 4 s
 def test_lost_lines_and_contradictions_are_refused(tmp_path):
     write_run(tmp_path)
     assert "ledger" not in found(tmp_path) and "accounted" not in found(tmp_path)

@@ -144,6 +144,7 @@ def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame
     assert not leftovers(run.out)
 
 
+@pytest.mark.slow  # 6 s
 def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     run = up("--for", "0", "--process-per-camera")
     run.wait_for_updates()

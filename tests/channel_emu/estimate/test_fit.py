@@ -68,7 +68,9 @@ def test_recovers_a_slow_chain_from_delays_alone(tmp_path: Path, seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("preset", "true"), [("ch6", CH6_TRUE), ("ch6-slow", SLOW_TRUE)])
+@pytest.mark.parametrize(
+    ("preset", "true"), [pytest.param("ch6", CH6_TRUE, marks=pytest.mark.slow), ("ch6-slow", SLOW_TRUE)]
+)
 def test_recovers_the_thesis_channel_from_delays_and_arrivals(
     tmp_path: Path, preset: str, true: dict[str, float], seed: int
 ) -> None:

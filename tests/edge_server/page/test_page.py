@@ -272,6 +272,7 @@ def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
         assert visitor.bytes / seconds < 3e6
 
 
+@pytest.mark.slow  # 6 s
 def test_a_visitor_who_does_not_read_costs_no_memory_and_delays_nobody(tmp_path):
     with (
         preview_page(tmp_path) as (_, page),

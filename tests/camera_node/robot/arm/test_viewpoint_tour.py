@@ -38,6 +38,7 @@ def test_viewpoints_look_at_their_target_from_their_radius():
     assert np.isclose(heights[1], heights[2]) and azimuths[1] < azimuths[2]
 
 
+@pytest.mark.slow  # 7 s
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
     found = cells_tour()
     assert ARM.path.radius_m == 0.34 and found.reached >= 45

@@ -76,6 +76,7 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     assert np.allclose(joints[-1], joints[-2]), "it ends at rest"
 
 
+@pytest.mark.slow  # 4 s
 def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys, host):
     port = free_port()
     file = write_cell(tmp_path, host, teleop={"solver": "dls"})

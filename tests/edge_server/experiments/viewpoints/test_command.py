@@ -94,6 +94,7 @@ def test_a_simulated_expert_is_asked_and_a_policy_plans_by_its_answers(tmp_path,
     assert "about other reconstructions" in capsys.readouterr().err and len(file["answers"]) == 60
 
 
+@pytest.mark.slow  # 6 s
 def test_a_person_is_asked_on_the_page_and_the_next_call_goes_on(tmp_path, monkeypatch):
     """The page's own tests answer; here somebody answers once and finishes."""
     served = []

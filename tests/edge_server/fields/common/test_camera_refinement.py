@@ -60,6 +60,7 @@ def test_gains_are_found_and_the_held_out_view_gains(name: str) -> None:
     assert np.corrcoef(np.log(found).ravel(), -np.log(gains).ravel())[0, 1] > 0.65
 
 
+@pytest.mark.slow  # 7 s
 def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     views = _displaced(SEEN, 0.02, 1.5)
     scores = {}

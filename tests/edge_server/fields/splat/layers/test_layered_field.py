@@ -391,6 +391,7 @@ def test_a_fit_without_a_step_says_why() -> None:
     assert still.fit([_frame(0, 40, False)], Budget(seconds=1e-6)).note == "nothing is left to learn"
 
 
+@pytest.mark.slow  # 8 s
 def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
     """The ball is seeded anew, over its surroundings too: these are left out. One seed differs from the next,
     and one processor from another, by half a decibel."""
