@@ -6,6 +6,7 @@ import contextlib
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable
 from socketserver import ThreadingMixIn
 from typing import Any
@@ -19,6 +20,8 @@ log = logging.getLogger(__name__)
 
 CALLER = "freshfield.caller"
 """Key of the ``access.Caller`` in the environment of an application's requests."""
+
+LINGER_S = 2.0
 
 
 class _Handler(WSGIRequestHandler):
@@ -49,12 +52,28 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
+        with contextlib.suppress(OSError):
+            _read_to_its_end(request)
         with self._lock, contextlib.suppress(ValueError):
             self._open.remove(request)
         super().shutdown_request(request)
 
     def handle_error(self, *_: Any) -> None:
         """A connection that broke is the client's matter."""
+
+
+def _read_to_its_end(connection: socket.socket) -> None:
+    """Say that the answer is complete, then read and forget what still comes, for LINGER_S at most.
+
+    Closing with bytes unread resets the connection, and the client loses an answer that it has not read, such
+    as the refusal of a body that is too large.
+    """
+    until = time.monotonic() + LINGER_S
+    connection.shutdown(socket.SHUT_WR)
+    while (left := until - time.monotonic()) > 0:
+        connection.settimeout(left)
+        if not connection.recv(2**16):
+            return
 
 
 def _guarded(inner: Any, door: HttpDoor) -> Any:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import time
 
 import cv2
 import numpy as np
 import pytest
 
+from edge_server.live.output import guarded_http
 from edge_server.page import PageError
 from edge_server.page.preferences import MAX_BODY_BYTES, PreferencePage
 from edge_server.viewpoints.preference_session import PreferenceSession
@@ -87,7 +89,7 @@ def test_the_page_is_blind(asked):
     ("path", "body", "status"),
     [
         ("/answer", b"no json", 400), ("/answer", b"[1]", 400), ("/answer", {"choice": "left"}, 409),
-        ("/import", b"{}", 400), ("/import", b"x" * (MAX_BODY_BYTES + 1), 413),
+        ("/import", b"{}", 400), ("/import", b"x" * 16 * MAX_BODY_BYTES, 413),
         ("/answer", b"[" * 90_000, 400),
     ],
 )  # fmt: skip
@@ -97,6 +99,15 @@ def test_bad_requests_change_nothing(asked, path, body, status):
     assert found == status and len(text.splitlines()) == 1 and not kept
     turn = state(url)["turn"]
     assert request(url, "POST", "/answer", {"turn": turn, "choice": "both"})[0] == 404 and not kept
+
+
+def test_who_sends_without_end_is_cut_off(asked, monkeypatch):
+    monkeypatch.setattr(guarded_http, "LINGER_S", 0.2)
+    host, port = asked[1].removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as endless, pytest.raises(ConnectionError):
+        endless.sendall(b"POST /import HTTP/1.1\r\nContent-Length: 999999999\r\n\r\n")
+        while True:
+            endless.sendall(bytes(2**16))
 
 
 def test_a_foreign_web_site_answers_nothing(asked):
