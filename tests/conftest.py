@@ -33,13 +33,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # changes nothing but how long it takes. All else meets clocks, ports or whole deployments and has the machine
 # to itself.
 _SIDE_BY_SIDE = (
-    "camera_node/robot/calibration", "camera_node/robot/arm/test_viewpoint_tour.py", "camera_node/synthetic",
-    "camera_node/sources/test_with_effects.py", "deploy/test_wheel.py", "test_architecture.py",
-    "channel_emu/estimate", "channel_emu/model", "channel_emu/virtual", "edge_server/embed",
-    "edge_server/experiments", "edge_server/export", "edge_server/fidelity", "edge_server/fields",
-    "edge_server/report", "edge_server/scheduler", "edge_server/surface", "edge_server/treatments",
-    "fuzz", "stability", "test_lazy_imports.py",
+    "camera_node/pose", "camera_node/robot/calibration", "camera_node/robot/arm/test_viewpoint_tour.py",
+    "camera_node/robot/arm/test_kinematics.py", "camera_node/sources/datasets",
+    "camera_node/sources/test_with_effects.py", "camera_node/synthetic", "channel_emu/estimate",
+    "channel_emu/model", "channel_emu/virtual", "deploy/test_check_report.py", "deploy/test_docs.py",
+    "deploy/test_scenarios.py", "deploy/test_wheel.py", "edge_server/embed", "edge_server/experiments",
+    "edge_server/export", "edge_server/fidelity", "edge_server/fields", "edge_server/foreground",
+    "edge_server/live/test_buffer.py", "edge_server/live/test_keyframes.py", "edge_server/report",
+    "edge_server/scheduler", "edge_server/surface", "edge_server/treatments", "edge_server/viewpoints",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
+    "fuzz", "stability", "test_architecture.py", "test_lazy_imports.py",
 )  # fmt: skip
 
 
