@@ -69,7 +69,7 @@ class Simulation:
                                         for saw, run in zip(saws, self.runs)]) for text in metrics},
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
-            "dropped": counts["dropped_busy"],
+            "dropped": sum(count for name, count in counts.items() if name != "in_flight"),
             **counts,
             "duplicated": sum(run.duplicated for run in self.runs),
             "state_share": dict(zip(self.config.state_names, (round(float(s), 6) for s in share))),

@@ -212,13 +212,14 @@ class FieldUpdater:
         views = self.decoder.views(selection.items)
         if not views:
             return None
+        others = self.decoder.others(selection.others)
         treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
         if self.keyframes is None:
-            return views, self.field.fit([*self.decoder.others(selection.others), *treated], budget)
+            return views, self.field.fit([*others, *treated], budget)
         supervision = self.keyframes.with_earlier(treated)
         if self.keyframes.should_restart(len(supervision)):
             self.field.reset()
-        report = self.field.fit(supervision, budget)
+        report = self.field.fit([*others, *supervision], budget)
         # Refusals of earlier viewpoints are not counted against current frames.
         current = {view.camera for view in views}
         return views, replace(report, refused=tuple(c for c in report.refused if c in current))

@@ -42,7 +42,8 @@ def test_simulate_takes_short_spellings(capsys) -> None:
         "--seconds", "120", "--seed", "4",
     )  # fmt: skip
     assert found["mean_age_ms"] == pytest.approx(84, abs=4)
-    assert set(found) >= {"mean_age_ms", "mean_age_slotted_ms", "peak_age_ms", "delivered", "dropped"}
+    assert set(found) >= {"mean_age_ms", "mean_age_slotted_ms", "peak_age_ms"}
+    assert found["offered"] == found["delivered"] + found["dropped"] + found["in_flight"]
     assert set(found["delay_ms"]) == {"mean", "p50", "p95"}
     assert sum(found["state_share"].values()) == pytest.approx(1)
     again = simulate(

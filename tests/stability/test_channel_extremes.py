@@ -145,15 +145,6 @@ def test_a_clock_that_jumps() -> None:
     assert transit.due_ns is not None and transit.due_ns > 10**18
 
 
-def test_frames_of_the_same_instant() -> None:
-    for discipline in DISCIPLINES:
-        link = Channel(channel_from_mapping({"preset": "ch5", "discipline": discipline}), 0).link("a")
-        for _ in range(50):
-            link.offer(7)
-        link.advance(10**15)
-        assert sum(n for k, n in link.counts.items() if k != EventKind.DUPLICATED) == 50
-
-
 def test_ages_keep_nanoseconds_after_a_year() -> None:
     """Float64 of absolute nanoseconds would be off by 4 ns at 10^16 and by 100 at 10^18."""
     from channel_emu.model import ages

@@ -62,10 +62,6 @@ def learns_on(learner: Learner, problem) -> None:
     assert regret(learner, problem) < 0.04
 
 
-def any_of(spec: Spec, layout: StateLayout) -> Spec:
-    return replace(spec, layout=layout)
-
-
 @by_action
 def test_extreme_ages(spec):
     n = len(EXTREME_AGES_MS)
@@ -114,7 +110,7 @@ def test_extreme_poses_and_embeddings(spec, part):
     decide_and_learn(Learner(spec, 0), states)
     fitted = LAYOUT.standardized(states)
     assert np.isfinite(fitted.batch(states)).all()
-    decide_and_learn(Learner(any_of(spec, fitted), 0), states)
+    decide_and_learn(Learner(replace(spec, layout=fitted), 0), states)
 
 
 @by_action
@@ -273,7 +269,7 @@ def test_a_batch_of_rigs_of_different_sizes(spec):
 def test_after_all_of_this_it_learns_on(spec):
     """One learner, every hard case in turn, then a problem it can solve."""
     problem = FreshOnes() if spec.action == "select" else Waits()
-    spec = any_of(spec, problem.layout)
+    spec = replace(spec, layout=problem.layout)
     learner = Learner(spec, 0)
     rng = np.random.default_rng(0)
     hard = [state(6, rng, silent=k) for k in range(7)]

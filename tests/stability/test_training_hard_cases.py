@@ -59,19 +59,6 @@ def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
 
 
-def test_a_later_batch_without_rewards_teaches_nothing_and_harms_nothing(tmp_path):
-    """A blackout from some episodes on: what was learnt before it stays as it was."""
-    with WorkerPool(NOTHING) as pool:
-        learner = train(setting(), config(), pool, tmp_path, lambda line: None)
-        before = learner.actor.weights
-        moments = pool.draw(setting(NEVER), [1])[0]
-    states = [m.state for m in moments]
-    actions, logps = learner.act(states)
-    text = learner.update(learner.batch(states, actions, logps, [None] * len(states)))
-    assert text.dropped == len(states)
-    assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
-
-
 def test_damaged_late_and_doubled_frames(tmp_path):
     channel = {
         "preset": "ch6",
@@ -93,13 +80,6 @@ def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
     weights_after(alone, config(tries=2), tmp_path)
     # There is one set, so that no try is better than another.
     assert all(row["views"] == 1.0 for row in read_log(tmp_path))
-
-
-def test_a_constant_reward_teaches_nothing_and_harms_nothing(tmp_path):
-    constant = Reward("constant", 0.0, 0.0, 0.0, age=1e-300)
-    before = weights_after(setting(), config(reward=constant, episodes=3), tmp_path / "a")
-    after = weights_after(setting(), config(reward=constant, episodes=12), tmp_path / "b")
-    assert max(np.abs(after[n] - w).max() for n, w in before.items()) < 0.1
 
 
 def test_a_decision_of_nobody_is_an_outcome_without_scores():

@@ -49,10 +49,10 @@ class BanditEnvironment(gymnasium.Env):
     """``problem`` with ``cameras`` cameras; ``spec`` defines observations and actions.
 
     An empty set is not allowed (K_t >= 1): the youngest camera is used instead, and ``info["forced"]`` is
-    true. ``reset(seed)`` draws the round of that seed; without one the next round follows, so that all
-    decisions of a simulated episode are used before another is simulated. Where there is no reward, the mean
-    so far (0 before the first) replaces it, because most learners cannot take NaN, and ``info["missing"]`` is
-    true.
+    true. ``reset(seed)`` starts at a round drawn with that seed; without one the next round follows, so that
+    all decisions of a simulated episode are used before another is simulated. Where there is no reward, the
+    mean so far (0 before the first) replaces it, because most learners cannot take NaN, and
+    ``info["missing"]`` is true.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)

@@ -132,6 +132,25 @@ def test_updates_hand_them_to_the_field_and_report_frames_only():
     assert given[-2:] == ["reset", ["hand"]]
 
 
+def test_a_field_that_wants_every_frame_has_them_too():
+    class WantsAll:
+        frame_s, most_pixels, reset = 0.0, None, lambda self: None
+
+        def fit(self, views, budget):
+            given.append([(v.camera, v.generated_ns) for v in views])
+            return tiny_field().fit(views, budget)
+
+    given: list[list[tuple[str, int]]] = []
+    policy = make_policy("all", None, np.random.default_rng(0))
+    u = FieldUpdater(FrameBuffer(["hand"]), policy, WantsAll(), 0, keyframes=Keyframes(KeyframesConfig()))
+    for k in range(3):
+        pose = Pose.from_matrix(view("", 30 * (k // 2), 0, radius_m=2.0).camera_to_world)
+        u.buffer.put(frame("hand", sequence=k, generated_ns=k, pose=pose), k)
+        if k != 1:
+            u.fit(u.select(u.plan(k), k), Budget(steps=1))
+    assert given == [[("hand", 0)], [("hand", 1), ("hand", 2), ("hand#0", 0)]]
+
+
 def _update(u, k):
     pose = Pose.from_matrix(view("", 30 * k, 0, radius_m=2.0).camera_to_world)
     u.buffer.put(frame("hand", sequence=k, generated_ns=k * 10**9, pose=pose), k * 10**9)

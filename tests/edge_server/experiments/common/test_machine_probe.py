@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.common.machine_probe import CHAINED, CHAINS, TASKS, arithmetic
-from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.threads.thread_pool import CallerPool
 
 
@@ -18,13 +17,3 @@ def test_a_probe_ends_where_its_chains_lead(n: int) -> None:
     begun = np.arange(multiply_adds + additions) + 2.0
     ends = np.where(np.arange(begun.size) < multiply_adds, 1.0, begun + 0.5 * CHAINED)
     assert out[0] == pytest.approx(TASKS * lanes * ends.sum(), rel=1e-3)
-
-
-def test_a_kernel_within_a_function_needs_a_name_of_its_own() -> None:
-    """Two of one name would share the code of the first."""
-
-    def named(counter, worker, out):
-        out[0] = 1.0
-
-    with pytest.raises(ValueError, match=r"locals.*needs a __qualname__ of its own"):
-        kernel(named)

@@ -148,10 +148,3 @@ def test_pixels_of_weight_zero_are_not_drawn(field: NgpField) -> None:
     target = field._scratch.ray[0, :rays, 3:6]
     pixels = data.pixels[data.drawn].astype(np.float32) / 255.0
     assert all(np.abs(pixels - color).max(axis=1).min() < 1e-6 for color in target)
-
-
-def test_weights_of_one_change_nothing(field: NgpField) -> None:
-    plain = _train(field, _packed(field, None))
-    ones = _train(field, _packed(field, [np.ones(v.image.shape[:2], np.float32) for v in VIEWS]))
-    assert plain[0] == ones[0] and plain[2] == ones[2]
-    np.testing.assert_array_equal(plain[1], ones[1])
