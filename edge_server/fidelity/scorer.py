@@ -143,6 +143,11 @@ class Scorer:
         self._cameras: dict[str, _Camera] = {}
         self.unscored = 0  # renderings whose truth never came within half a period
 
+    def warm_up(self) -> None:
+        """Load what the metrics load at their first distance: of LPIPS, two CPU seconds."""
+        blank = np.zeros((64, 64, 3), np.uint8)
+        self.score("", blank, 0, blank, 0)
+
     def publish(self, camera: str, rendering: Render, published_ns: int) -> list[Score]:
         """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``, or a function of the truth's
         generation time that makes it; returns the scores that are complete already."""

@@ -126,6 +126,12 @@ class ScoringThread:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         except (OSError, AttributeError):
             log.debug("thread priority cannot be lowered here")
+        try:
+            self._scorer.warm_up()
+        except Exception:  # whatever it is costs scores, not the thread
+            log.exception("a metric could not be loaded")
+        # Loading is not charged: the allowance would be gone for half a minute.
+        self._asked_s, self._used_s = time.monotonic(), time.thread_time()
         while True:
             with self._wake:
                 self._wake.wait_for(lambda: self._inbox or self._ending)

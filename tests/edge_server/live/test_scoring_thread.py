@@ -49,13 +49,18 @@ def _publication(number: int, at_ns: int) -> Publication:
 
 
 def _run(
-    publications: list[int], frames: list[int], scored: list[Publication] | None = None
+    publications: list[int],
+    frames: list[int],
+    scored: list[Publication] | None = None,
+    scorer: Scorer | None = None,
 ) -> list[tuple[Score, Publication]]:
     """Scores of what was shown, of publications and held-out frames at given instants in ns. scored: takes
     publications with their scores."""
     shown: list[tuple[Score, Publication]] = []
     taken = [] if scored is None else scored
-    thread = ScoringThread(["cam00"], Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of))
+    thread = ScoringThread(
+        ["cam00"], scorer or Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of)
+    )
     events = [(at, 0, n) for n, at in enumerate(publications)] + [(at, 1, n) for n, at in enumerate(frames)]
     thread.start()
     for at_ns, kind, number in sorted(events):
@@ -116,3 +121,30 @@ def test_scoring_stays_within_its_share_of_the_machine(monkeypatch: Any) -> None
     monkeypatch.setattr(scoring_thread, "_ALLOWANCE_S", 0.0)
     monkeypatch.setattr(scoring_thread, "_SHARE", 0.0)
     assert _run([100 * MS], [k * 10 * MS for k in range(60)]) == []
+
+
+class LoadsLong:
+    """A metric that computes for longer than the allowance before its first distance."""
+
+    minimum_side = 1
+    loaded = False
+
+    def __call__(self, a: Any, b: Any) -> float:
+        begun_s = time.thread_time()
+        while not self.loaded and time.thread_time() < begun_s + 0.2:
+            pass
+        self.loaded = True
+        return 0.0
+
+
+def test_what_a_metric_loads_is_not_charged(monkeypatch: Any) -> None:
+    monkeypatch.setattr(scoring_thread, "_ALLOWANCE_S", 0.1)
+    assert _run([100 * MS], [k * 10 * MS for k in range(60)], scorer=Scorer(LoadsLong()))
+
+
+def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone() -> None:
+    def broken(a: Any, b: Any) -> float:
+        raise RuntimeError("no weights")
+
+    broken.minimum_side = 48  # larger than the frames: of them it is not asked
+    assert _run([100 * MS], [k * 10 * MS for k in range(60)], scorer=Scorer(broken))
