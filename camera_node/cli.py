@@ -103,7 +103,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         "(default %(default)s)",
     )  # fmt: skip
     run.add_argument("-q", "--quiet", action="store_true", help="only warnings")
-    transport.add_arguments(run)
+    transport.add_arguments(run, listens=False)
 
 
 def _add_doctor(doctor: argparse.ArgumentParser) -> None:
@@ -115,7 +115,7 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
     )
     doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
-    transport.add_arguments(doctor)
+    transport.add_arguments(doctor, listens=False)
 
 
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
@@ -163,7 +163,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.cache_mb < 0 or args.response_timeout <= 0:
         raise UsageError("--cache-mb cannot be negative, --response-timeout must be positive")
     options = NodeOptions(
-        to=_target(args.to),
+        to=transport.peer("--to", args.to),
         transport=transport.from_arguments(args),
         out=args.out,
         seconds=args.seconds,
@@ -202,16 +202,6 @@ def _chosen(scenario: Scenario, args: argparse.Namespace) -> tuple[str, ...]:
             f"it has {', '.join(scenario.cameras)}"
         )
     return chosen
-
-
-def _target(text: str) -> str:
-    try:
-        host, port = transport.host_port(text)
-    except transport.TransportError as error:
-        raise UsageError(f"--to: {error}") from None
-    if port == 0:
-        raise UsageError(f"--to: expected HOST:PORT with a port from 1, got {text!r}")
-    return f"{host}:{port}"
 
 
 if __name__ == "__main__":

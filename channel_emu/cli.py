@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Emulates a bad network between cameras and the edge, seeded and per frame.
 
-  channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room
+  channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room --trace trace.jsonl
   channel-emu presets
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
   channel-emu simulate --preset gilbert-elliott --metric shown:20ms:16.7ms --csv frames.csv --plot ages.png
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
-  channel-emu replay runs/room/trace.jsonl
+  channel-emu replay trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
-  channel-emu fit runs/room/trace.jsonl --plot fit.png --out fitted.yaml
+  channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
   channel-emu bench --seconds 20 --load 2
   channel-emu bench --simulate
   channel-emu accuracy --out runs/accuracy
@@ -60,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
+        if "to" in args:
+            args.to = transport.peer("--to", args.to)
         return args.go(args)
     # ValueError: a scenario, a spelling, a transport option, a trace. OSError: a path, an address.
     except (ValueError, OSError) as error:

@@ -10,6 +10,8 @@ from typing import IO, Any
 
 MARKER = "run.json"
 """Written first into every run's folder. Only a folder that holds one may be replaced."""
+EARLIER = "earlier-run"
+"""Where the files of the run that was replaced lie until the new one is up: a mistyped option loses none."""
 
 
 class FolderError(ValueError):
@@ -17,7 +19,8 @@ class FolderError(ValueError):
 
 
 def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
-    """Make ``out`` an empty run folder with a marker, locked for as long as the returned file is open.
+    """Make ``out`` an empty run folder with a marker, locked for as long as the returned file is open. The
+    files of an earlier run lie in ``EARLIER`` until ``forget_earlier``.
 
     about: contents of the marker. Raises FolderError if the folder holds anything but an earlier run, or a
     run that is still going on.
@@ -38,14 +41,26 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
     except OSError:
         lock.close()
         raise FolderError(f"another run is writing to {out}; end it, or name another with --out") from None
-    for path in out.iterdir():
-        if path == marker:
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+    earlier = out / EARLIER
+    before = set(out.iterdir()) - {marker, earlier}
+    keep = not earlier.exists()  # else the last start failed, and what lies there is worth more than its logs
+    if before and keep:
+        earlier.mkdir()
+    for path in before:
+        path.rename(earlier / path.name) if keep else _delete(path)
     lock.truncate(0)
     json.dump(about, lock, indent=1)
     lock.flush()
     return lock
+
+
+def forget_earlier(out: Path) -> None:
+    """Delete the files of the run that this one replaces."""
+    _delete(out / EARLIER)
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

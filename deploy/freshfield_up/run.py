@@ -144,6 +144,7 @@ class Launcher:
         waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
+            folder.forget_earlier(self.options.out)
             for driver in self.processes.drivers:
                 driver.start()  # last: the arm must not tour before the field can learn
         elif now_s - self._began_s > READY_WITHIN_S:
@@ -234,8 +235,13 @@ class Launcher:
             self._fail(export.exit_summary())
 
     def _report(self) -> None:
-        """Write the report, whatever happened before."""
+        """Write the report, whatever happened since the run was up."""
         out = self.options.out
+        if self._failures and self._ready_s is None:
+            earlier = out / folder.EARLIER
+            kept = f"; the earlier run's files are in {earlier}" if earlier.exists() else ""
+            self._display.message(f"no report: the run did not start{kept}")
+            return
         if not any(out.glob("ledger-*.tsv")):
             self._display.message("no report: no process has written about a frame")
             return

@@ -122,7 +122,7 @@ class UpdateLoop:
                 first_ns = now_ns
             if reported == wanted or (first_ns is not None and now_ns - first_ns > self._grace_ns):
                 return
-            self._on_status(f"waiting for cameras: {reported} of {wanted} have reported")
+            self._on_status(f"waiting for training cameras: {reported} of {wanted} have reported")
             arrivals = self._updater.buffer.wait(arrivals, _MAX_SLEEP_S)
 
     def _update_once(self) -> None:

@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server explain", description=DESCRIPTION, formatter_class=raw)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--decision", type=int, metavar="N", help="number of the update [the newest kept]")
+    parser.add_argument("--decision", type=int, metavar="N", help="that of update N [the newest kept]")
     parser.add_argument("--camera", metavar="NAME", help="whose picture [the one with the largest share]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     args = parser.parse_args(argv)

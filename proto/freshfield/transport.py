@@ -97,6 +97,17 @@ def host_port(text: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
+def peer(option: str, text: str) -> str:
+    """HOST:PORT of a peer to connect to, given with ``option``. Raises TransportError that names it."""
+    try:
+        host, port = host_port(text)
+    except TransportError as error:
+        raise TransportError(f"{option}: {error}") from None
+    if port == 0:
+        raise TransportError(f"{option}: expected HOST:PORT with a port from 1, got {text!r}")
+    return f"{host}:{port}"
+
+
 @dataclass(frozen=True)
 class Transport:
     """How this process talks: files are PEM. Without ``cert`` and ``ca`` everything is plain text.
@@ -223,8 +234,8 @@ class Transport:
         return grpc.ssl_server_credentials([pair], _pem(self.ca), require_client_auth=self.ca is not None)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The security options that every process takes."""
+def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None:
+    """The security options that every process takes. listens: whether it waits for others to connect."""
     group = parser.add_argument_group("security", "off unless given; the same options for every process")
     group.add_argument("--tls-cert", type=Path, metavar="PEM", help="own certificate")
     group.add_argument("--tls-key", type=Path, metavar="PEM", help="own private key")
@@ -239,19 +250,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--insecure", action="store_true",
-        help="listen beyond this machine without TLS or without asking who calls",
+        help="listen beyond this machine without TLS or without asking who calls" if listens
+        else "send the token to another machine without TLS",
     )  # fmt: skip
 
 
 def from_arguments(args: argparse.Namespace) -> Transport:
-    """Transport of parsed ``add_arguments`` options. Raises TransportError for unreadable files."""
+    """Transport of parsed ``add_arguments`` options. Raises TransportError for files that cannot be used."""
     for path in (args.tls_cert, args.tls_key, args.tls_ca):
         if path:
             _read(path)
     if (args.tls_cert is None) != (args.tls_key is None):
         raise TransportError("--tls-cert and --tls-key go together")
     tokens = _tokens(args.token_file) if args.token_file else {}
-    return Transport(args.tls_cert, args.tls_key, args.tls_ca, tokens, args.insecure)
+    transport = Transport(args.tls_cert, args.tls_key, args.tls_ca, tokens, args.insecure)
+    # gRPC would say nothing of a damaged file, and try again for ever.
+    if args.tls_cert:
+        transport._context()
+    if args.tls_ca:
+        try:
+            ssl.create_default_context(cafile=args.tls_ca)
+        except ssl.SSLError:
+            raise TransportError(f"--tls-ca {args.tls_ca} holds no certificate (PEM)") from None
+    return transport
 
 
 def _tokens(path: Path) -> dict[str, str]:

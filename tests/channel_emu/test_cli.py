@@ -161,6 +161,12 @@ def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
     assert why in error and error.count("\n") == 1 and error.startswith("channel-emu: ")
 
 
+@pytest.mark.parametrize("command", [["run", "room", "--out", "out"], ["proxy", "--preset", "ch5"]])
+def test_a_peer_without_a_port_is_refused(capsys, command: list[str]) -> None:
+    assert main([*command, "--to", "edge"]) == 2
+    assert capsys.readouterr().err.startswith("channel-emu: --to: expected HOST:PORT")
+
+
 def test_replay_says_whether_decisions_agree(capsys, tmp_path: Path) -> None:
     from channel_emu.model.config import channel_from_mapping
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from freshfield_up.folder import MARKER, FolderError, prepare
+from freshfield_up.folder import EARLIER, MARKER, FolderError, forget_earlier, prepare
 
 
 def test_a_new_folder_gets_a_marker(tmp_path: Path) -> None:
@@ -21,8 +21,19 @@ def test_an_earlier_run_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "field").mkdir()
     (tmp_path / "field" / "weights").write_text("old")
     prepare(tmp_path, {"run": 2}).close()
+    forget_earlier(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [MARKER]
     assert json.loads((tmp_path / MARKER).read_text()) == {"run": 2}
+
+
+def test_an_earlier_run_outlives_starts_that_fail(tmp_path: Path) -> None:
+    prepare(tmp_path, {"run": 1}).close()
+    (tmp_path / "report.json").write_text("good")
+    for failed in (2, 3):
+        prepare(tmp_path, {"run": failed}).close()
+        (tmp_path / "log-edge.txt").write_text(f"start {failed} failed")
+    assert [p.name for p in (tmp_path / EARLIER).iterdir()] == ["report.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-edge.txt"}
 
 
 def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) -> None:
@@ -33,7 +44,8 @@ def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) ->
     prepare(out, {}).close()
     (out / "link").symlink_to(precious)
     prepare(out, {}).close()
-    assert not (out / "link").exists() and (precious / "photo").read_text() == "keep"
+    forget_earlier(out)
+    assert list(out.iterdir()) == [out / MARKER] and (precious / "photo").read_text() == "keep"
 
 
 def test_anything_else_is_refused_and_left_alone(tmp_path: Path) -> None:

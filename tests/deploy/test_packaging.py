@@ -78,7 +78,7 @@ def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() ->
     (torch,) = re.finditer(r"install .*--no-deps +(torch==\S+)", plan)
     rest = plan.index("-e '.[edge,embed,up]'")
     assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
-    assert "deploy/up.py deploy/scenarios/card.yaml --for 60s" in plan
+    assert "deploy/up.py deploy/scenarios/card.yaml --for=60s" in plan
     assert requirement("torch").specifier.contains(LOCKS["torch-cuda"]["torch"])
     assert torch[1] == f"torch=={LOCKS['torch-cuda']['torch']}"
     for early in re.findall(r"install .*'(numba\S+)' '(opencv\S+)'", plan)[0]:
@@ -94,7 +94,7 @@ def test_the_index_variable_reaches_torch_alone() -> None:
 
 def test_the_options_of_the_demo_reach_the_launcher() -> None:
     plan = dry_run("demo", SCENARIO="s.yaml", FOR="5s", OUT="o", PORT="8181", DATA="d")
-    assert "deploy/up.py s.yaml --for 5s --out o --port 8181 --data d" in plan
+    assert "deploy/up.py s.yaml --for=5s --out o --port 8181 --data d" in plan
 
 
 def in_the_environment_of_an_image(texts: list[str]) -> list[Requirement]:

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.status import read_json
 from tests.conftest import ROOT
 from tests.ports import free_port
@@ -167,6 +168,16 @@ def test_ctrl_c_before_the_first_update_makes_no_mesh_and_is_no_failure(tmp_path
     finally:
         run.process.kill()
     assert "no mesh: nothing to export yet" in run.output and "making the mesh" not in run.output
+
+
+def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) -> None:
+    prepare(tmp_path / "run", {}).close()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    run = Up(tmp_path, "--policy", "foo")
+    assert run.end() == 1
+    assert "'foo' is not known" in run.output and "PSNR" not in run.output
+    assert run.output.endswith(f"the run did not start; the earlier run's files are in {run.out / EARLIER}\n")
+    assert (run.out / EARLIER / "report.json").exists()
 
 
 @pytest.mark.slow

@@ -334,6 +334,15 @@ def test_options_become_a_transport(tmp_path):
         parsed("--tls-cert", str(token))
 
 
+@pytest.mark.parametrize("text", ["", "no certificate", "-----BEGIN CERTIFICATE-----\nMIIB\n"])
+def test_files_that_hold_no_certificate_are_refused_by_name(pem, tmp_path, text):
+    (damaged := tmp_path / "damaged.pem").write_text(text)
+    with pytest.raises(TransportError, match=r"--tls-ca .*damaged\.pem holds no certificate"):
+        parsed("--tls-ca", str(damaged))
+    with pytest.raises(TransportError, match=r"cannot use --tls-cert .*damaged\.pem"):
+        parsed("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key"))
+
+
 def test_a_slow_reader_is_felt_at_once():
     """bdp_probe=0: a client cannot bury a stalled reader under megabytes of frames, which are age."""
 

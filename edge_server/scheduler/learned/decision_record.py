@@ -109,20 +109,20 @@ class RecordedDecision:
 
 
 def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
-    """Read decision ``number`` of the run in folder ``run``; None: the newest. ValueError: there is no such
-    decision, or its file is damaged."""
+    """Read the decision of the run in folder ``run`` that update ``number`` was made by, the last one until
+    then; None: the newest. ValueError: it is not kept, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(
             f"{run}: no decisions are recorded: edge-server run, and simulate with --out, keep those of a "
             "learned policy (bandit:FILE)"
         )
-    path = known[-1] if number is None else run / FOLDER / f"{number:06d}.npz"
-    if path not in known:
+    until = [path for path in known if number is None or int(path.stem) <= number]
+    if not until:
         raise ValueError(
-            f"{run}: decision {number} is not recorded; from {int(known[0].stem)} to {int(known[-1].stem)} "
-            "there are some: every update has one, the newest are kept"
+            f"{run}: the decision of update {number} is not kept; the oldest kept is {int(known[0].stem)}"
         )
+    path = until[-1]
     arrays, about = checkpoint.load(path, kind=_KIND, most_bytes=stored_bytes(path))
     try:
         actor = Actor.load(path.with_name(Path(about["policy"]).name))

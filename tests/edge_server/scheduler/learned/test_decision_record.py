@@ -98,8 +98,15 @@ def test_what_is_not_there_is_said(tmp_path):
     with pytest.raises(ValueError, match=r"no decisions are recorded: .*simulate .*bandit:FILE"):
         read_decision(tmp_path)
     DecisionWriter(tmp_path).write(a_decision(5))
-    with pytest.raises(ValueError, match="decision 4 is not recorded; from 5 to 5"):
+    with pytest.raises(ValueError, match="decision of update 4 is not kept; the oldest kept is 5"):
         read_decision(tmp_path, 4)
+
+
+def test_a_decision_that_is_held_is_that_of_later_updates_too(tmp_path):
+    record = DecisionWriter(tmp_path)
+    for number in (5, 9):
+        record.write(a_decision(number))
+    assert [read_decision(tmp_path, n).decision.number for n in (5, 8, 9, 40)] == [5, 5, 9, 9]
 
 
 def test_damage_is_named(tmp_path):
