@@ -28,6 +28,7 @@ from channel_emu.model.nanoseconds import NEVER_NS
 # Longer than any stream lives; a frame with a longer delay counts as not delivered.
 MAX_DELAY_MS = 1e9
 _MAX_ROWS_MS = 1e12
+_MOST_OVERLAPPING = 0.02  # share of the frames of a drop-new link that may seem to have been sent together
 
 
 class RecordingError(ValueError):
@@ -85,7 +86,10 @@ def read_recording(path: Path, discipline: str | None = None) -> Recording:
         raise RecordingError(f"{path}: cannot be read: {error}") from None
     if begin == "{":
         return from_trace(path, trace.read(path))
-    return _from_rows(path, discipline or "drop-new")
+    found = _from_rows(path, discipline or "drop-new")
+    if discipline is None:
+        _check_drop_new(found)
+    return found
 
 
 def from_trace(path: Path, found: trace.Trace) -> Recording:
@@ -147,6 +151,20 @@ def _from_rows(path: Path, discipline: str) -> Recording:
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
     cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
     return Recording(path, cameras, discipline, False, too_long)
+
+
+def _check_drop_new(recording: Recording) -> None:
+    """Refuse rows of another kind of link: their waits would be counted as delays. A few frames may be out of
+    order where clocks are coarse."""
+    came = [c.offered_ms[went] for c in recording.cameras if (went := ~np.isnan(c.delay_ms)).any()]
+    ends = [offered + c.delay_ms[~np.isnan(c.delay_ms)] for offered, c in zip(came, recording.cameras)]
+    meanwhile = sum(int((o[1:] < np.maximum.accumulate(e)[:-1]).sum()) for o, e in zip(came, ends))
+    share = meanwhile / max(sum(map(len, came)), 1)
+    if share > _MOST_OVERLAPPING:
+        raise RecordingError(
+            f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was on "
+            "its way, and a drop-new link drops those: say what the link does with --discipline"
+        )
 
 
 def _camera_of_rows(
