@@ -162,8 +162,8 @@ def _check_drop_new(recording: Recording) -> None:
     share = meanwhile / max(sum(map(len, came)), 1)
     if share > _MOST_OVERLAPPING:
         raise RecordingError(
-            f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was on "
-            "its way, and a drop-new link drops those: say what the link does with --discipline"
+            f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was "
+            "on its way, and a drop-new link drops those: say what the link does with --discipline"
         )
 
 
