@@ -47,6 +47,8 @@ def run(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C or the last round. Raises ScenarioError and ArmError before the arm moves."""
     if args.joints is not None and not args.show:
         raise ScenarioError("--joints: goes with --show: a drive begins where the arm stands")
+    if args.rounds < 0:
+        raise ScenarioError(f"--rounds: expected 0 (without end) or more, got {args.rounds}")
     scenario = load(args.scenario)
     config = require_arm(scenario)
     if config.path is None:

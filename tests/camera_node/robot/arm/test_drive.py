@@ -192,6 +192,8 @@ def test_the_tour_is_shown_without_an_arm(cell, capsys):
     np.testing.assert_allclose(shown(capsys.readouterr().out), np.rad2deg(stops_of(file)), atol=0.006)
     assert main(["drive-arm", str(file), f"--joints={home}"]) == 2
     assert "--joints: goes with --show" in capsys.readouterr().err
+    assert main(["drive-arm", str(file), "--rounds", "-1"]) == 2
+    assert "--rounds: expected 0" in capsys.readouterr().err
 
 
 def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):
