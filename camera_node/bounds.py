@@ -32,8 +32,8 @@ class Bounded:
             lowest, highest = each.metadata["range"]
             for number in value if isinstance(value, tuple) else (value,):
                 if not lowest <= number <= highest:  # refuses NaN, too
-                    raise ValueError(
-                        f"{each.name} is {number:.10g}, expected {lowest:.10g} to {highest:.10g}"
-                    )
+                    # An integer of hundreds of digits fits no float.
+                    shown = f"{number:.10g}" if isinstance(number, float) else f"{number!s:.60}"
+                    raise ValueError(f"{each.name} is {shown}, expected {lowest:.10g} to {highest:.10g}")
             if value == ():
                 raise ValueError(f"{each.name} is empty, expected one value or more")

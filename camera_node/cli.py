@@ -36,7 +36,7 @@ exit codes: 0 stopped as asked, 1 failed while running, 2 wrong scenario, option
 """
 
 
-DEFAULT_CACHE_MB = 64.0
+DEFAULT_CACHE_MB, MAX_CACHE_MB = 64.0, 1e6
 
 
 class UsageError(Exception):
@@ -158,10 +158,13 @@ def _prepare(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from camera_node.node import Node, NodeOptions
 
-    if args.seconds is not None and args.seconds <= 0:
+    # Written so that they refuse NaN, too.
+    if args.seconds is not None and not args.seconds > 0:
         raise UsageError("--seconds: expected a positive number")
-    if args.cache_mb < 0 or args.response_timeout <= 0:
-        raise UsageError("--cache-mb cannot be negative, --response-timeout must be positive")
+    if not 0 <= args.cache_mb <= MAX_CACHE_MB:
+        raise UsageError(f"--cache-mb: expected 0 to {MAX_CACHE_MB:.0f}")
+    if not args.response_timeout > 0:
+        raise UsageError("--response-timeout: expected a positive number")
     options = NodeOptions(
         to=transport.peer("--to", args.to),
         transport=transport.from_arguments(args),

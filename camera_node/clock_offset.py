@@ -18,6 +18,8 @@ PERIOD_S = 1.0
 # The first exchanges follow one another closely, so that early frames get a good estimate too.
 _FIRST = 4
 _FIRST_PERIOD_S = 0.05
+# 146 years: clocks differ by what has passed since 1970 at most, and a frame's header has room for this.
+_MAX_OFFSET_NS = 2**62
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class OffsetEstimator:
         if round_trip < 0 or replied_ns < received_ns:
             return
         offset = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
+        if abs(offset) > _MAX_OFFSET_NS:
+            return
         with self._lock:
             self._samples.append((returned_ns, offset, round_trip // 2))
 

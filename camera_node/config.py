@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.bounds import Bounded, bounded, one_of
-from freshfield.limits import MAX_IMAGE_SIDE_PX
+from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
 from freshfield.payload import CODECS
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
@@ -24,6 +24,12 @@ REPLAYS = ("once", "restart")
 PAIRINGS = ("nearest", "interpolated")
 BACKGROUNDS = ("white", "black", "keep")
 ROBOTS = ("ur3e",)
+FPS_RANGE = (0.01, 1000.0)
+"""Of captures, and of frames of a recording, a second."""
+MAX_GAP_MS = 3.6e6
+"""Between a frame and the pose it is paired with: poses an hour away are another recording's."""
+MAX_LATENCY_MS = 6e4
+"""Of a camera: one that shows what was a minute ago is not live."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class SourceConfig(Bounded):
     """
 
     kind: str
-    fps: float | None = bounded(None, 0.01, 1000)
+    fps: float | None = bounded(None, *FPS_RANGE)
     codec: str = one_of("jpeg", CODECS)
     quality: int = bounded(92, 1, 100)
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
@@ -86,7 +92,7 @@ class ArmConfig(Bounded):
     base_yaw_deg: float = 0.0
     frequency_hz: float = bounded(125.0, 10, 500)
     pairing: str = one_of("interpolated", PAIRINGS)
-    max_gap_ms: float = bounded(20.0, 0, math.inf)
+    max_gap_ms: float = bounded(20.0, 0, MAX_GAP_MS)
     path: PathConfig | None = None
     simulated: bool = False
     teleop: dict[str, Any] | None = None  # read by the command alone: a node that streams needs none of it
@@ -136,8 +142,8 @@ class TrajectoryConfig(Bounded):
 
     files: dict[str, str]
     pairing: str = one_of("interpolated", PAIRINGS)
-    max_gap_ms: float = bounded(50.0, 0, math.inf)
-    start_s: float = 0.0
+    max_gap_ms: float = bounded(50.0, 0, MAX_GAP_MS)
+    start_s: float = bounded(0.0, -MAX_STAMP_S, MAX_STAMP_S)
     hand_eye: str = ""
 
 
@@ -201,7 +207,7 @@ class CameraConfig(LiveConfig):
     camera by address (rtsp://...). It knows no intrinsics: ``calibration`` gives them. latency_ms: from
     exposure to the host, for drivers that stamp nothing themselves; subtracted from the time of arrival."""
 
-    latency_ms: float = 0.0
+    latency_ms: float = bounded(0.0, 0, MAX_LATENCY_MS)
 
 
 @dataclass(frozen=True)
@@ -231,7 +237,7 @@ class ZjuConfig(RecordedConfig):
     the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
     background: what goes behind the person."""
 
-    recorded_fps: float = bounded(50.0, 0.01, 1000)
+    recorded_fps: float = bounded(50.0, *FPS_RANGE)
     masks: str | None = None
     background: str = one_of("black", BACKGROUNDS)
 

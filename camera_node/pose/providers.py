@@ -16,6 +16,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
+from freshfield.limits import MAX_STAMP_S
 
 T = TypeVar("T")
 
@@ -143,6 +144,10 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
             raise TrajectoryError(f"{path}:{number}: {error}") from None
         except ValueError:
             raise TrajectoryError(f"{path}:{number}: expected t tx ty tz qx qy qz qw") from None
+        if abs(t) > MAX_STAMP_S:
+            raise TrajectoryError(
+                f"{path}:{number}: the time {t:g} is none in seconds: are these milliseconds or nanoseconds?"
+            )
         times.append(_nanoseconds(fields[0]))
         poses.append(Pose(tuple(map(float, q)), (x, y, z)))  # type: ignore[arg-type]
     return times, poses

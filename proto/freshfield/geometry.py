@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 # Right-multiplying a camera-to-world matrix with this turns OpenGL axes (x right, y up, z backward)
 # into OpenCV axes and back: it is its own inverse.
 OPENGL_TO_OPENCV: Array = np.diag([1.0, -1.0, -1.0, 1.0])
+_LAST_ROW: Array = np.array([0.0, 0.0, 0.0, 1.0])
 
 # Below this angle the closed forms divide by nearly nothing; their Taylor series is exact to fp64.
 _SMALL_ANGLE = 1e-4
@@ -156,11 +157,13 @@ class Pose:
 
     @staticmethod
     def from_matrix(camera_to_world: ArrayLike) -> Pose:
-        """Pose of a rigid (4, 4) or (3, 4) matrix. Raises GeometryError unless it is finite and
-        orthonormal to 1e-3 (real calibrations are; a sheared or mirrored matrix is a mistake)."""
+        """Pose of a rigid (4, 4) or (3, 4) matrix. Raises GeometryError unless it is finite, orthonormal to
+        1e-3 (real calibrations are; a sheared or mirrored matrix is a mistake), and its last row 0 0 0 1."""
         m = np.asarray(camera_to_world, dtype=np.float64)
         if m.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(m)):
             raise GeometryError("pose must be a finite 3 x 4 or 4 x 4 matrix")
+        if np.abs(m[3:] - _LAST_ROW).max(initial=0.0) > 1e-6:
+            raise GeometryError("the pose's last row is not 0 0 0 1: is it transposed?")
         r = m[:3, :3]
         if np.abs(r @ r.T - np.eye(3)).max() > MAX_QUATERNION_ERROR or np.linalg.det(r) < 0:
             raise GeometryError("the pose's rotation is not orthonormal and right-handed")

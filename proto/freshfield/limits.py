@@ -122,6 +122,10 @@ a word opens another one."""
 
 # --- time -------------------------------------------------------------------------------------
 
+MAX_STAMP_S = 4.6e9
+"""Of a stamp in a file, either way: the difference of two fits 64 bits in nanoseconds. Since 1970 it is the
+year 2115; larger ones are in another unit."""
+
 MAX_CAPTURE_AHEAD_NS = 250_000_000
 """How far a capture may lie ahead of the edge's clock, beyond the uncertainty of the node's offset."""
 

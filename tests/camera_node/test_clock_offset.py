@@ -41,4 +41,6 @@ def test_impossible_exchanges_are_ignored():
     estimator = OffsetEstimator()
     estimator.add(0, 0, 10, 5)  # the answer took longer to make than the whole exchange
     estimator.add(0, 10, 5, 20)  # answered before it was received
+    for absurd in (-(2**63), 2**63 - 1):  # no frame's header has room for the offset
+        estimator.add(10**18, absurd, absurd, 10**18 + 5)
     assert estimator.estimate(100) is None

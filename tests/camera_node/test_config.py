@@ -9,6 +9,8 @@ import pytest
 from camera_node.config import WorldConfig, find_data, source_config
 from freshfield.scenario import ScenarioError, load, parse
 
+VIDEO = {"kind": "video", "data": "x"}
+
 
 def config(**source):
     return source_config(parse({"cameras": {"count": 2}, "source": source}, Path("s.yaml")))
@@ -40,8 +42,12 @@ def test_what_is_given_reaches_the_scene():
         ({"kind": "transforms", "data": "x", "scale": 0.5}, "scale is 0.5"),
         ({"kind": "transforms", "data": "x", "background": "keep"}, "use png"),
         ({"kind": "transforms", "data": "x", "loop": "once"}, "loop is 'once'"),
-        ({"kind": "video", "data": "x", "trajectory": {"files": {}, "pairing": "best"}}, "pairing is 'best'"),
-        ({"kind": "video", "data": "x", "background": "white"}, "source.background: unknown key"),
+        ({**VIDEO, "trajectory": {"files": {}, "pairing": "best"}}, "pairing is 'best'"),
+        ({**VIDEO, "trajectory": {"files": {}, "max_gap_ms": 1e308}}, "trajectory: max_gap_ms is 1e"),
+        ({**VIDEO, "trajectory": {"files": {}, "start_s": 1e300}}, "trajectory: start_s is 1e"),
+        ({"kind": "camera", "latency_ms": 1e308}, "latency_ms is 1e"),
+        ({"kind": "world", "quality": 10**400}, "quality is 10{59}, expected 1 to 100"),
+        ({**VIDEO, "background": "white"}, "source.background: unknown key"),
     ],
 )
 def test_errors_name_file_and_key(source, message):

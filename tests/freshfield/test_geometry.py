@@ -114,6 +114,8 @@ def test_poses_survive_the_way_through_a_matrix(q, t):
         lambda m: m + np.triu(np.full((4, 4), 0.01)),  # sheared
         lambda m: np.where(np.eye(4) > 0, np.nan, m),
         lambda m: m[:2],
+        lambda m: m.T,
+        lambda m: m * [[1], [1], [1], [2]],
     ],
 )
 def test_matrices_that_are_no_pose_are_refused(spoil):

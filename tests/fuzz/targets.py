@@ -149,7 +149,8 @@ def _images(dataset: Dataset) -> str:
 
 def models(folder: Path) -> Target:
     """A COLMAP model: first byte even for binary, then cameras and images with ``SPLIT`` between them."""
-    (folder / "a.png").write_bytes(PNG)
+    for name in ("a.png", "b.png"):
+        (folder / name).write_bytes(PNG)
 
     def take(data: bytes) -> str:
         ending = ".bin" if data[:1] < b"\x80" else ".txt"
@@ -220,7 +221,7 @@ def _sessions() -> Iterable[bytes]:
 def _models() -> Iterable[bytes]:
     yield (
         b"\xff1 OPENCV 2 2 2.0 2.0 1.0 1.0 0.1 0 0 0\n2 SIMPLE_RADIAL 2 2 2 1 1 0" + SPLIT
-        + b"# IMAGE\n1 1 0 0 0 0 0 1 1 a.png\n0 0 -1\n2 .7 .7 0 0 1 2 3 2 a.png\n\n"
+        + b"# IMAGE\n1 1 0 0 0 0 0 1 1 a.png\n0 0 -1\n2 .7 .7 0 0 1 2 3 2 b.png\n\n"
     )  # fmt: skip
     numbers = np.array([2.0, 2.0, 1.0, 1.0], "<f8").tobytes()
     camera = np.array([1, 1], "<i4").tobytes() + np.array([2, 2], "<u8").tobytes() + numbers

@@ -87,13 +87,13 @@ def read_hand_eye(path: Path) -> HandEye:
         raise HandEyeError(f"{path}: setup: expected {' or '.join(SETUPS)}, got {setup!r}")
     try:
         transform = rigid_transform(data.pop("transform"))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise HandEyeError(f"{path}: transform: {error}") from None
     try:
         offset_s = float(data.pop("time_offset_s", 0.0))
         if not abs(offset_s) < MAX_OFFSET_S:
             raise ValueError
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise HandEyeError(
             f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way"
         ) from None

@@ -198,6 +198,7 @@ def _hand_eye(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> Calibration:
+    from camera_node.config import MAX_GAP_MS
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
     from camera_node.robot.calibration import files
     from camera_node.robot.calibration.hand_eye import calibrate as hand_eye
@@ -206,8 +207,8 @@ def _calibrate(args: argparse.Namespace) -> Calibration:
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
         return hand_eye.calibrate(files.read_pairs(args.pairs, setup), args.method)
-    if not args.max_gap_ms > 0:
-        raise CalibrationError("--max-gap-ms: expected a positive number")
+    if not 0 < args.max_gap_ms <= MAX_GAP_MS:
+        raise CalibrationError(f"--max-gap-ms: expected a positive number up to {MAX_GAP_MS:.0f}")
     if args.live is None and args.hand is not None:
         hand, target = files.read_track(args.hand), files.read_track(args.target)
         for name, track in (("hand", hand), ("target", target)):
@@ -265,9 +266,10 @@ def _target(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration.targets import parse_target
 
     board = parse_target(args.board)
-    width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
-    if not 64 <= width <= 32_000:
-        raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
+    sides = [side_m / 0.0254 * args.dpi for side_m in board.size_m]
+    if not 64 <= sides[0] <= 32_000:
+        raise CalibrationError(f"--dpi: makes a picture {sides[0]:.0f} pixels wide, expected 64 to 32000")
+    width, height = map(round, sides)
     # Draw finer, with whole pixels per module, then scale. Otherwise the modules' rounding errors add up.
     fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
     picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)

@@ -18,6 +18,7 @@ from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose
+from camera_node.sources.datasets.imaging import decode_file
 from camera_node.sources.datasets.records import read_json
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
@@ -63,7 +64,7 @@ def read_pairs(file: Path, setup: str) -> Samples:
             hand, target = pair
             hands.append(rigid_transform(hand))
             targets.append(rigid_transform(target))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise CalibrationError(
                 f"{file}: pair {k + 1}: expected [hand in base, target in camera]: {error}"
             ) from None
@@ -90,7 +91,7 @@ def read_visp_pose(file: Path) -> Array:
         values = np.array(data["data"], dtype=np.float64).ravel()
         if values.shape != (6,) or not np.isfinite(values).all():
             raise ValueError(f"{values.size} numbers")
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = " ".join(str(error).split())
         raise CalibrationError(
             f"{file}: expected ViSP's YAML of a pose, data: tx ty tz and theta u: {why}"
@@ -131,9 +132,9 @@ def read_lens(file: Path) -> Pinhole:
 
 
 def _read_gray_image(file: Path) -> NDArray[np.uint8]:
-    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    picture = decode_file(file, cv2.IMREAD_GRAYSCALE)
     if picture is None:
-        raise CalibrationError(f"{file}: cannot be read as a picture")
+        raise CalibrationError(f"{file}: cannot be read as a picture, or is larger than OpenCV's limit")
     return np.asarray(picture, dtype=np.uint8)
 
 

@@ -84,7 +84,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
         found.append(posed_photo(photo, image.name, pose, where))
     if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
-    return Dataset(tuple(found), missing)
+    with errors_at(str(file.with_stem("images"))):
+        return Dataset(tuple(found), missing)
 
 
 def _images(given: Path, model: Path, images: str | None) -> Path:

@@ -59,6 +59,7 @@ def _rows(file: Path) -> np.ndarray:
         not isinstance(rows, np.ndarray)
         or rows.ndim != 2
         or rows.shape[1:] != (17,)
+        or not len(rows)
         or rows.dtype.kind not in "fiu"
     ):
         shape = getattr(rows, "shape", "several arrays")
@@ -77,7 +78,7 @@ def _camera(row: np.ndarray, video: Path, where: str) -> CalibratedCamera:
     clip = Clip(video)
     clip.close()
     x, y = clip.width / width, clip.height / height
-    if abs(x / y - 1.0) > _SAME_SHAPE:
+    if not abs(x / y - 1.0) <= _SAME_SHAPE:
         raise DatasetError(
             f"{where}: is of images of {width:g} x {height:g}, {video.name} has {clip.width} x {clip.height}"
         )

@@ -28,7 +28,7 @@ from camera_node.sources.datasets.records import (
     read_array,
     read_json,
 )
-from freshfield.geometry import se3_inverse
+from freshfield.geometry import Pose, se3_inverse
 
 FILES = ("cameras.json",)
 # Smallest first: more pixels than a field learns in a second are of no use.
@@ -67,7 +67,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {pictures}")
     held_out &= {image.name for image in found}
-    return Dataset(tuple(found), missing, held_out=held_out, per_camera=True)
+    with errors_at(str(file)):
+        return Dataset(tuple(found), missing, held_out=held_out, per_camera=True)
 
 
 def _images(folder: Path, images: str | None) -> Path:
@@ -108,7 +109,7 @@ def _entry(entry: dict[str, Any], where: str) -> tuple[str, Lens, np.ndarray]:
     try:
         d = [float(v) for v in entry.get("distortion", [])]
         width, height = int(entry["width"]), int(entry["height"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DatasetError(f"{where}: width, height or distortion is wrong: {error}") from None
     model = entry.get("distortionModel")
     if model == "RadialAndTangential" and len(d) in (0, 5):
@@ -121,6 +122,7 @@ def _entry(entry: dict[str, Any], where: str) -> tuple[str, Lens, np.ndarray]:
             "with 5 or Fisheye with 8"
         )
     with errors_at(where):
+        Pose.from_matrix(transform)  # refuses what is no rigid transform, which alone can be inverted so
         lens = Lens(
             width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,21 @@ from freshfield.geometry import Pinhole
 import cv2  # isort: skip
 
 
+def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
+    """The image as ``cv2.imread`` returns it; None for a file that it cannot read, and for one whose header
+    states more pixels than its limit, where ``cv2.imread`` raises."""
+    try:
+        return cv2.imread(str(path), flags)
+    except cv2.error:
+        return None
+
+
 def read_image(path: Path) -> Image:
     """RGB (H, W, 3) or straight-alpha RGBA (H, W, 4), uint8. Raises DatasetError.
 
     EXIF rotation is ignored: poses and intrinsics belong to the pixels as stored.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = decode_file(path, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise DatasetError(f"{path}: not an image that OpenCV can read, or larger than its limit")
     if image.dtype == np.uint16:

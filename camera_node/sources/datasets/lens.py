@@ -28,6 +28,8 @@ _WIDEST_RAD = math.radians(60.0)
 # Focal lengths tried, as multiples of the lens's own, narrowest view first.
 _ZOOMS = 4.0 * 0.98 ** np.arange(180)
 _BORDER = 65
+# Of the image that a lens is described for, of which smaller copies are read.
+_MAX_SIDE_PX = 10**6
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,10 @@ class Lens:
     fisheye: bool = False
 
     def __post_init__(self) -> None:
+        sides = (self.width, self.height)
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.radial, *self.tangential)
-        if not all(map(math.isfinite, numbers)) or min(self.width, self.height) < 1:
-            raise DatasetError("the camera's numbers are not finite, or it has no pixels")
+        if not all(map(math.isfinite, numbers)) or not 1 <= min(sides) <= max(sides) <= _MAX_SIDE_PX:
+            raise DatasetError("the camera's numbers are not finite, or it has no pixels or too many")
         if min(self.fx, self.fy) <= 0:
             raise DatasetError(f"the focal lengths are {self.fx:g}, {self.fy:g}: expected positive ones")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,12 @@ class Dataset:
     held_out: frozenset[str] = frozenset()
     per_camera: bool = False
 
+    def __post_init__(self) -> None:
+        """Raises DatasetError for two images of one name: whoever keeps images by name would lose one."""
+        for name, count in Counter(image.name for image in self.images).most_common(1):
+            if count > 1:
+                raise DatasetError(f"{count} of its entries are of the image {name}: keep one")
+
     def __len__(self) -> int:
         return len(self.images)
 
@@ -87,6 +94,7 @@ class Dataset:
 
 
 _LONGEST_NAME = 255  # bytes, of a file on every common file system
+_LONGEST_PATH = 1000  # a system takes 4096 bytes, of which the folder and other alphabets need some
 
 
 def path_within(name: str) -> Path:
@@ -95,7 +103,11 @@ def path_within(name: str) -> Path:
     path = Path(name)
     if not name or path.is_absolute() or ".." in path.parts:
         raise DatasetError(f"{name[:200]!r} does not lie within the folder of the data set")
-    if "\0" in name or any(len(part.encode("utf-8", "replace")) > _LONGEST_NAME for part in path.parts):
+    if (
+        "\0" in name
+        or len(name) > _LONGEST_PATH
+        or any(len(part.encode("utf-8", "replace")) > _LONGEST_NAME for part in path.parts)
+    ):
         raise DatasetError(f"{name[:200]!r} is not the name of a file")
     return path
 
@@ -132,7 +144,7 @@ def read_array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...], where
         value = np.array(entry[key], dtype=np.float64)
     except KeyError:
         raise DatasetError(f"{where}: {key} is missing") from None
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise DatasetError(f"{where}.{key}: expected numbers") from None
     if value.size != math.prod(shape) or not np.all(np.isfinite(value)):
         raise DatasetError(f"{where}.{key}: expected finite numbers of shape {shape}, got {value.shape}")

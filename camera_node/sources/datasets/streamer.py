@@ -13,7 +13,14 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
+from camera_node.config import (
+    FPS_RANGE,
+    RecordedConfig,
+    TrajectoryConfig,
+    VideoConfig,
+    errors_of,
+    find_data,
+)
 from camera_node.pose.providers import FixedPose, PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source, rate
@@ -66,7 +73,7 @@ def open_recorded(
     if found.moving or found.per_camera:
         names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: found.of(name) for camera, name in names.items()}
-        recorded = {camera: _recorded_fps(found, shown[camera]) for camera in cameras}
+        recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
     else:
         shares = split_photos(len(found), scenario.training, scenario.held_out)
         shown = {camera: tuple(found[i] for i in shares[camera]) for camera in cameras}
@@ -97,13 +104,24 @@ def _playback(config: RecordedConfig, count: int, recorded: Fraction) -> Playbac
     return Playback(count, fps, recorded, config.loop == "back-and-forth")
 
 
-def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage]) -> Fraction:
-    if dataset.fps:
-        return rate(dataset.fps)
+def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
+    if dataset.fps is not None:
+        return _recorded_rate(dataset.fps, path)
     times = [image.time_s for image in images if image.time_s is not None]
     if len(times) < 2 or times[-1] <= times[0]:
         return rate(PHOTO_FPS)
-    return rate((len(times) - 1) / (times[-1] - times[0]))
+    return _recorded_rate((len(times) - 1) / (times[-1] - times[0]), path)
+
+
+def _recorded_rate(fps: float, path: Path) -> Fraction:
+    """The rate that a recording states or its times show. Raises DatasetError for an impossible one."""
+    lowest, highest = FPS_RANGE
+    if not lowest <= fps <= highest:
+        raise DatasetError(
+            f"{path}: recorded {fps:g} frames a second, as its fps or times say: expected {lowest:g} to "
+            f"{highest:g}, with times in seconds"
+        )
+    return rate(fps)
 
 
 class ImageSource(Source):
@@ -186,7 +204,7 @@ def _video_sources(
     clips = {name: open_clip(rig, name) for name in rig.cameras}
     # All cameras turn round at the same frame, or they would drift apart at every turn.
     count = min(clip.count for clip in clips.values())
-    rates = {rate(clip.fps) for clip in clips.values()}
+    rates = {_recorded_rate(clip.fps, clip.path) for clip in clips.values()}
     for clip in clips.values():
         clip.close()
     if len(rates) != 1:

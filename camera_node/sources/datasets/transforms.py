@@ -9,6 +9,7 @@ recording by several cameras of something that moves.
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,8 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
         time_s = _number(frame, "time", where) if "time" in frame else None
         images.append(posed_photo(photo, frame["file_path"], _pose(frame, where), where, camera, time_s))
     fps = _number(data, "fps", str(file)) if "fps" in data else None
-    return Dataset(tuple(images), missing, fps)
+    with errors_at(str(file)):
+        return Dataset(tuple(images), missing, fps)
 
 
 def _find_image(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
@@ -96,7 +98,7 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
         return matrix @ OPENGL_TO_OPENCV
     except KeyError:
         raise DatasetError(f"{where}: 'transform_matrix' is missing") from None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise DatasetError(f"{where}: transform_matrix is no camera-to-world matrix: {error}") from None
 
 
@@ -127,11 +129,13 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
     k1, k2, p1, p2 = (_number(d, name, where) if name in d else 0.0 for name in ("k1", "k2", "p1", "p2"))
     cx = _number(d, "cx", where) if "cx" in d else width / 2.0
     cy = _number(d, "cy", where) if "cy" in d else height / 2.0
-    return Lens(width, height, fx, fy, cx, cy, (k1, k2), (p1, p2))
+    with errors_at(where):
+        return Lens(width, height, fx, fy, cx, cy, (k1, k2), (p1, p2))
 
 
 def _number(d: dict[str, Any], key: str, where: str) -> float:
     value = d[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DatasetError(f"{where}: {key} is {value!r}, expected a number")
+    # Compared, not converted: an integer of hundreds of digits fits no float.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
+        raise DatasetError(f"{where}: {key} is {value!r:.60}, expected a number")
     return float(value)

@@ -51,7 +51,7 @@ def load_dataset(
     try:
         cams, instants = annotations["cams"], [list(instant["ims"]) for instant in annotations["ims"]]
         numbers = {key: [np.asarray(v, dtype=np.float64) for v in cams[key]] for key in "KDRT"}
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise DatasetError(f"{file}: expected 'cams' with K, D, R, T and 'ims': {error!r} is wrong") from None
     count = len(numbers["K"])
     counts = {key: len(values) for key, values in numbers.items()} | {

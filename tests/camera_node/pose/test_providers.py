@@ -73,6 +73,8 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected"),
         ("0 0 0 0 0 0 0 0\n", ":1: quaternion"),
         ("0 nan 0 0 0 0 0 1\n", ":1: expected"),
+        ("1732600000000 0 0 0 0 0 0 1\n", ":1: the time 1.7.* milliseconds or nanoseconds"),
+        ("0 0 0 0 0 0 0 1\n-1e300 0 0 0 0 0 0 1\n", ":2: the time -1e"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "must increase"),
     ],
 )

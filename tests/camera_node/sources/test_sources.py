@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from camera_node.capture import build_cameras, prepare
 from camera_node.config import source_config
+from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene
 from freshfield import payload
@@ -48,6 +50,19 @@ def test_a_recording_is_assigned_by_name(tmp_path):
     np.testing.assert_array_equal(rgb(source.read(1)), picture(13)[..., ::-1])
     other = opened(photo_scenario(data, 3, assignment={"cam00": "cam02", "cam02": "cam00"}), ["cam00"])
     np.testing.assert_array_equal(rgb(other["cam00"].read(1)), picture(13)[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    ("fps", "time_unit_s"), [(-1, 1.0), (0, 1.0), (1e-300, 1.0), (1e9, 1.0), (None, 1e308), (None, 1e-320)]
+)
+def test_an_impossible_rate_of_a_recording_is_named(fps, time_unit_s, tmp_path):
+    data = write_photos(tmp_path, 3, cameras=2, **({} if fps is None else {"fps": fps}))
+    written = json.loads(data.read_text())
+    for frame in written["frames"]:
+        frame["time"] *= time_unit_s
+    data.write_text(json.dumps(written))
+    with pytest.raises(DatasetError, match=r"transforms\.json: recorded .* expected 0\.01 to 1000"):
+        opened(photo_scenario(data, 2))
 
 
 def test_wrong_assignments_are_named(tmp_path):

@@ -55,7 +55,9 @@ def test_a_camera_that_stands_does_not_follow_the_hand(tmp_path):
         ({"transform": np.diag([1.0, 1, -1, 1]).tolist()}, "transform: the pose's rotation"),
         ({"transform": "none"}, "transform"),
         ({"time_offset_s": float("nan")}, "time_offset_s"),
+        ({"transform": [[10**400] * 4] * 4}, "transform: .* too large"),
         ({"time_offset_s": "soon"}, "time_offset_s"),
+        ({"time_offset_s": 10**400}, "time_offset_s"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(tmp_path, change, message):

@@ -18,6 +18,7 @@ from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.targets import parse_target
 from tests.camera_node.robot.calibration.pictures import noisy_samples, write_poses
+from tests.camera_node.sources.datasets.photos import BOMB
 from tests.conftest import data_dir
 
 X = simulated.CAMERA_IN_HAND
@@ -145,6 +146,11 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
     assert "has 0 camera XML files" in fails(tmp_path, "--board", "qr:60mm")
     live = "--live", "room", "--camera", "cam00", "--board", "qr:60mm"
     assert "expected positive" in fails(*live, "--want-mm", "-1")
+    target = "--hand", pairs, "--target", pairs
+    for wrong in ("nan", "inf", "-1"):
+        assert "--max-gap-ms: expected a positive number" in fails(*target, "--max-gap-ms", wrong)
+    pairs.write_text(json.dumps([[[[10**400] * 4] * 4] * 2]))
+    assert "pair 1: expected [hand in base, target in camera]: " in fails("--pairs", pairs)
     file = tmp_path / "x.csv"
     file.write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,2,3\n")
     assert "x.csv:3: expected t tx ty tz" in fails("--hand", file, "--target", file)
@@ -157,6 +163,21 @@ def test_an_answer_is_not_lost_with_its_file(option, tmp_path, capsys, pairs):
     said = capsys.readouterr()
     assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 1.5
     assert said.err.startswith(f"camera-node: {option}: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("target qr:60mm --out board.png --dpi nan", "--dpi: makes a picture nan pixels wide"),
+        ("target qr:60mm --out board.png --dpi inf", "--dpi: makes a picture inf pixels wide"),
+        ("intrinsics {} --board chessboard:9x6:10mm", "bomb.png: cannot be read as a picture, or is larger"),
+    ],
+)
+def test_numbers_and_pictures_beyond_bounds_are_one_line(arguments, message, tmp_path, capsys):
+    (tmp_path / "bomb.png").write_bytes(BOMB)
+    assert main(["calibrate", *arguments.format(tmp_path).split()]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("spelling", ["charuco:7x5:30mm:22mm", "apriltag:36h11:0:80mm", "qr:60mm:hello"])

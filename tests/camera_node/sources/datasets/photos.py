@@ -12,6 +12,9 @@ import numpy as np
 from freshfield.geometry import OPENGL_TO_OPENCV, look_at
 from freshfield.scenario import Scenario, parse
 
+BOMB = b"P6\n60000 60000\n255\n"
+"""A picture file that states 10 GB of pixels."""
+
 
 def picture(seed: int, width: int = 32, height: int = 24, channels: int = 3) -> np.ndarray:
     """A smooth random image, uint8 (height, width, channels)."""

@@ -92,6 +92,8 @@ def test_dynerf_damage_is_named(tmp_path):
     np.save(file, np.zeros((3, 15)))
     fails(r"expected numbers of shape \(cameras, 17\), got \(3, 15\)", dynerf.load_dataset, folder)
     rows = np.load(io.BytesIO(whole))
+    np.save(file, rows[:0])
+    fails(r"expected numbers of shape \(cameras, 17\), got \(0, 17\)", dynerf.load_dataset, folder)
     np.save(file, rows[:2])
     fails("poses of 2 cameras, its folder 3 videos", dynerf.load_dataset, folder)
     np.save(file, np.where(np.arange(3)[:, None] == 1, np.nan, rows))
@@ -155,6 +157,9 @@ def test_zju_damage_is_named(tmp_path):
     found["ims"][1]["ims"].pop()
     np.save(file, found, allow_pickle=True)
     fails(r"numbers of cameras differ: K 3, .*ims\[1\] 2", zju.load_dataset, folder)
+    found["cams"]["K"] = [[[10**400] * 3] * 3] * 3
+    np.save(file, found, allow_pickle=True)
+    fails("expected 'cams' with K, D, R, T .* too large", zju.load_dataset, folder)
     del found["cams"]["D"]
     np.save(file, found, allow_pickle=True)
     fails("expected 'cams' with K, D, R, T", zju.load_dataset, folder)
@@ -287,6 +292,15 @@ def test_eyeful_damage_is_named(tmp_path):
     for change, message in (
         (lambda e: e.pop("T"), r"KRT\[1\] \(10/10_DSC0001\): T is missing"),
         (lambda e: e.update(K=[1, 2]), r"K: expected finite numbers of shape \(3, 3\)"),
+        (lambda e: e.update(K=[[10**400] * 3] * 3), "K: expected numbers"),
+        (lambda e: e.update(T=[*zip(*e["T"])]), "last row is not 0 0 0 1: is it transposed"),
+        (lambda e: e.update(width=float("inf")), "width, height or distortion is wrong"),
+        (lambda e: e.update(height=10**400), "too many"),
+        (lambda e: e.update(distortion=[10**400] * 5), "width, height or distortion is wrong"),
+        (
+            lambda e: e.update(cameraId="10/10_DSC0000"),
+            "json: 2 of its entries are of the image 10/10",
+        ),
         (lambda e: e.update(distortion=[0.1]), "RadialAndTangential' with 1 coefficients"),
         (lambda e: e.update(cameraId="/x"), "does not lie within the folder"),
         (lambda e: e.update(cameraId="x"), "cameraId is 'x'"),
@@ -382,6 +396,8 @@ def test_colmap_damage_is_named(tmp_path, binary):
         images.write_text("\n".join([*lines[:3], "2 0.1 0.2"]))
         fails(r"images\.txt:4: expected IMAGE_ID QW", colmap.load_dataset, folder)
     cameras.write_bytes(whole[cameras])
+    images.write_bytes(whole[images].replace(b"cam02", b"cam00"))
+    fails(rf"{images.name}: 2 of its entries are of the image cam00 x\.jpg", colmap.load_dataset, folder)
     images.write_bytes(whole[images])
     for file in (folder / "images").iterdir():
         file.unlink()

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.sources.datasets.photo import ImageOptions
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import ImageOptions, Photo
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.transforms import load_dataset
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
-from tests.camera_node.sources.datasets.photos import opencv_pose, picture, write_photos
+from tests.camera_node.sources.datasets.photos import BOMB, opencv_pose, picture, write_photos
 from tests.conftest import data_dir
 
 
@@ -103,7 +104,19 @@ def test_alpha_is_kept_laid_on_a_color_and_weighted_when_shrinking(tmp_path):
         ),
         (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(0, 7.0), "orthonormal"),
         (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, float("nan")), "finite"),
+        (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, 10**400), "transform_matrix"),
+        (
+            lambda d: d["frames"][0]["transform_matrix"].__setitem__(3, [0, 0, 0, 2]),
+            "last row is not 0 0 0 1",
+        ),
+        (
+            lambda d: d["frames"][0].update(transform_matrix=[*zip(*d["frames"][0]["transform_matrix"])]),
+            r"frames\[0\].*last row is not 0 0 0 1: is it transposed",
+        ),
+        (lambda d: d["frames"].append(d["frames"][1]), "2 of its entries are of the image images/001.png"),
         (lambda d: d.update(fl_x="long"), "fl_x"),
+        (lambda d: d.update(fl_x=10**400), "fl_x is 10{59}, expected"),
+        (lambda d: d.update(h=1e300), "too many"),
         (lambda d: d.update(fl_x=-1.0), "impossible"),
         (lambda d: d.pop("fl_x"), "camera_angle_x"),
         (lambda d: d.update(k3=0.5), "k3"),
@@ -120,6 +133,10 @@ def test_what_is_wrong_is_named(tmp_path, change, message):
 
 def test_an_image_of_another_size_or_damaged_is_refused_when_read(tmp_path):
     dataset = load_dataset(write_photos(tmp_path, 2))
+    bomb = Photo(tmp_path / "bomb.png", Lens(60000, 60000, 1.0, 1.0, 1.0, 1.0), ImageOptions())
+    bomb.path.write_bytes(BOMB)
+    with pytest.raises(DatasetError, match=r"bomb\.png: .* larger than its limit"):
+        bomb.read()
     cv2.imwrite(str(tmp_path / "images/000.png"), np.zeros((24, 30, 3), np.uint8))
     (tmp_path / "images/001.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
     with pytest.raises(DatasetError, match="30 x 24"):
@@ -203,14 +220,16 @@ def test_the_pose_flip_is_its_own_inverse(tmp_path):
     np.testing.assert_allclose(record.camera_to_world @ OPENGL_TO_OPENCV, stored, atol=1e-12)
 
 
-@pytest.mark.parametrize("leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", ""])
+@pytest.mark.parametrize(
+    "leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", "", "a/" * 5000]
+)
 def test_images_outside_the_data_set_are_not_read(tmp_path, leads):
     inside, outside = tmp_path / "set", tmp_path / "outside.png"
     inside.mkdir()
     cv2.imwrite(str(outside), picture(0))
     path = leads.format(outside=outside.with_suffix(""))
     file = edit(write_photos(inside, 2), lambda d: d["frames"][0].update(file_path=path))
-    with pytest.raises(DatasetError, match=r"frames\[0\].*(does not lie within the folder|is missing)"):
+    with pytest.raises(DatasetError, match=r"frames\[0\].*(does not lie within|is missing|is not the name)"):
         load_dataset(file)
 
 
