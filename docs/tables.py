@@ -111,6 +111,10 @@ VERDICTS = (
     ("ppo-select", FROM_NOTHING, "better than random"),
     ("ppo-select", FROM_NOTHING, "fixed threshold"),
     ("ppo-select", FROM_NOTHING, "better than all"),
+    ("ppo-wait", "room, ch6, age -0.015/ms, wait", "best fixed"),
+    ("ppo-wait", "room, ch6, age -0.015/ms, threshold", "best fixed"),
+    ("ppo-wait", "room, ch6, age -0.015/ms", ""),
+    ("ppo-wait", "room, ch6, age -0.015/ms, threshold", "the ages tell"),
     ("metrics", "LPIPS", ""),
     ("metrics", "SSIM", "lowest"),
 )
