@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import msgspec
 
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.scenario import Scenario, ScenarioError, read_section
+from freshfield.untrusted import read_json
 
 if TYPE_CHECKING:
     from edge_server.embed import EmbeddingConfig
@@ -242,7 +242,7 @@ def _read_json(scenario: Scenario, key: str, name: str, model: type | None = Non
         raise ScenarioError(f"{scenario.path}: edge.{key}: expected the name of a file, got {name!r}")
     path = scenario.path.parent / name
     try:
-        found = json.loads(path.read_text())
+        found = read_json(path.read_text())
         if not isinstance(found, dict):
             raise ValueError("expected a JSON object")
         if model is not None:

@@ -7,7 +7,8 @@ other link, one frame a line::
     0.0, 41.5, cam00
     33.3, , cam00
 
-separated by commas, semicolons or tabs. Lines that start with # and a first line of names are skipped.
+separated by commas, semicolons or tabs, the same in all lines. Lines that start with # and a first line of
+names are skipped.
 """
 
 from __future__ import annotations
@@ -118,10 +119,17 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 def _from_rows(path: Path, discipline: str) -> Recording:
     rows: dict[str, list[tuple[float, float]]] = {}
+    separators: set[str] = set()
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        words = [w.strip() for w in line.replace(";", ",").replace("\t", ",").split(",")]
+        separators |= {mark for mark in ",;\t" if mark in line}
+        if len(separators) > 1:
+            raise RecordingError(
+                f"{path}: line {number}: expected the same separator throughout (comma, semicolon or tab) "
+                f"and a point in numbers, got {line.strip()!r}"
+            )
+        words = [w.strip() for w in line.split(next(iter(separators), ","))]
         try:
             offered = float(words[0])
             delivered = float(words[1]) if len(words) > 1 and words[1] else math.nan

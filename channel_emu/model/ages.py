@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from channel_emu.model.chain import Chain, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import to_ns
 from channel_emu.model.spelling import SpellingError, rate_per_ms, span_ms
 
 Instants = NDArray[np.int64]
@@ -65,10 +66,10 @@ def query_age_ms(saw: Sawtooth, every_ms: float) -> float | None:
     """Mean of the age at multiples of ``every_ms``, just after deliveries, from the first delivery to the
     end: the age that queries meet, or at slot boundaries (5.2). Deliveries that fall on them lower it by half
     of ``every_ms``."""
-    every_ns = round(every_ms * 1e6)
+    every_ns = to_ns(every_ms)
     if every_ns < 1:
         raise ValueError(f"queries: expected at least a nanosecond apart, got {every_ms:g} ms")
-    edges = np.append(saw.delivered_ns, saw.end_ns)
+    edges = np.append(np.minimum(saw.delivered_ns, saw.end_ns), saw.end_ns)
     first = -(-edges // every_ns)  # the first instant at or after each delivery
     count = np.diff(first).astype(float)
     if not len(count) or count.sum() == 0:
@@ -80,7 +81,7 @@ def query_age_ms(saw: Sawtooth, every_ms: float) -> float | None:
 def shown_age_ms(saw: Sawtooth, computing_ms: float, refresh_ms: float) -> float | None:
     """Age of what is shown: each frame is computed on for ``computing_ms`` after its delivery, and a screen
     shows the newest one that is ready at each multiple of ``refresh_ms``, until the next."""
-    ready = Sawtooth(saw.delivered_ns + round(computing_ms * 1e6), saw.generated_ns, saw.end_ns)
+    ready = Sawtooth(saw.delivered_ns + to_ns(computing_ms), saw.generated_ns, saw.end_ns)
     at_refresh = query_age_ms(ready, refresh_ms)
     return None if at_refresh is None else at_refresh + refresh_ms / 2
 

@@ -23,6 +23,9 @@ DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
 FITTED_DISCIPLINES = tuple(d for d in DISCIPLINES if d != "lcfs-preempt")
 """Those that a recording can be fitted with: lcfs-preempt delivers only fast frames, which biases delays."""
 
+MAX_SIZE_BYTES = 2**32 - 1
+"""Of a message: gRPC writes its length in 32 bits."""
+
 
 class EventKind(StrEnum):
     """What can happen to a frame. All but STARTED and DUPLICATED end its transit."""

@@ -105,7 +105,7 @@ def _errant(path: Path, profile: str) -> dict[str, Any]:
         count = max(1, round(packets_per_s * span_s))
     except SpellingError:
         raise
-    except (KeyError, TypeError, ZeroDivisionError, OverflowError, ValueError) as error:
+    except (csv.Error, KeyError, TypeError, ArithmeticError, ValueError) as error:
         raise SpellingError(f"{path}: not profiles of ERRANT: {error}") from None
     times_ms = [-(-(i + 1) * span_s * 1000 // count) for i in range(count)]
     return {

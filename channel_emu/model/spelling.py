@@ -174,14 +174,15 @@ def delays_ms(path: Path) -> list[float]:
             return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
         except (KeyError, TypeError, ValueError, RecursionError):
             raise SpellingError(f"{path}: neither delays nor a trace of this emulator") from None
-    rows = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}
-    columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ())
-               if word.strip() in names]  # fmt: skip
-    column, unit_ms = columns[0] if columns else (0, 1.0)
     try:
+        rows = list(csv.reader(lines))
+        columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ())
+                   if word.strip() in names]  # fmt: skip
+        column, unit_ms = columns[0] if columns else (0, 1.0)
         return [float(row[column]) * unit_ms for row in rows[bool(columns) :]]
-    except (ValueError, IndexError) as error:
+    except (csv.Error, ValueError, IndexError) as error:
         raise SpellingError(
             f"{path}: expected a column delay_ms, or one delay in ms a line: {error}"
         ) from None

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.model.link import EventKind, Transit
+from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
 
 VERSION = 2
@@ -133,6 +133,8 @@ def read(path: Path) -> Trace:
             instant = getattr(record, key)
             if instant is not None and (type(instant) is not int or not 0 <= instant <= NEVER_NS):
                 raise TraceError(f"{path}: line {number}: {key}: expected nanoseconds, got {instant!r}")
+        if type(record.bytes) is not int or not 0 <= record.bytes <= MAX_SIZE_BYTES:
+            raise TraceError(f"{path}: line {number}: bytes: expected a message's size, got {record.bytes!r}")
         if record.outcome is not None and record.outcome not in list(EventKind):
             raise TraceError(f"{path}: line {number}: outcome: unknown, got {record.outcome!r}")
         records.append(record)

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from channel_emu.model import ages
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
+from channel_emu.model.link import MAX_SIZE_BYTES
 from channel_emu.virtual import python_engine
 from channel_emu.virtual.link_run import OUTCOMES, LinkRun, camera_period_ms
 
 _MOST_FRAMES = 1e9
+_MOST_CAMERAS = 10_000  # 25 kB each, and ten times as many as a scenario has
 
 
 class SimulationError(ValueError):
@@ -114,16 +116,19 @@ def simulate(
     threads: of the kernel; None uses every processor if the run is long enough. Results do not depend on it.
     Raises SimulationError.
     """
-    names = [f"cam{i:02d}" for i in range(cameras)] if isinstance(cameras, int) else cameras
-    if not names:
-        raise SimulationError("cameras: expected at least one")
+    count = cameras if isinstance(cameras, int) else len(cameras)
+    if not 1 <= count <= _MOST_CAMERAS:
+        raise SimulationError(f"cameras: expected 1 to {_MOST_CAMERAS}, got {count}")
+    names = [f"cam{i:02d}" for i in range(count)] if isinstance(cameras, int) else cameras
     if not 0 < seconds <= 1e9:
         raise SimulationError(f"seconds: expected more than 0 and at most 1e9, got {seconds:g}")
     if frame_period_ms is not None and not 1e-3 <= frame_period_ms < math.inf:
         raise SimulationError(f"frame_period_ms: expected at least 0.001, got {frame_period_ms:g}")
     if not 1e-3 <= slot_ms < math.inf:
         raise SimulationError(f"slot_ms: expected at least 0.001, got {slot_ms:g}")
-    frames = len(names) * seconds * 1e3 * _frames_per_ms(config, frame_period_ms)
+    if not 0 <= frame_bytes <= MAX_SIZE_BYTES:
+        raise SimulationError(f"frame_bytes: expected 0 to {MAX_SIZE_BYTES}, got {frame_bytes}")
+    frames = count * seconds * 1e3 * _frames_per_ms(config, frame_period_ms)
     if frames > _MOST_FRAMES:
         raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)

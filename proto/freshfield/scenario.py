@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
+import sys
 import types
 import typing
 from dataclasses import dataclass, field
@@ -244,7 +244,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return read_section(typing.cast(type, hint), value, where)
     if hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and abs(value) <= sys.float_info.max):  # also of a whole number that no float holds
             raise ScenarioError(f"{where}: expected a number, got {value!r}")
         return float(value)
     if hint is Path:

@@ -1,11 +1,14 @@
 """Files that a stranger may have written: references are followed only as far as the file's own size allows.
 
 A few hundred bytes of YAML or of a pickle can refer to themselves so often that they stand for gigabytes. An
-honest file has fewer values than bytes, however often it repeats some by reference.
+honest file has fewer values than bytes, however often it repeats some by reference. A key that an object has
+twice is refused: which of the two values was meant, nobody knows.
 """
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -29,6 +32,28 @@ class _Loader(yaml.SafeLoader):
         if self.flow_level + len(self.indents) > MOST_NESTED:
             raise UntrustedError("not YAML: nested too deeply")
         return super().fetch_more_tokens()
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:  # as the constructor reads them: 1 and 01 are one key
+            name = str(self.construct_object(key)) if key.tag in self.yaml_constructors else key.value
+            if name in seen:
+                raise UntrustedError(f"line {key.start_mark.line + 1}: {_repeated(name)}")
+            seen.add(name)
+        return node
+
+    def construct_whole_number(self, node: Any) -> int:
+        value = self.construct_yaml_int(node)
+        str(value)  # ValueError for thousands of digits in hexadecimal: no message could quote them
+        return int(value)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_whole_number)
+
+
+def _repeated(key: str) -> str:
+    return f"the key {key[:200]!r} is there twice: keep one"
 
 
 def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]]) -> None:
@@ -64,11 +89,31 @@ def read_yaml(text: str) -> Any:
         return loader.construct_document(node)
     except UntrustedError:
         raise
-    except (yaml.YAMLError, ValueError) as error:  # numbers and dates that are none raise a plain ValueError
+    # What a tag says is a number, a date or a truth value, and is none, raises nearly anything.
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         raise UntrustedError(f"not YAML: {' '.join(str(error).split())}") from None
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def read_json(text: str) -> Any:
+    """The value of a JSON document. Raises UntrustedError."""
+    try:
+        return json.loads(text, object_pairs_hook=_object)
+    except UntrustedError:
+        raise
+    except RecursionError:
+        raise UntrustedError("nested too deeply") from None
+    except ValueError as error:
+        raise UntrustedError(str(error)) from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise UntrustedError(_repeated(Counter(key for key, _ in pairs).most_common(1)[0][0]))
+    return found
 
 
 def _node_parts(node: Any) -> Iterable[Any]:

@@ -146,6 +146,12 @@ def test_rates(text: str, value: float) -> None:
         (["--slot-ms", "0"], "slot_ms: expected"),
         (["--slot-ms", "-1"], "slot_ms: expected"),
         (["--slot-ms", "nan"], "slot_ms: expected"),
+        (["--frame-bytes", "-1"], "frame_bytes: expected 0 to"),
+        (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
+        (["--cameras", "30000000"], "cameras: expected 1 to"),
+        (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
+        (["--fault", "bandwidth:1.0e-308"], "bandwidth: megabits_per_s: expected at least"),
+        (["--fault", "loss:{probability: 0, probability: 1}"], "expected something like loss:0.1"),
         (["--seconds", "1e9", "--cameras", "18"], "frames: expected at most"),
         (["--arrivals", "poisson:1e12"], "frames: expected at most"),
         (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
@@ -165,6 +171,24 @@ def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
 def test_a_peer_without_a_port_is_refused(capsys, command: list[str]) -> None:
     assert main([*command, "--to", "edge"]) == 2
     assert capsys.readouterr().err.startswith("channel-emu: --to: expected HOST:PORT")
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [(["--service", "trace:{}"], "one delay in ms a line"), (["--preset", "errant:{}:a/b/c/d"], "of ERRANT")],
+)
+def test_a_table_with_an_endless_field_is_one_line(
+    capsys, tmp_path: Path, words: list[str], why: str
+) -> None:
+    (tmp_path / "a.csv").write_text(f'delay_ms\n"{"5" * 140_000}"\n')
+    test_mistakes_get_one_line(capsys, [word.format(tmp_path / "a.csv") for word in words], why)
+
+
+def test_a_slot_longer_than_the_run_has_no_boundary(capsys) -> None:
+    assert (
+        simulate(capsys, "--preset", "ch5", "--seconds", "1", "--slot-ms", "1e300")["mean_age_slotted_ms"]
+        is None
+    )
 
 
 def test_replay_says_whether_decisions_agree(capsys, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
-from freshfield.untrusted import UntrustedError, read_yaml, refuse_expansion, stored_bytes
+from freshfield.untrusted import UntrustedError, read_json, read_yaml, refuse_expansion, stored_bytes
 from tests.work import work_ms
 
 LEVELS = "abcdefghijklmnop"
@@ -46,6 +46,20 @@ def test_an_alias_bomb_is_refused_at_once(text):
         ("a: 2001-99-99", "not YAML"),
         ("x" * (MAX_YAML_CHARS + 1), "characters, more than"),
         ("!!python/object/apply:os.system [true]", "could not determine a constructor"),
+        ("a: 0x" + "f" * 5000, "not YAML"),  # a message could not quote it
+        ("a: 1" + ":00" * 300 + ":00.5", "not YAML"),
+        ("a: !!bool maybe", "not YAML"),
+        ("a: !!int", "not YAML"),
+        ("a: !!timestamp soon", "not YAML"),
+        ("a: 1\nb: 2\na: 3", "line 3: the key 'a' is there twice"),
+        ("a: {b: 1, c: 2, 'b': 1}", "line 1: the key 'b' is there twice"),
+        ("[{b: 1}, {b: 1, b: 1}]", "the key 'b' is there twice"),
+        ("{1: a, 01: b}", "the key '1' is there twice"),  # octal
+        ("{yes: a, true: b}", "the key 'True' is there twice"),
+        ("a: &a {b: 1}\nc: {<<: *a, <<: *a}", "line 2: the key '<<' is there twice"),
+        (f"? {'k' * 10**4}\n? {'k' * 10**4}", "is there twice"),
+        ("{? [1]: a}", "unhashable key"),
+        (f"{LISTS}z: {{? *p : 1, ? *p : 2}}", "is there twice"),
     ],
     ids=lambda v: v[:12],
 )
@@ -70,6 +84,27 @@ def test_honest_references_are_followed():
     text = "base: &b {width: 128, height: 96}\none: *b\ntwo: {<<: *b, width: 64}\n"
     assert read_yaml(text)["two"] == {"width": 64, "height": 96} and read_yaml(text)["one"]["width"] == 128
     assert read_yaml("") is None and read_yaml("3") == 3
+    nested = "a: &a {x: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3}\n"
+    assert read_yaml(nested) == {"a": {"x": 1}, "b": {"x": 2}, "c": {"x": 3}}, (
+        "what is merged is no repetition"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('{"a": 1, "b": {"c": 1, "d": 2, "c": 1}}', "the key 'c' is there twice"),
+        ("[" * 10**5, "nested too deeply"),
+        ("{", "Expecting"),
+        ("9" * 5000, "limit"),
+    ],
+    ids=lambda v: v[:12],
+)
+def test_what_is_no_json_is_one_line(text, why):
+    with pytest.raises(UntrustedError, match=why) as error:
+        read_json(text)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    assert read_json('{"a": [{"a": 1}, {"a": 2}]}') == {"a": [{"a": 1}, {"a": 2}]}
 
 
 @pytest.mark.parametrize(

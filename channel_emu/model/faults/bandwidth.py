@@ -13,8 +13,8 @@ class Params:
     megabits_per_s: float
 
     def __post_init__(self) -> None:
-        if self.megabits_per_s <= 0:
-            raise ValueError(f"megabits_per_s: expected more than 0, got {self.megabits_per_s:g}")
+        if not self.megabits_per_s >= 1e-9:  # a bit in a quarter of an hour
+            raise ValueError(f"megabits_per_s: expected at least 1e-9, got {self.megabits_per_s:g}")
 
 
 class Effect(Fault):

@@ -103,5 +103,5 @@ class Spec:
                 layout[name] = tuple(layout[name])
             values["omegas_ms"] = tuple(values["omegas_ms"])
             return Spec(layout=StateLayout(**layout), **values)
-        except (TypeError, KeyError) as error:
+        except (TypeError, KeyError, OverflowError) as error:
             raise ValueError(f"not a learner's specification ({error})") from None

@@ -125,6 +125,14 @@ def test_losses_by_state() -> None:
     assert metric("age", 15_000, **section) != near(age)
 
 
+def test_what_is_computed_beyond_the_end_is_not_shown() -> None:
+    section = {"arrivals": "periodic:100ms", "service": "det:50ms", "discipline": "parallel"}
+    # Shown 450 and 500 ms after each capture, at 450, 500, ... 950 ms; and half a refresh more on average.
+    assert metric("shown:400ms:50ms", 1, **section) == pytest.approx((6 * 450 + 5 * 500) / 11 + 25)
+    for text in ("shown:5s:16ms", "shown:1e300ms:1e300ms", "shown:1ms:1e300ms", "query:1e300ms"):
+        assert metric(text, 1, **section) is None
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -101,6 +101,9 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
         (1, '"camera"', '"kamera"', "line 2 is not a trace record"),
         (1, '"offered_ns":', '"offered_ns":-', "line 2: offered_ns: expected nanoseconds"),
         (1, '"outcome":"', '"outcome":"un', "line 2: outcome: unknown"),
+        (1, '"bytes":', '"bytes":-', "line 2: bytes: expected a message's size, got -1"),
+        (1, '"bytes":1001', '"bytes":null', "line 2: bytes: expected a message's size, got None"),
+        (1, '"bytes":', '"bytes":1' + "0" * 400, "line 2: bytes: expected a message's size"),
     ],
 )
 def test_damaged_traces_are_refused_with_the_place(

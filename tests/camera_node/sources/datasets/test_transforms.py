@@ -233,8 +233,8 @@ def test_images_outside_the_data_set_are_not_read(tmp_path, leads):
         load_dataset(file)
 
 
-def test_json_that_is_nested_or_counts_too_far_is_one_line(tmp_path):
-    for text in ("[" * 10**5, '{"frames": ' + "9" * 5000 + "}"):
+def test_json_that_is_nested_or_counts_too_far_or_repeats_itself_is_one_line(tmp_path):
+    for text in ("[" * 10**5, '{"frames": ' + "9" * 5000 + "}", '{"w": 64, "frames": [], "w": 32}'):
         (tmp_path / "transforms.json").write_text(text)
         with pytest.raises(DatasetError, match="cannot be read as JSON"):
             load_dataset(tmp_path / "transforms.json")
