@@ -176,6 +176,9 @@ def _run(args: argparse.Namespace) -> int:
     from edge_server.live.server import EdgeServer, ServerOptions
     from edge_server.scheduler import parse_policy
 
+    for option, seconds in (("seconds", args.seconds), ("checkpoint-every", args.checkpoint_every)):
+        if seconds is not None and not 0.0 <= seconds <= 1e9:  # a timer's most is 9.2e9
+            raise ScenarioError(f"--{option} {seconds:g}: expected 0 to 1e+09")
     scenario = load(args.scenario, args.seed)
     config = read_config(scenario)
     if args.policy:

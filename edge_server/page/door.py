@@ -121,9 +121,14 @@ class Door:
         def through_the_door(handler: Any, host: Any, port: Any, **options: Any) -> Any:
             self.used = True
             process = options.pop("process_request")
+            # One of its own that passes on what it does not count.
+            logger = logging.Logger("websockets.server")
+            logger.parent = logging.getLogger(logger.name)
+            logger.addFilter(self._worth_a_line)
             options |= {
                 "max_size": MAX_VISITOR_MESSAGE_BYTES,
                 "max_queue": 4,
+                "logger": logger,
                 "close_timeout": 2.0,
                 "ssl": self._tls,
                 "process_request": lambda connection, request: self._answer(connection, request, process),
@@ -186,6 +191,12 @@ class Door:
         self.refused[what] += 1
         return False
 
+    def _worth_a_line(self, record: logging.LogRecord) -> bool:
+        """Whether websockets may log it: a failed handshake, which anybody may cause, is only counted."""
+        if record.msg != "opening handshake failed":
+            return True
+        return self._refuse("a request that is no GET of HTTP/1.1")
+
     def _answer(self, connection: VisitorConnection, request: Request, process: Process) -> Response | None:
         """What to answer a request with; None lets a visitor in."""
         host, origin = _one(request, "Host"), _one(request, "Origin")
@@ -200,6 +211,9 @@ class Door:
             if error.status == 401:
                 refusal.headers["WWW-Authenticate"] = 'Basic realm="freshfield", charset="UTF-8"'
             return refusal
+        if len(request.path.partition("?")[0]) > 255:  # no file has such a name, and asking for it fails
+            self._refuse("a path that is too long")
+            return connection.respond(404, "There is no such page.\n")
         if "websocket" in (_one(request, "Upgrade") or "").lower():
             if len(self.visitors) >= MAX_VISITORS:
                 return connection.respond(503, f"{MAX_VISITORS} visitors are here already\n")

@@ -279,4 +279,4 @@ def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_usage(value: Any) -> bool:
-    return isinstance(value, dict) and "rss_mb" in value and "cpu" in value
+    return isinstance(value, dict) and None not in (value.get("rss_mb"), value.get("cpu"))

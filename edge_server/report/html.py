@@ -200,9 +200,9 @@ def _cut_line(report: Report) -> str:
     from edge_server.foreground import WHY  # only where a run cuts objects out
 
     whole = [f"{cut[name]} ({why})" for name, why in WHY.items() if cut.get(name)]
-    spent = _n(cut["ms_per_image"], 0, " ms")
+    spent = _n(cut.get("ms_per_image"), 0, " ms")
     return (
-        f"<p>The object was cut out of {cut['masked']} images, {spent} each; "
+        f"<p>The object was cut out of {_n(cut.get('masked'), 0)} images, {spent} each; "
         f"used whole: {', '.join(whole) or 'none'}.</p>"
     )
 

@@ -3,16 +3,127 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Required, TypedDict
+
+import msgspec
+from msgspec import Meta
 
 Row = dict[str, Any]
 
-MEASURED = (
-    "chamfer_mm", "complete", "accuracy_median_mm", "within_mm", "target_chamfer_mm", "target_complete",
-)  # fmt: skip
+# Beyond it nothing that a run measures or counts.
+Number = Annotated[int, Meta(ge=-(10**15), le=10**15)] | Annotated[float, Meta(ge=-1e15, le=1e15)]
+Numbers = dict[str, Number | None]
+
+
+class _Updates(TypedDict, total=False):
+    count: Number | None
+    ms_p50: Number | None
+    ms_p95: Number | None
+    first_ms: Number | None
+    deadline_ms: Number | None
+    with_deadline: Number | None
+    within_deadline: Number | None
+    undecodable: Number | None
+    shed: Number | None
+    without_step: Number | None
+    refused: dict[str, Number]
+
+
+class _Data(TypedDict):
+    file: str
+    instant: str | None
+    training: int
+    held_out: list[str]
+    missing: int
+
+
+class _Histogram(TypedDict):
+    edges_ms: list[Number]
+    counts: list[Number]
+
+
+class _Delays(TypedDict, total=False):
+    mean: Number | None
+    p50: Number | None
+    p95: Number | None
+    p99: Number | None
+    max: Number | None
+    histogram: _Histogram
+
+
+class _FrontierPoint(TypedDict):
+    effort: str
+    update_ms: Number
+    psnr_db: Number
+    psnr_moving_db: Number
+
+
+class _Measured(TypedDict):
+    chamfer_mm: Number
+    complete: Number
+    accuracy_median_mm: Number
+    within_mm: Number
+    target_chamfer_mm: Number
+    target_complete: Number
+
+
+class _Mesh(TypedDict):
+    file: str
+    triangles: int
+    seconds: Number
+    stages_s: dict[str, Number]
+    measured: _Measured | None
+
+
+class _Publication(TypedDict, total=False):
+    t_s: Required[Number]
+    number: Number
+    selected: list[str] | Number | None
+    refused: list[str] | None
+    steps: Number | None
+    update_ms: Number | None
+    aaoi_ms: Number | None
+    psnr_db: Number | None
+    psnr_moving_db: Number | None
+    ssim: Number | None
+    lpips: Number | None
+    perceptual: Number | None
+    truth_gap_ms: Number | None
+    scored_on: str | None
+
+
+class _Shown(TypedDict, total=False):
+    t_s: Required[Number]
+    age_ms: Numbers | None
+    psnr_db: Number | None
+    psnr_moving_db: Number | None
+    psnr_still_db: Number | None
+    ssim: Number | None
+    lpips: Number | None
+
+
+class _Ages(TypedDict, total=False):
+    t_s: Required[Number]
+    age_ms: Numbers | None
+
+
+# What a report takes from the files, and of which type: of JSON files key by key, of JSON lines row by row.
+_EDGE: dict[str, Any] = {
+    "kind": str, "scenario": str | None, "seed": int | None, "field": str | None, "policy": str | None,
+    "value": Number | None, "seconds": Number, "uptime_s": Number, "lines_lost": Number,
+    "updates": _Updates | None, "foreground": Numbers | None, "baseline": Numbers | None,
+    "data": _Data | None, "lpips_missing": str | None, "lpips_network": str | None,
+}  # fmt: skip
+_CHANNEL: dict[str, Any] = {
+    "state_share": dict[str, Number] | None, "drawn_delay_ms": _Delays | None,
+    "delay_error_ms": _Delays | None,
+}  # fmt: skip
+_FRONTIER: dict[str, Any] = {"points": list[_FrontierPoint], "about": str}
+_ROWS: dict[str, Any] = {
+    "series": _Publication, "ages": _Ages, "shown": _Shown, "processes": dict[str, Number | Numbers | None],
+}  # fmt: skip
 
 
 @dataclass
@@ -45,17 +156,17 @@ def read_run_files(out: Path) -> RunFiles:
     if not out.is_dir():
         raise FileNotFoundError(f"{out} is not a folder: give the folder of a run (its --out)")
     files = RunFiles(out)
-    files.edge = _read_json(out / "edge.json", files.notes)
-    files.channel = _read_json(out / "channel.json", files.notes)
+    files.edge = _read_json(out / "edge.json", _EDGE, files.notes)
+    files.channel = _read_json(out / "channel.json", _CHANNEL, files.notes)
     files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
     files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
     # Not of a fit; processes only where one command started all of them.
     for name in [n for n in ("shown", "processes") if (out / f"{n}.jsonl").exists()]:
         setattr(files, name, _continuous(_read_lines(out / f"{name}.jsonl", files.notes)))
     if (out / "frontier.json").exists():  # not of a fit
-        files.frontier = _read_json(out / "frontier.json", files.notes)
+        files.frontier = _read_json(out / "frontier.json", _FRONTIER, files.notes)
     if (out / "mesh.json").exists():  # only where the scenario asks for one
-        files.mesh = _mesh(_read_json(out / "mesh.json", files.notes), files.notes)
+        files.mesh = _read_json(out / "mesh.json", _Mesh, files.notes)
     for name in ("truth", "rendered"):
         path = out / f"{name}.png"
         if path.is_file():
@@ -63,56 +174,50 @@ def read_run_files(out: Path) -> RunFiles:
     return files
 
 
-def _mesh(data: Row, notes: list[str]) -> Row:
-    """``data`` if it has the keys that the export writes; else {} and a note."""
+def _read_json(path: Path, model: Any, notes: list[str]) -> Row:
+    """What ``model`` names of an object in a JSON file: key by key, or with a TypedDict all or nothing."""
+    kept: Row = {}
     try:
-        measured = data["measured"]
-        numbers = [data["triangles"], data["seconds"], *data["stages_s"].values()]
-        numbers += [] if measured is None else [measured[name] for name in MEASURED]
-        if isinstance(data["file"], str) and all(isinstance(n, int | float) for n in numbers):
-            return data
-    except (KeyError, TypeError, AttributeError):
-        pass
-    if data:
-        notes.append("mesh.json left out: not what edge-server export --json writes")
-    return {}
-
-
-def _read_json(path: Path, notes: list[str]) -> Row:
-    try:
-        data = json.loads(path.read_bytes())
+        data = msgspec.convert(_parse(path.read_bytes()), dict[str, Any])
+        if not isinstance(model, dict):
+            return msgspec.convert(data, model)
     except FileNotFoundError:
         notes.append(f"{path.name} is missing")
-    except (OSError, ValueError) as error:
+        return kept
+    except (OSError, ValueError, RecursionError) as error:
         notes.append(f"{path.name} left out: {error}")
-    else:
-        if isinstance(data, dict):
-            return data
-        notes.append(f"{path.name} left out: expected an object")
-    return {}
+        return kept
+    for key in [key for key in model if key in data]:
+        try:
+            kept[key] = msgspec.convert(data[key], model[key])
+        except ValueError as error:
+            notes.append(f"{path.name}: {key} left out: {error}")
+    return kept
 
 
 def _read_lines(path: Path, notes: list[str]) -> list[Row]:
-    """Rows of a JSON-lines file that are objects with a finite ``t_s``; a note counts the others."""
+    """Rows of a JSON-lines file that are what they should be; a note counts the others."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError:
         notes.append(f"{path.name} is missing")
         return []
-    rows, bad = [], 0
+    rows: list[Row] = []
     for line in lines:
         try:
-            row = json.loads(line)
-            timed = isinstance(row, dict) and math.isfinite(row["t_s"])
-        except (ValueError, KeyError, TypeError, OverflowError):
-            timed = False
-        if timed:
-            rows.append(row)
-        else:
-            bad += 1
-    if bad:
+            row = msgspec.convert(_parse(line), _ROWS[path.stem])
+            if isinstance(row.get("t_s"), int | float):
+                rows.append(row)
+        except (ValueError, RecursionError):
+            pass
+    if bad := len(lines) - len(rows):
         notes.append(f"{path.name}: {bad} of {len(lines)} lines unreadable (killed while writing?)")
     return rows
+
+
+def _parse(text: bytes) -> Any:
+    """JSON, with None in place of NaN and infinity."""
+    return json.loads(text, parse_constant=lambda name: None)
 
 
 def _continuous(rows: list[Row]) -> list[Row]:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:  # loaded only by the policies that need them
     from edge_server.scheduler.learned.decision import Decision
     from edge_server.treatments import Treatment
 
+LONGEST_MS = 3_600_000.0
+"""Of a wait, a period, a deadline or an update: in an hour every scene has changed."""
+
 
 class Observer(Protocol):
     """Computes the state of all cameras when it is called, and only the ``parts`` asked for."""
@@ -83,12 +86,12 @@ class Policy:
         if self.parameter is None or value is None:
             return
         if self.parameter == "k":
-            if value != int(value) or value < 1:
+            if value < 1 or value % 1:  # of NaN and infinity the remainder is NaN
                 raise ValueError(f"k: expected a whole number from 1, got {value:g}")
             self.value = int(value)
         else:
-            if not np.isfinite(value) or value < 0:
-                raise ValueError(f"{self.parameter}: expected zero or more, got {value:g}")
+            if not 0 <= value <= LONGEST_MS:
+                raise ValueError(f"{self.parameter}: expected 0 to {LONGEST_MS:.0f}, got {value:g}")
             self.value = float(value)
 
     @property

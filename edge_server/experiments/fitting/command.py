@@ -120,6 +120,13 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
         model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
         raise OptionError(f"--field {request.field}: {error}") from None
+    from edge_server.fields.common.supervision import check_view  # as above
+
+    try:
+        for view in (*data.training, *data.held_out):
+            check_view(view)
+    except ValueError as error:
+        raise DatasetError(f"{data.file}: {error}") from None
     request.out.mkdir(parents=True, exist_ok=True)
     run_ = _Run(request, options, data, model)
     if request.resume:

@@ -12,19 +12,24 @@ import numpy as np
 
 from edge_server.fields.common.view_store import Arrays, ViewStore
 
+VERSION = 1  # of what ``pack_state`` writes
+
 
 def pack_state(
     name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays
 ) -> Arrays:
     """All of it in one dictionary of copies. counters: facts for JSON. arrays: what was learned."""
-    meta = {"version": 1, "field": name, "settings": asdict(settings), **counters, **view_store.meta()}
+    meta = {"version": VERSION, "field": name, "settings": asdict(settings), **counters, **view_store.meta()}
     both = {"meta": np.array(json.dumps(meta)), **arrays, **view_store.arrays()}
     return {name: np.array(array) for name, array in both.items()}
 
 
-def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...]) -> dict[str, Any]:
-    """The facts in ``state``. ValueError unless it is the state of a field called ``name`` whose settings
-    agree with these in the options ``shape``; all other options may differ."""
+def unpack_meta(
+    settings: Any, state: Arrays, name: str, shape: tuple[str, ...], version: int = VERSION
+) -> dict[str, Any]:
+    """The facts in ``state``. ValueError unless it is the state of a field called ``name``, of this
+    ``version`` and all finite, whose settings agree with these in the options ``shape``; all other options
+    may differ."""
     try:
         meta = json.loads(str(state["meta"]))
         theirs = meta["settings"]
@@ -33,6 +38,11 @@ def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...])
     made_by = meta.get("field", name)
     if made_by != name:
         raise ValueError(f"the state is that of a field called {made_by}, this one is {name}")
+    if meta.get("version") != version:
+        raise ValueError(f"the state has version {meta.get('version')}, this program reads {version}")
+    for key, array in state.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"the state's {key} holds numbers that are not finite")
     for option in shape:
         mine = getattr(settings, option)
         mine = list(mine) if isinstance(mine, tuple) else mine  # as JSON has it

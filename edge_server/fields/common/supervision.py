@@ -13,6 +13,7 @@ from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
+from freshfield.limits import MAX_CENTER_OUTSIDE_SIDES
 
 CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
 MARGIN_PX = 2
@@ -64,6 +65,12 @@ def check_view(view: View) -> None:
         raise ValueError(
             f"camera {view.camera}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are no lens "
             f"for an image of {camera.width} x {camera.height}"
+        )
+    outside = (abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+    if max(outside) > MAX_CENTER_OUTSIDE_SIDES + 0.5:
+        raise ValueError(
+            f"camera {view.camera}: its principal point of {camera.cx:g}, {camera.cy:g} is far outside "
+            f"the image of {camera.width} x {camera.height}"
         )
     if not invertible(camera):
         raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")

@@ -14,7 +14,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from freshfield.access import HttpDoor, HttpRefused
 from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
-from freshfield.transport import Transport
+from freshfield.transport import Transport, TransportError
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +100,8 @@ def serve_guarded(
     what: the application's name for messages. port: 0 takes a free one. Raises TransportError if it would be
     open to others (see ``Transport.guard``), OSError if the port is not available.
     """
+    if not 0 <= port <= 65535:
+        raise TransportError(f"{what}: {port} is not a port; give one from 1 to 65535, or 0 for a free one")
     transport = transport or Transport()
     if words := transport.guard(host, what, http=True):
         log.warning("--insecure: %s", words)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from edge_server.scheduler.learned.state import StateLayout, require_int
+from edge_server.scheduler.policy import LONGEST_MS
 
 Action = Literal["select", "wait", "wait-arrived", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "wait-arrived", "threshold")
@@ -62,8 +63,10 @@ class Spec:
         if len(self.omegas_ms) > MAX_OMEGAS:
             raise ValueError(f"omegas_ms: expected at most {MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
-        if not rising or not all(math.isfinite(o) and o >= 0 for o in self.omegas_ms):
-            raise ValueError(f"omegas_ms: expected finite values from 0, rising, got {self.omegas_ms}")
+        if not rising or not all(0 <= o <= LONGEST_MS for o in self.omegas_ms):
+            raise ValueError(
+                f"omegas_ms: expected values from 0 to {LONGEST_MS:.0f}, rising, got {self.omegas_ms}"
+            )
         if self.network not in ("pooled", "flat"):
             raise ValueError(f"network {self.network!r} is not known; choose pooled or flat")
         if (self.network == "flat") != (self.cameras is not None):

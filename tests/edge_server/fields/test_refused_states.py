@@ -50,6 +50,15 @@ def _last_array_cut(state: State) -> None:
     state[_last_array(state)] = state[_last_array(state)][:-1]
 
 
+def _last_array_not_finite(value: float) -> Callable[[State], None]:
+    def spoil(state: State) -> None:
+        name = _last_array({n: a for n, a in state.items() if a.dtype.kind == "f"})
+        state[name] = state[name].copy()
+        state[name].flat[-1] = value
+
+    return spoil
+
+
 def _image_cut(state: State) -> None:
     state["image_0"] = state["image_0"][:-1]
 
@@ -66,6 +75,10 @@ DAMAGE: dict[str, Callable[[State], Any]] = {
     "a pose that is none": _pose_lost,
     "an array that is too short": _last_array_cut,
     "an array that is missing": lambda state: state.pop(_last_array(state)),
+    "an array that holds NaN": _last_array_not_finite(np.nan),
+    "an array that holds infinity": _last_array_not_finite(np.inf),
+    "of a later version": _said(lambda meta: meta.update(version=10**9)),
+    "of no version": _said(lambda meta: meta.pop("version")),
     "no step count": _said(lambda meta: meta.pop("step")),
     "a step count that is none": _said(lambda meta: meta.update(step=None)),
     "no cameras": _said(lambda meta: meta.pop("cameras")),

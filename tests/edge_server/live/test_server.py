@@ -13,6 +13,7 @@ import grpc
 import numpy as np
 import pytest
 
+from edge_server.cli import main as edge_server
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import field_names
@@ -363,3 +364,11 @@ def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_pat
     (ledger,) = read_all(tmp_path / "out")
     assert ledger.closed
     assert json.loads((tmp_path / "out" / "edge.json").read_text())["lines_lost"] == 0
+
+
+@pytest.mark.parametrize("option", ["--seconds", "--checkpoint-every"])
+@pytest.mark.parametrize("value", ["nan", "1e300", "-1"])
+def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option, value):
+    assert edge_server(["run", "room", f"{option}={value}", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert f"{option} " in said and "expected 0 to 1e+09" in said and said.count("\n") == 1

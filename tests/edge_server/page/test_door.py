@@ -200,6 +200,29 @@ def test_a_foreign_web_site_reaches_nothing() -> None:
     assert get(port, "/metrics")[0] == 200 and get(port, "/metrics", Host=foreign)[0] == 403
 
 
+def test_requests_that_no_page_answers_are_counted_and_logged_once(caplog) -> None:
+    with page_of(bare_state()) as page, Visitor(page.port):
+        wait_until(lambda: page._server.get_clients(), "the visitor")
+        refused = door_of(page).refused
+        for request in (b"HEAD / HTTP/1.1", b"POST / HTTP/1.1", b"GET / HTTP/1.0", b"\x00\xff"):
+            with socket.create_connection(("127.0.0.1", page.port), timeout=10) as raw:
+                raw.sendall(request + b"\r\nHost: 127.0.0.1\r\n\r\n")
+                with contextlib.suppress(ConnectionResetError):
+                    assert not raw.recv(100)
+        wait_until(lambda: refused["a request that is no GET of HTTP/1.1"] == 4, "all of them")
+        assert get(page.port, "/" + "a" * 3000)[0] == get(page.port, "/" + "a" * 200)[0] == 404
+        assert refused["a path that is too long"] == 1
+    said = [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")]
+    assert sum("no GET of HTTP/1.1" in r.getMessage() for r in said) == 1
+    assert not any(r.exc_info for r in said)
+
+
+@pytest.mark.parametrize("port", [99_999_999_999, 65536, -5])
+def test_what_is_no_port_is_refused(port: int) -> None:
+    with pytest.raises(TransportError, match=f"metrics: {port} is not a port"):
+        serve_metrics(bare_state(), INGEST, "127.0.0.1", port)
+
+
 # --- what a visitor may send --------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from edge_server.config import ExportConfig
 from edge_server.report import build_report
+from edge_server.report.html import render_html
 from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
 from edge_server.report.run_files import read_run_files
 from freshfield_up.summary import summarize
@@ -236,6 +237,42 @@ def test_nan_in_a_file_does_not_become_nan_in_the_report(tmp_path):
     assert report["fidelity"]["series"][-1]["psnr_db"] is None
     assert "series.jsonl: 5 of 9 lines unreadable (killed while writing?)" in report["notes"]
     build_report(tmp_path)
+
+
+DEEP = "[" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "note"),
+    [
+        ("edge.json", '{"updates": [1], "seed": 3}', "edge.json: updates left out: Expected"),
+        ("edge.json", '{"updates": {"refused": 7}, "seed": 3}', "updates left out: Expected"),
+        ("edge.json", '{"baseline": "x", "seed": 3}', "edge.json: baseline left out"),
+        ("edge.json", '{"data": {"held_out": []}, "kind": "fit", "seed": 3}', None),
+        ("edge.json", f'{{"seconds": {10**400}, "seed": 3}}', "edge.json: seconds left out"),
+        ("edge.json", DEEP, "edge.json left out: maximum recursion"),
+        ("edge.json", "[]", "edge.json left out: Expected `object`"),
+        ("channel.json", '{"drawn_delay_ms": {"histogram": [1]}, "state_share": [1]}', "share left out"),
+        ("frontier.json", '{"points": [{"effort": "low", "update_ms": [1]}]}', "points left out"),
+        ("ages.jsonl", '{"t_s": 1, "age_ms": [5]}', "ages.jsonl: 1 of 1 lines"),
+        ("shown.jsonl", '{"t_s": 1, "age_ms": "x"}', "shown.jsonl: 1 of 1 lines"),
+        ("series.jsonl", f'{{"t_s": 1, "update_ms": {10**400}}}', "series.jsonl: 1 of 1 lines"),
+        ("series.jsonl", f'{{"t_s": {10**400}}}', "series.jsonl: 1 of 1 lines"),
+        ("series.jsonl", '{"t_s": 1, "refused": 5}', "series.jsonl: 1 of 1 lines"),
+        ("series.jsonl", DEEP, "series.jsonl: 1 of 1 lines"),
+        ("processes.jsonl", '{"t_s": {}, "edge": {"cpu": 1}}', "processes.jsonl: 1 of 1 lines"),
+        ("processes.jsonl", '{"t_s": 1, "edge": {"cpu": "x"}}', "processes.jsonl: 1 of 1 lines"),
+    ],
+)  # fmt: skip
+def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
+    write_run(tmp_path, publications=2, ages=2)
+    (tmp_path / file).write_text(text)
+    files = read_run_files(tmp_path)
+    report = assemble(files)
+    render_html(report, {})
+    json.dumps(report, allow_nan=False)
+    assert note is None or any(note in each for each in files.notes)
+    assert file != "edge.json" or "seed" not in text or report["seed"] == 3
 
 
 def test_hostile_names_do_not_reach_the_page_as_markup(tmp_path):

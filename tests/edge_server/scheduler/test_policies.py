@@ -173,8 +173,12 @@ def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, no
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("threshold", -1), ("wait", float("nan")), ("freshest-k", 0), ("round-robin", 2.5), ("random", 0)],
-)
+    [
+        ("threshold", -1), ("wait", float("nan")), ("freshest-k", 0), ("round-robin", 2.5), ("random", 0),
+        ("wait", 1e308), ("wait-arrived", float("inf")), ("periodic", 3.7e6), ("round-robin", float("inf")),
+        ("random", float("nan")),
+    ],
+)  # fmt: skip
 def test_a_value_out_of_range_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match="expected"):
         make_policy(name, value, np.random.default_rng(0))

@@ -23,6 +23,7 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
+VERSION = 3
 COUNTERS = ("layered", "shown", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
@@ -60,14 +61,14 @@ def pack(field: Any) -> Arrays:
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
         tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
-    meta = {"version": 3, "field": NAME, "settings": asdict(field.settings), **counters, "refused": refused,
-            "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
+    meta = {"version": VERSION, "field": NAME, "settings": asdict(field.settings), **counters,
+            "refused": refused, "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
 
 def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
-    meta = unpack_meta(field.settings, state, NAME, ("harmonics",))
+    meta = unpack_meta(field.settings, state, NAME, ("harmonics",), VERSION)
     field.first = SplatField(field.settings, field.pool)
     field.static = StaticLayer(field.settings, field.pool)
     field.first.load_state(_under("first.", state))

@@ -145,6 +145,25 @@ def test_what_cannot_work_is_refused_in_one_line(tmp_path, capsys, words, messag
     assert message in said and said.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fl_x": 1e307}, "no lens for an image of 32 x 32"),
+        ({"cx": 1e308}, "principal point"),
+        ({"transform_matrix": 1e30}, "from the origin"),
+    ],
+)
+def test_cameras_that_a_field_refuses_are_refused_in_one_line(tmp_path, capsys, values, message):
+    path = write_photos(tmp_path / "set", 3)
+    data = json.loads(path.read_text())
+    if moved := values.pop("transform_matrix", None):
+        data["frames"][2]["transform_matrix"][0][3] = moved
+    path.write_text(json.dumps(data | values))
+    assert fit(tmp_path / "set", tmp_path / "out", "--seconds", "0.1") == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+
+
 def test_marks_end_with_the_whole_and_leave_a_long_last_slice():
     assert marks_s(60.0) == [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0]
     assert marks_s(0.5) == [0.5]

@@ -98,6 +98,7 @@ def test_files_are_written_as_a_live_run_has_them(tmp_path: Path, capsys):
         (["--compute", "x"], "--compute x"),
         (["--policy", "hope"], "hope"),
         (["--policy", "threshold:soon"], "soon"),
+        (["--policy", "wait:1e308"], "omega_ms: expected 0 to 3600000, got 1e+308"),
         (["--seconds", "0"], "--seconds"),
         (["--compute=-1:0"], "--compute"),
     ],
@@ -118,6 +119,13 @@ def test_the_scenario_says_zero_or_milliseconds():
     for wrong in ("free", {"ms_per_step": -1.0}, {"ms_per_update": float("nan")}, {"seconds": 1}):
         with pytest.raises(ScenarioError, match="compute"):
             config(wrong)
+
+
+@pytest.mark.parametrize("name", ["grace_ms", "update_ms", "deadline_ms"])
+@pytest.mark.parametrize("value", [-1.0, 1e308])
+def test_a_time_that_nobody_waits_is_refused(name: str, value: float):
+    with pytest.raises(ScenarioError, match=f"x.yaml: edge: {name}: expected .* to 3600000, got"):
+        read_config(parse({"cameras": {"count": 2}, "edge": {name: value}}, Path("x.yaml")))
 
 
 def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):

@@ -31,6 +31,8 @@ def _posed(rotation: np.ndarray, position_m: float = 1.0) -> View:
         (_posed(np.eye(3), 1e300), "more than 1e.09 m from the origin"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=5e-324)), "no lens for an image of 16 x 16"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fy=1e30)), "no lens"),
+        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cx=1e308)), "principal point .* far outside"),
+        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cy=-16.1)), "principal point .* far outside"),
     ],
 )
 def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> None:
@@ -42,6 +44,7 @@ def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
     check_view(_posed(np.eye(3), 6e6))
     check_view(_posed(np.eye(3), FARTHEST_M))
     check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=1e4, fy=1e4)))
+    check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, cx=-16.0, cy=32.0)))
 
 
 def test_pixels_move_where_they_change_beyond_the_noise_and_two_around() -> None:

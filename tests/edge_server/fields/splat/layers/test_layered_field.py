@@ -223,7 +223,10 @@ def test_a_refused_state_changes_nothing() -> None:
     for wrong in (
         SplatField(SMALL).state(),
         {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
-    ):
+        {k: v * np.nan if k == "moving.share" else v for k, v in _moving().state().items()},
+        {k: np.array(str(v).replace('"version": 3', '"version": 1')) if k == "meta" else v
+         for k, v in _moving().state().items()},
+    ):  # fmt: skip
         with pytest.raises(ValueError):
             field.load_state(wrong)
     after = field.state()
