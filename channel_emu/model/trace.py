@@ -27,6 +27,7 @@ from channel_emu.model.nanoseconds import NEVER_NS
 
 VERSION = 2
 _INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
+_KINDS = {"camera": str, "session": str, "sequence": int, "number": int, "state": int}
 
 
 class TraceError(ValueError):
@@ -119,7 +120,7 @@ def read(path: Path) -> Trace:
             raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
         config = channel_from_mapping(head["channel"], f"{path}: channel")
         seed = int(head["seed"])
-    except (json.JSONDecodeError, KeyError, TypeError):
+    except (json.JSONDecodeError, KeyError, TypeError, OverflowError, RecursionError):
         raise TraceError(f"{path}: not a freshfield trace: the first line has no trace header") from None
     records = []
     for number, line in enumerate(lines[1:-1], start=2):
@@ -127,7 +128,9 @@ def read(path: Path) -> Trace:
             values = json.loads(line)
             values["flips"] = tuple((float(place), int(mask)) for place, mask in values["flips"])
             record = Record(**values)
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+            if any(type(values[key]) is not kind for key, kind in _KINDS.items()):
+                raise TypeError
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
             raise TraceError(f"{path}: line {number} is not a trace record") from None
         for key in _INSTANTS:
             instant = getattr(record, key)
