@@ -8,6 +8,7 @@ import signal
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any
 
 import cv2
 
@@ -45,7 +46,8 @@ def init_worker(threads: int) -> None:
 
 def end_at_once(pool: ProcessPoolExecutor) -> None:
     """Shut a pool down without waiting for what its processes are doing."""
-    processes, manager = list((pool._processes or {}).values()), pool._executor_manager_thread
+    processes = list((pool._processes or {}).values())
+    manager: Any = pool._executor_manager_thread  # a thread, of which typeshed has another opinion
     # First: a pool that finds its processes dead fails its futures, and one that was cancelled then raises.
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
