@@ -14,6 +14,7 @@ from camera_node.robot import arm_cli
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration import command as calibrate
 from freshfield import transport
+from freshfield.files import out_folder
 from freshfield.scenario import Scenario, ScenarioError, load
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     run.set_defaults(run=_run)
     _add_cameras(run)
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="channel emulator or edge server")
-    run.add_argument("--out", type=Path, metavar="DIR", help="folder for the ledger and the status file")
+    run.add_argument("--out", type=out_folder, metavar="DIR", help="for the ledger and the status file")
     run.add_argument("--seconds", type=float, metavar="S", help="stop after S seconds of capture")
     run.add_argument(
         "--cache-mb", type=float, default=DEFAULT_CACHE_MB, metavar="MB",
@@ -173,11 +174,6 @@ def _run(args: argparse.Namespace) -> int:
         response_timeout_s=args.response_timeout,
     )
     scenario, cameras = _open(args, args.cache_mb)
-    if args.out is not None:
-        try:
-            args.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"--out: {args.out}: {error.strerror}") from None
 
     async def live() -> None:
         node = Node(scenario, cameras, options)

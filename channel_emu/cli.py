@@ -17,7 +17,7 @@ from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
 from freshfield import scenario, transport
-from freshfield.files import format_table
+from freshfield.files import format_table, out_file, out_folder
 
 if TYPE_CHECKING:
     from channel_emu.live.proxy import Hook, Report
@@ -79,7 +79,8 @@ def _add_run(commands: Any) -> None:
     )  # fmt: skip
     sub.add_argument("scenario", help="a scenario file, or the name of a shipped one")
     sub.add_argument("--to", default="127.0.0.1:7000", metavar="HOST:PORT", help="the edge (%(default)s)")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="for channel.json and the ledger")
+    sub.add_argument("--out", type=out_folder, required=True, metavar="DIR",
+                     help="for channel.json and the ledger")  # fmt: skip
     sub.add_argument("--seed", type=int, help="instead of the scenario's")
     _add_live_options(sub, "frame")
     sub.set_defaults(go=_run)
@@ -99,7 +100,7 @@ def _run(args: argparse.Namespace) -> int:
 def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
     """The options of both live commands, as ``_serve`` reads them. what: passes the link."""
     sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
-    sub.add_argument("--trace", type=Path, metavar="FILE", help=f"record what happens to every {what}")
+    sub.add_argument("--trace", type=out_file, metavar="FILE", help=f"record what happens to every {what}")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
     sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
     transport.add_arguments(sub)
@@ -152,9 +153,9 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument("--metric", action="append", default=[], metavar="NAME[:VALUE...]", help="further ages: "
                      + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items())
                      )  # fmt: skip
-    sub.add_argument("--csv", type=Path, metavar="FILE", help="a row a frame: when it was offered and "
+    sub.add_argument("--csv", type=out_file, metavar="FILE", help="a row a frame: when it was offered and "
                      "delivered, as fit reads them")  # fmt: skip
-    sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: ages over time, delays")
+    sub.add_argument("--plot", type=out_file, metavar="FILE", help="picture: ages over time, delays")
     sub.add_argument("--json", action="store_true", help="everything, as one JSON object")
     sub.set_defaults(go=_simulate)
 
@@ -331,8 +332,9 @@ def _add_fit(commands: Any) -> None:
                      "(%(default)s), or one for each")  # fmt: skip
     sub.add_argument("--discipline", choices=FITTED_DISCIPLINES, help="what the link of the rows does with a "
                      "frame while it is busy (default: drop-new)")  # fmt: skip
-    sub.add_argument("--out", type=Path, metavar="FILE.yaml", help="write a scenario with the fitted channel")
-    sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: delays over time and the state")
+    sub.add_argument("--out", type=out_file, metavar="FILE.yaml",
+                     help="write a scenario with the fitted channel")  # fmt: skip
+    sub.add_argument("--plot", type=out_file, metavar="FILE", help="picture: delays over time and the state")
     sub.add_argument("--json", action="store_true")
     sub.set_defaults(go=_fit)
 
@@ -403,7 +405,8 @@ def _add_accuracy(commands: Any) -> None:
     )  # fmt: skip
     sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="the first one (default: %(default)s)")
-    sub.add_argument("--out", type=Path, metavar="DIR", help="write the tables as CSV and a figure there")
+    sub.add_argument("--out", type=out_folder, metavar="DIR",
+                     help="write the tables as CSV and a figure there")  # fmt: skip
     sub.add_argument("--json", action="store_true")
     sub.set_defaults(go=_accuracy)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freshfield import transport
+from freshfield.files import out_file, out_folder
 from freshfield.scenario import ScenarioError, load
 from freshfield.session import SessionError
 from freshfield.transport import TransportError
@@ -143,7 +144,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--page-port", type=int, metavar="PORT", help="serve the live page on this port")
     run.add_argument("--page-host", default="127.0.0.1", metavar="HOST", help="page's address [%(default)s]")
     run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port")
-    run.add_argument("--out", type=Path, default=Path("runs/edge"), metavar="DIR", help="[%(default)s]")
+    run.add_argument("--out", type=out_folder, default="runs/edge", metavar="DIR", help="[%(default)s]")
     run.add_argument("--emulator-out", type=Path, metavar="DIR",
         help="the emulator's --out, whose channel state the page shows [that of this server]")  # fmt: skip
     run.add_argument("--seed", type=int, help="instead of the scenario's")
@@ -163,8 +164,8 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
     run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
     run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz this often")
-    run.add_argument("--record", type=Path, metavar="FILE", help="write the session as MCAP, to look at or "
-                     "replay (source kind mcap)")  # fmt: skip
+    run.add_argument("--record", type=out_file, metavar="FILE", help="write the session as MCAP, to look at "
+                     "or replay (source kind mcap)")  # fmt: skip
     run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
     transport.add_arguments(run)
     run.set_defaults(run=_run)
@@ -261,6 +262,11 @@ def _report(args: argparse.Namespace) -> int:
 
     if not args.directory.is_dir():
         raise ScenarioError(f"{args.directory}: no such folder")
+    left = ("ledger-*.tsv", "series.jsonl", "edge.json", "run.json")
+    if not any(path for pattern in left for path in args.directory.glob(pattern)):
+        raise ScenarioError(
+            f"{args.directory}: holds none of {', '.join(left)}: name the folder of a run or fit (its --out)"
+        )
     build_report(args.directory)
     print(args.directory / "report.html")
     return 0

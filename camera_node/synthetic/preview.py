@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 
 import cv2
 import numpy as np
 import yaml
 
 from camera_node.synthetic.render import Image
-from camera_node.synthetic.scene import SCENES, Scene, make_scene
+from camera_node.synthetic.scene import SCENES, Scene, SceneError, make_scene
+from freshfield.files import out_file, write_bytes
 
 
 def contact_sheet(scene: Scene, t_s: float) -> Image:
@@ -27,6 +29,7 @@ def contact_sheet(scene: Scene, t_s: float) -> Image:
     for k, name in enumerate(names):
         y, x = gap + (k // columns) * (height + gap), gap + (k % columns) * (width + gap)
         image = scene.render(name, t_s)
+        print(f"  {name}: {k + 1} of {len(names)} pictures", file=sys.stderr, flush=True)
         scale = width / 400
         for color, thick in ((0, 3), (255, 1)):
             at = (int(6 * scale) + 2, int(14 * scale) + 6)
@@ -36,20 +39,29 @@ def contact_sheet(scene: Scene, t_s: float) -> Image:
     return sheet
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
     parser = argparse.ArgumentParser(description="tile all cameras of a scene at an instant into a PNG")
     parser.add_argument("scene", choices=SCENES)
-    parser.add_argument("--out", required=True, help="PNG file to write")
+    parser.add_argument("--out", type=out_file, required=True, help="PNG file to write")
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="instant in seconds")
     parser.add_argument("--size", type=int, default=256, metavar="PX", help="side of each picture")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scene parameter")
     args = parser.parse_args(arguments)
     params = {k: yaml.safe_load(v) for k, _, v in (s.partition("=") for s in args.set)}
-    scene = make_scene(args.scene, {"count": 19, "width": args.size, "height": args.size, **params})
-    sheet = contact_sheet(scene, args.at)
-    if not cv2.imwrite(args.out, cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
-        raise SystemExit(f"cannot write {args.out}")
+    try:
+        scene = make_scene(args.scene, {"count": 19, "width": args.size, "height": args.size, **params})
+        sheet = contact_sheet(scene, args.at)
+    except SceneError as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        print("\nstopped; nothing was written", file=sys.stderr)
+        return 130
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(args.out, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+    print(args.out)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,7 +12,7 @@ from typing import Any
 
 from edge_server.export import ExportError, file_names
 from edge_server.surface import SurfaceError
-from freshfield.files import write_json
+from freshfield.files import out_file, out_folder, write_json
 
 DESCRIPTION = """\
 Write what a run or a fit has made as files for other programs. RUN is its folder, or a checkpoint in it.
@@ -35,8 +35,8 @@ from depth as the cameras see it, fused on a grid; what no camera saw stays open
 """
 
 
-# (mesh, scenario, views) -> (distances to the true surface or None, a sentence to print).
-Comparison = Callable[[Any, str, Any], tuple[dict[str, Any] | None, str]]
+# scenario -> (mesh, views) -> (distances to the true surface or None, a sentence to print).
+Comparison = Callable[[str], Callable[[Any, Any], tuple[dict[str, Any] | None, str]]]
 
 
 def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
@@ -60,13 +60,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("edge-server export", description=DESCRIPTION, formatter_class=raw)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run or fit, or a checkpoint")
-    add("--mesh", type=Path, metavar="FILE", help=".ply or .glb")
-    add("--splats", type=Path, metavar="FILE", help=".ply")
-    add("--points", type=Path, metavar="FILE", help=".ply")
-    add("--colmap", type=Path, metavar="DIR")
+    add("--mesh", type=out_file, metavar="FILE", help=".ply or .glb")
+    add("--splats", type=out_file, metavar="FILE", help=".ply")
+    add("--points", type=out_file, metavar="FILE", help=".ply")
+    add("--colmap", type=out_folder, metavar="DIR")
     add("--binary", action="store_true", help="of --colmap: binary instead of text")
-    add("--transforms", type=Path, metavar="DIR")
-    add("--trajectory", type=Path, metavar="FILE")
+    add("--transforms", type=out_folder, metavar="DIR")
+    add("--trajectory", type=out_file, metavar="FILE")
     add("--count", type=int, default=20000, metavar="N", help="points of --points and others [%(default)s]")
     mesh = parser.add_argument_group("of --mesh").add_argument
     mesh("--voxel", type=float, metavar="MM", help="[what a pixel spans at the surface]")
@@ -81,7 +81,8 @@ def _parser() -> argparse.ArgumentParser:
     mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
     mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
          "far the mesh is from the true surface")  # fmt: skip
-    mesh("--json", type=Path, metavar="FILE", help="size, seconds of each stage and, of --measure, distances")
+    mesh("--json", type=out_file, metavar="FILE",
+         help="size, seconds of each stage and, of --measure, distances")  # fmt: skip
     return parser
 
 
@@ -139,9 +140,15 @@ class Export:
             raise ExportError("--binary is for --colmap DIR")
         if args.mesh is None and (args.measure is not None or args.json is not None):
             raise ExportError("--measure and --json are for --mesh FILE")
-        if args.measure is not None and self._compare is None:
-            raise ExportError("--measure: run it as edge-server export")
+        if args.measure is not None:
+            if self._compare is None:
+                raise ExportError("--measure: run it as edge-server export")
+            self._measure = self._compare(args.measure)
         self._settings()
+        if args.mesh is not None:
+            from edge_server.surface.mesh import import_marching_cubes
+
+            import_marching_cubes()
 
     def _settings(self):
         from edge_server.surface.reconstruct import MeshSettings
@@ -171,8 +178,8 @@ class Export:
         closed = ", watertight" if mesh.watertight else ""
         print(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}", flush=True)
         found = None
-        if self.args.measure is not None and self._compare is not None:
-            found, words = self._compare(mesh, self.args.measure, self.source.views)
+        if self.args.measure is not None:
+            found, words = self._measure(mesh, self.source.views)
             print(f"  {words}", flush=True)
         if self.args.json is None:
             return

@@ -11,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, Network, open_lpips
+from freshfield.files import out_folder
 
 DESCRIPTION = f"""\
 Fetch the weights of LPIPS with its authors' package and convert them to a weights folder of ours.
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server fetch-lpips", description=DESCRIPTION, formatter_class=raw)
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="weights folder to write")
+    parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--network", choices=get_args(Network), action="append", help="[both]")
     args = parser.parse_args(argv)
     try:

@@ -6,7 +6,6 @@ For development and a bench in one's own network: keys have no password, certifi
 from __future__ import annotations
 
 import argparse
-import errno
 import ipaddress
 import os
 import re
@@ -16,6 +15,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from freshfield.files import out_folder
 from freshfield.scenario import load
 from freshfield.transport import TransportError
 
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "edge's holds tokens.txt as well, with which people log in to the page.",
     )  # fmt: skip
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder to write")
+    parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="new folder to write")
     for process in ("edge", "emulator"):
         parser.add_argument(
             f"--{process}", action="append", default=[], metavar="HOST",
@@ -55,7 +55,7 @@ def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: 
     hosts = {"edge": edge, "emulator": emulator}
     alternatives = {p: [_alternative(host) for host in (*hosts.get(p, ()), *_HERE)] for p in names}
     if out.exists():
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(out))
+        raise FileExistsError(f"--out {out}: exists already: name a new folder")
     before = os.umask(0o077)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

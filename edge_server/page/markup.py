@@ -37,7 +37,7 @@ _CARD = "background:rgba(128,140,160,.10);border-radius:6px"
 
 INTRO = (
     f'<div style="padding:.5em .9em 0;font-size:.82em;line-height:1.45">'
-    "Cameras send frames over a bad network. A neural field learns the scene from whatever has arrived, "
+    "Cameras send frames over a bad network. A radiance field learns the scene from whatever has arrived, "
     f'so what you see is always a little <b>old</b>. <span style="{_DIM}">Drag to turn, scroll to '
     "approach, right-drag to shift. Click a camera to look through it.</span></div>"
 )
@@ -98,7 +98,8 @@ def _age_parts(parts_ms: Mapping[str, float]) -> str:
     for k, (name, ms) in enumerate(parts_ms.items()):
         color = css(scale_color(k / max(len(parts_ms) - 1, 1)))
         pieces.append(f'<div style="width:{100 * ms / total_ms:.1f}%;background:{color}"></div>')
-        words.append(f'<span style="color:{color}">&#9632;</span> {escape(name)} {number(ms)}')
+        swatch = f'<span style="color:{color}">&#9632;</span>'
+        words.append(f'<span style="white-space:nowrap">{swatch} {escape(name)} {number(ms)}</span>')
     return (
         '<div style="padding:0 .9em .5em;font-size:.75em">'
         f'<span style="{_DIM}">age of what is shown, {number(total_ms)} ms</span>'
@@ -157,7 +158,7 @@ def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
     big = "font-size:1.15em;font-weight:600;font-variant-numeric:tabular-nums"
     return (
         f'<div style="{_CARD};{edge}padding:.3em .55em;white-space:nowrap;overflow:hidden">'
-        f'<div style="{_DIM};font-size:.7em">{name}</div>'
+        f'<div style="{_DIM};font-size:.7em;white-space:normal">{name}</div>'
         f'<div><span style="{big}">{value}</span>'
         f'<span style="{_DIM};font-size:.7em"> {unit}</span></div></div>'
     )
@@ -227,7 +228,7 @@ def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out
 def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
     """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
     names = " ".join(
-        f'<span style="color:{css(color)};margin-left:.6em">&#9473; {escape(name)}</span>'
+        f'<span style="color:{css(color)};margin-left:.6em;white-space:nowrap">&#9473; {escape(name)}</span>'
         for name, color in lines
     )
     right = f'<span style="{_DIM}">{escape(remark)}</span>' if remark else names

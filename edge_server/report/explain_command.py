@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge_server.report.style import BLUE, GREY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
-from freshfield.files import write_json
+from freshfield.files import out_file, write_json
 
 DESCRIPTION = """\
 What moved a decision of a learned policy (bandit:FILE): part of the state, camera, region of an image.
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--decision", type=int, metavar="N", help="that of update N [the newest kept]")
     parser.add_argument("--camera", metavar="NAME", help="whose picture [the one with the largest share]")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--json", type=out_file, metavar="FILE", help="write the figures there, too")
     args = parser.parse_args(argv)
     try:
         found = read_decision(args.run, args.decision)

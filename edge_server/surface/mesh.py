@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +61,7 @@ def extract_mesh(
     watertight: treat space in the box that no camera looked through as solid; this closes the surface.
     on_slab: called with the completed share. SurfaceError: scikit-image is missing, or there is no surface.
     """
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError:
-        raise SurfaceError(INSTALL) from None
+    marching_cubes = import_marching_cubes()
     dense = _Dense(volume, min_weight, watertight)
     vertices: list[NDArray[np.float64]] = []
     faces: list[NDArray[np.int64]] = []
@@ -91,6 +89,15 @@ def extract_mesh(
     metres = dense.metres(index)
     mesh = Mesh(metres.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
     return remove_degenerate(mesh)
+
+
+def import_marching_cubes() -> Callable[..., Any]:
+    """scikit-image's marching cubes. SurfaceError where it is not installed."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise SurfaceError(INSTALL) from None
+    return marching_cubes
 
 
 def _merge_seams(

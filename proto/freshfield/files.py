@@ -6,6 +6,7 @@ adds them up can say that something is missing.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import csv
 import io
@@ -57,6 +58,29 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer = csv.DictWriter(file, names, restval="")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def out_folder(text: str) -> Path:
+    """An argument type: a folder that a command writes into; it need not be there yet."""
+    return _to_write(text, is_folder=True)
+
+
+def out_file(text: str) -> Path:
+    """An argument type: a file that a command writes; it need not be there yet, nor its folder."""
+    return _to_write(text, is_folder=False)
+
+
+def _to_write(text: str, is_folder: bool) -> Path:
+    path = Path(text)
+    there = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
+    if there == path and not is_folder:
+        if path.is_dir():
+            raise argparse.ArgumentTypeError(f"{path} is a folder, not a file: name another")
+    elif not there.is_dir():
+        raise argparse.ArgumentTypeError(f"{there} is a file, not a folder: name another")
+    elif not os.access(there, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"{there} cannot be written to: name another place")
+    return path
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import os
@@ -11,7 +12,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from freshfield.files import Lines, write_json
+from freshfield.files import Lines, out_file, out_folder, write_json
 
 
 @contextmanager
@@ -50,6 +51,38 @@ def test_json_is_replaced_whole_by_any_number_of_threads(tmp_path):
     done.set()
     reader.join()
     assert problems == [] and os.listdir(tmp_path) == ["status.json"]
+
+
+@pytest.mark.parametrize(
+    ("option", "place", "said"),
+    [
+        (out_folder, "file", "file is a file, not a folder: name another"),
+        (out_folder, "file/x", "file is a file, not a folder: name another"),
+        (out_folder, "link", "link is a file, not a folder: name another"),
+        (out_file, "folder", "folder is a folder, not a file: name another"),
+        (out_file, "file/x", "file is a file, not a folder: name another"),
+        (out_folder, "folder/new/x", "folder cannot be written to: name another place"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_refused_with_its_option(
+    tmp_path, capsys, monkeypatch, option, place, said
+):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
+    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=option)
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["--out", str(tmp_path / place)])
+    assert f"argument --out: {tmp_path}/{said}" in capsys.readouterr().err
+
+
+def test_places_that_are_there_or_not_yet_can_be_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    for option, places in ((out_folder, (".", "new/new")), (out_file, ("file", "new/new"))):
+        assert [str(option(place)) for place in places] == list(places)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path):

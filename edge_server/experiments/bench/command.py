@@ -18,7 +18,7 @@ from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
-from freshfield.files import write_json, write_text
+from freshfield.files import out_file, write_json, write_text
 
 DESCRIPTION = """\
 Measure this machine. Figures are medians; outside_cores says how many cores others kept busy meanwhile.
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("bench", DESCRIPTION)
     add = parser.add_argument
     add("part", nargs="*", metavar="PART", help=f"{', '.join((*PARTS, *MORE))}, all [all]")
-    add("--json", type=Path, metavar="FILE", help="write figures there; plots and tables beside")
+    add("--json", type=out_file, metavar="FILE", help="write figures there; plots and tables beside")
     add("--resume", action="store_true", help="keep what FILE holds already, measure the rest")
     add(
         "--field",

@@ -7,10 +7,28 @@ import os
 import signal
 import threading
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any
 
 import cv2
 
 from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
+
+
+class _Process(SpawnProcess):
+    def start(self) -> None:
+        """Start with Ctrl-C blocked, which the new process inherits: else it ends one that still imports."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class WorkerContext(SpawnContext):
+    """Of processes that ``init_worker`` initializes: fresh ones, to which Ctrl-C never comes."""
+
+    Process = _Process
 
 
 def init_worker(threads: int) -> None:
@@ -28,9 +46,14 @@ def init_worker(threads: int) -> None:
 
 def end_at_once(pool: ProcessPoolExecutor) -> None:
     """Shut a pool down without waiting for what its processes are doing."""
-    for process in list((pool._processes or {}).values()):
-        process.terminate()
+    processes = list((pool._processes or {}).values())
+    manager: Any = pool._executor_manager_thread  # a thread, of which typeshed has another opinion
+    # First: a pool that finds its processes dead fails its futures, and one that was cancelled then raises.
     pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+    if manager is not None:
+        manager.join()  # a second shutdown, as at the end of a with, would take the cancelling back
 
 
 def _end_with_parent() -> None:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
+from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.common.arguments import OptionError, command_parser, parse_options
+from edge_server.experiments.common.arguments import OptionError, at_least, command_parser, parse_options
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
@@ -27,7 +28,7 @@ from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.live.scoring_thread import to_bytes
-from freshfield.files import write_json
+from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -65,12 +66,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--list-options", action="store_true", help="say what the field's options mean")
     add("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
     add(
-        "--holdout", default="8", metavar="K|NAME,...",
-        help="every K-th view, or these images or cameras; split: what the data set keeps for testing; "
-        "0: none [%(default)s]",
+        "--holdout", metavar="K|NAME,...",
+        help="of a data set: every K-th view, or these images or cameras; split: what it keeps for testing; "
+        "0: none [8]",
     )  # fmt: skip
     add("--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]")
-    add("--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]")
+    add("--frame", type=at_least(0), default=0, metavar="N", help="instant of a moving set [%(default)s]")
     add(
         "--background", choices=sorted(BACKGROUNDS), default="white",
         help="what transparent images are laid on [%(default)s]",
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="setting of the field, e.g. levels=12; again for more",
     )  # fmt: skip
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
+    add("--out", type=out_folder, metavar="DIR", help="[runs/fit-NAME]")
     add("--resume", action="store_true", help="go on from OUT until --seconds in all")
     args = parser.parse_args(argv)
     if args.list_options:
@@ -112,6 +113,8 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
 
     if not 0.0 < request.seconds <= 1e6:
         raise OptionError(f"--seconds {request.seconds:g}: expected more than 0")
+    if not request.scale >= 1.0:
+        raise OptionError(f"--scale {request.scale:g}: expected 1 or more (2 halves the images)")
     options = parse_options(request.option)
     data = _open(request)
     if any(v.image.shape[2] == 4 for v in data.training):
@@ -147,7 +150,11 @@ def _data_name(data: Path) -> str:
 
 def _open(request: argparse.Namespace) -> Recorded:
     if not _is_scene(request.data):
-        return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
+        holdout = "8" if request.holdout is None else request.holdout
+        return load_recorded(request.data, holdout, request.scale, request.frame, request.format)
+    for name in ("format", "holdout"):
+        if getattr(request, name) is not None:
+            raise OptionError(f"--{name} is for data sets; the scene {request.data} holds out {HELD_OUT}")
     t_s = request.frame / WORLD_FPS
     still = synthetic_still(str(request.data), size=max(8, round(_SCENE_SIZE / request.scale)), t_s=t_s)
     return Recorded(request.data, still.training, still.held_out, f"at {t_s:g} s")

@@ -28,7 +28,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
-from freshfield.files import write_json
+from freshfield.files import out_file, out_folder, write_json
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = """\
@@ -142,8 +142,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=int, metavar="N", help="repetitions [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="the first one [%(default)s]")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--points", type=Path, metavar="FILE", help="figure 2 there, too: what deadline_ms chooses from")
-    add("--out", type=Path, default=Path("runs/frontier"), metavar="DIR", help="[%(default)s]")
+    add("--points", type=out_file, metavar="FILE", help="figure 2 there, too: what deadline_ms chooses from")
+    add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="[%(default)s]")
     return parser
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from camera_node.config import WorldConfig, source_config
+from camera_node.synthetic.scene import Scene
 from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
@@ -18,11 +20,16 @@ from freshfield.scenario import load
 SPACING_M = 0.5 * WITHIN_M
 
 
-def compare_with_scene(mesh: Mesh, scenario: str, views: Sequence[View]) -> tuple[dict[str, Any] | None, str]:
-    """What ``edge-server export --measure`` does: ``distances``, and one line for people."""
-    found = distances(mesh, scenario, views)
-    if found is None:
+def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[dict[str, Any] | None, str]]:
+    """What ``edge-server export --measure`` does with a mesh: ``distances``, and one line for people. Raises
+    ScenarioError at once, before there is a mesh."""
+    return partial(_compare, still_scene(scenario))
+
+
+def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> tuple[dict[str, Any] | None, str]:
+    if scene is None:
         return None, "not measured: the true surface is known of synthetic scenes that stand still"
+    found = distances(mesh, scene, views)
     return found, (
         f"chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
         f"{100 * found['complete']:.1f} % of the surface within {found['within_mm']:g} mm "
@@ -30,19 +37,20 @@ def compare_with_scene(mesh: Mesh, scenario: str, views: Sequence[View]) -> tupl
     )
 
 
-def distances(mesh: Mesh, scenario: str, views: Sequence[View]) -> dict[str, Any] | None:
-    """``surface.metrics.Comparison`` of a mesh with what cameras see of a scenario's scene, and the targets.
-
-    None where nobody knows the surface: recorded data, real cameras, a scene that moves. Raises
-    ScenarioError, and SurfaceError where one of the two is empty.
-    """
+def still_scene(scenario: str) -> Scene | None:
+    """A scenario's scene; None where nobody knows the surface: recorded data, real cameras, a scene that
+    moves. Raises ScenarioError."""
     loaded = load(scenario)
     source = source_config(loaded)
     if not isinstance(source, WorldConfig):
         return None
     scene, _ = exact_scene(loaded, source)
-    if scene.moving:
-        return None
+    return None if scene.moving else scene
+
+
+def distances(mesh: Mesh, scene: Scene, views: Sequence[View]) -> dict[str, Any]:
+    """``surface.metrics.Comparison`` of a mesh with what cameras see of a scene, and the targets. Raises
+    SurfaceError where one of the two is empty."""
     found = compare(mesh, surface_truth(Scan(scene, tuple(views)), SPACING_M))
     return {
         **dataclasses.asdict(found),

@@ -6,7 +6,6 @@ import argparse
 import importlib
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
@@ -23,6 +22,7 @@ from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fields.registry import field_names
 from edge_server.viewpoints.candidates import ViewpointError
+from freshfield.files import out_folder
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
@@ -188,5 +188,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--field", choices=field_names(), default="splat",
         help="representation, where the study names none [%(default)s]")  # fmt: skip
     add_folders(parser)
-    add("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="[%(default)s]")
+    add("--out", type=out_folder, default="runs/study", metavar="DIR", help="[%(default)s]")
     return parser

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import ResultStore, processor
 from edge_server.experiments.common.result_store import content_key as key_of
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.common.worker import WorkerContext, end_at_once, init_worker
 from edge_server.experiments.studies.trial import Row, Trial, run_trial
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
@@ -103,7 +102,7 @@ class Engine:
     ) -> Iterator[tuple[list[str], list[Row]]]:
         # Fresh processes: forking one that has threads of kernels in it would hang.
         jobs = min(self.jobs, len(tasks))
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"), init_worker, (max(1, usable_cores() // jobs),))
+        pool = ProcessPoolExecutor(jobs, WorkerContext(), init_worker, (max(1, usable_cores() // jobs),))
         try:
             running: dict[Future[list[Row]], list[str]] = {
                 pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import (
@@ -27,7 +26,7 @@ from edge_server.viewpoints.policy import CandidatePolicy
 from edge_server.viewpoints.preference_session import PERSON
 from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
-from freshfield.files import write_json
+from freshfield.files import out_folder, write_json
 from freshfield.scenario import ScenarioError
 from freshfield.transport import TransportError
 
@@ -152,5 +151,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--page-host", default="127.0.0.1", metavar="HOST", help="of --ask's page [%(default)s]")
     transport.add_arguments(parser)
     add_folders(parser)
-    add("--out", type=Path, default=Path("runs/viewpoints"), metavar="DIR", help="[%(default)s]")
+    add("--out", type=out_folder, default="runs/viewpoints", metavar="DIR", help="[%(default)s]")
     return parser

@@ -6,7 +6,6 @@ import argparse
 import hashlib
 import json
 import logging
-import multiprocessing
 import tempfile
 import time
 import traceback
@@ -22,7 +21,7 @@ from camera_node.capture import Camera
 from edge_server.experiments.common.arguments import at_least, command_parser
 from edge_server.experiments.common.result_store import ResultStore, content_key, processor
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.common.worker import WorkerContext, end_at_once, init_worker
 from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
 from edge_server.experiments.virtual.fault_plan import (
     FAULTS_OVER_S,
@@ -36,6 +35,7 @@ from edge_server.experiments.virtual.from_scenario import training_cameras
 from edge_server.experiments.virtual.simulate import digest
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.report.frame_accounting import FrameCounts, account_frames
+from freshfield.files import out_file
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario
@@ -209,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--seeds", type=_seeds, required=True, metavar="A..B", help="from A to B, or A alone")
     add("--faults", type=_numbers, metavar="K,...", help="only these of the seeds' faults")
     add("--jobs", type=at_least(1), default=1, metavar="N", help="processes [%(default)s]")
-    add("--out", type=Path, metavar="FILE", help="keep results in this file; known ones are not run again")
+    add("--out", type=out_file, metavar="FILE", help="keep results there; known ones are not run again")
     args = parser.parse_args(argv)
     began, failed, slowest = time.monotonic(), 0, 0.0
     store = ResultStore.in_lines(args.out) if args.out else ResultStore()
@@ -232,9 +232,9 @@ def _results(args: argparse.Namespace, store: ResultStore) -> Iterator[dict[str,
     keys = {seed: content_key([source_digest(), seed, args.faults]) for seed in args.seeds}
     wanted = [seed for seed in args.seeds if store.find(keys[seed]) is None]
     jobs = min(args.jobs, len(wanted))
-    spawn = multiprocessing.get_context("spawn")
     share = (max(1, usable_cores() // max(1, jobs)),)
-    with ProcessPoolExecutor(jobs, spawn, init_worker, share) if jobs > 1 else nullcontext() as pool:
+    context = WorkerContext()
+    with ProcessPoolExecutor(jobs, context, init_worker, share) if jobs > 1 else nullcontext() as pool:
         try:
             each = map if pool is None else pool.map
             computed = each(run_seed, wanted, [args.faults] * len(wanted))

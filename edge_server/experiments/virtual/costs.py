@@ -26,7 +26,7 @@ from edge_server.experiments.virtual.virtual_deployment import RunSettings
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
-from freshfield.files import write_json
+from freshfield.files import out_file, write_json
 from freshfield.frame import BufferedFrame
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S",
         help="of virtual time, three times [%(default)g]")  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON to write")
+    parser.add_argument("--out", type=out_file, required=True, metavar="FILE", help="JSON to write")
     add_folders(parser)
     args = parser.parse_args(argv)
     try:

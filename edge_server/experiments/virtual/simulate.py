@@ -27,7 +27,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
 from edge_server.scheduler import parse_policy, short_name
-from freshfield.files import write_json, write_text
+from freshfield.files import out_folder, write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
@@ -234,7 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--epoch-ms", type=float, metavar="MS",
         help=f"between decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
     add_folders(parser)
-    add("--out", type=Path, metavar="DIR",
+    add("--out", type=out_folder, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
     add("--json", action="store_true", help="everything, as one JSON object")
     return parser

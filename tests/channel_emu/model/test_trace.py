@@ -105,7 +105,7 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
         (1, '"bytes":1001', '"bytes":null', "line 2: bytes: expected a message's size, got None"),
         (0, '"seed":', '"seed":1e999, "of":', "no trace header"),
         (0, "{", "[" * 100_000, "no trace header"),
-        (1, '"number":0', '"number":"x"', "line 2 is not a trace record"),
+        (1, '"number":', '"number":1.', "line 2 is not a trace record"),
         (1, '"camera":"', '"camera":["c"],"session":"', "line 2 is not a trace record"),
         (1, '"flips":[]', '"flips":[[0.5,1e999]]', "line 2 is not a trace record"),
         (1, "{", "[" * 100_000, "line 2 is not a trace record"),

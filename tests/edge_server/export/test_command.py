@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tracemalloc
 import zipfile
 
@@ -82,7 +83,7 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
 
 def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    from edge_server.experiments.scenes.mesh_truth import distances
+    from edge_server.experiments.scenes.mesh_truth import distances, still_scene
     from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
     from edge_server.surface.reconstruct import MeshSettings, mesh_from_depth_maps
@@ -92,7 +93,9 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
         depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for v in near.views
     ]
-    found = distances(mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
+    scene = still_scene("tile")
+    assert scene is not None
+    found = distances(mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.004)), scene, near.views)
     assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
 
 
@@ -166,6 +169,17 @@ def test_what_cannot_be_is_said_in_a_line(run, tmp_path, capsys, monkeypatch, wo
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("--measure", "nope"), "shipped scenarios: "), ((), "pip install 'freshfield[surface]'")],
+)
+def test_what_a_mesh_needs_is_asked_for_before_the_run_is_opened(tmp_path, capsys, monkeypatch, words, said):
+    if not words:
+        monkeypatch.setitem(sys.modules, "skimage.measure", None)  # as where it is not installed
+    assert export(tmp_path / "nowhere", "--mesh", tmp_path / "m.ply", *words) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_no_checkpoint_and_the_wrong_field(tmp_path, capsys):

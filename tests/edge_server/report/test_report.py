@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.cli import main as edge_server
 from edge_server.config import ExportConfig
 from edge_server.report import build_report
 from edge_server.report.html import render_html
@@ -77,6 +78,16 @@ def test_a_field_that_stopped_early_has_no_final_score():
     series = [{"t_s": t, "psnr_db": 20.0} for t in (1.0, 2.0)]
     found = fidelity(series, 60.0, {})
     assert found["final"]["psnr_db"] is None and found["mean"]["psnr_db"] == 20.0
+
+
+@pytest.mark.parametrize("name", ["", "ledger-node-a-1.tsv", "series.jsonl", "edge.json", "run.json"])
+def test_the_command_takes_folders_in_which_a_run_left_something(tmp_path, capsys, name):
+    (tmp_path / "field.npz").touch()
+    if name:
+        (tmp_path / name).touch()
+    assert edge_server(["report", str(tmp_path)]) == (0 if name else 2)
+    assert (tmp_path / "report.html").exists() == bool(name)
+    assert name or f"{tmp_path}: holds none of ledger-*.tsv, series.jsonl," in capsys.readouterr().err
 
 
 def test_ages_are_time_averages_and_none_without_a_report(run):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.common.arguments import at_least, command_parser, run_command
+from freshfield.files import out_folder, write_json
 
 DESCRIPTION = """\
 Train a small detector on variations of our own scenes: the one whose backbone gives the default embeddings,
@@ -66,7 +67,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from edge_server.experiments.training.detector.network import parameters
     from edge_server.experiments.training.detector.training import Settings, train
     from edge_server.report.machine import machine, versions
-    from freshfield.files import write_json
 
     worlds, epochs, held = (20, 2, 4) if args.quick else (args.worlds, args.epochs, HELD_OUT_WORLDS)
     subject, kinds, out = args.of, SUBJECTS[args.of], folder(args)
@@ -173,7 +173,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--of", choices=("scenes", "tile"), default="scenes", help="what it finds: people, carts, balls and "
         "drums of our scenes, or the tile, with its mask [%(default)s]")  # fmt: skip
-    add("--out", type=Path, metavar="DIR", help="[runs/detector, of tile runs/detector-tile]")
+    add("--out", type=out_folder, metavar="DIR", help="[runs/detector, of tile runs/detector-tile]")
     add("--seed", type=int, default=0, help="[%(default)s]")
     add(
         "--worlds", type=at_least(20), default=400, metavar="N",

@@ -18,6 +18,7 @@ from edge_server.embed import MODELS, EmbeddingError
 from edge_server.experiments.common.arguments import command_parser, run_command
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, Layers, Perceptual, save_coefficients
+from freshfield.files import out_folder, write_json
 
 Array = NDArray[np.float64]
 
@@ -77,7 +78,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     )
     from edge_server.experiments.training.detector.network import LAYERS
     from edge_server.experiments.training.detector.renderings import field_renderings
-    from freshfield.files import write_json
 
     lpips, missing = open_lpips(weights_folder(args.lpips), "alex")
     if lpips is None:
@@ -233,7 +233,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--out", type=Path, default=Path("runs/perceptual"), metavar="DIR", help="[%(default)s]")
+    add("--out", type=out_folder, default="runs/perceptual", metavar="DIR", help="[%(default)s]")
     add("--seed", type=int, default=0, help="[%(default)s]")
     add("--quick", action="store_true", help="8 worlds, small pictures: to try it out")
     add("--json", action="store_true", help="print perceptual.json instead of a summary")

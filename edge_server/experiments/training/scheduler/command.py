@@ -43,7 +43,7 @@ from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
 from edge_server.scheduler.learned.rewards import REWARDS
-from freshfield.files import write_csv, write_json
+from freshfield.files import out_folder, write_csv, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -314,5 +314,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
     add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")
     add_folders(parser)
-    add("--out", type=Path, required=True, metavar="DIR", help="where everything is written")
+    add("--out", type=out_folder, required=True, metavar="DIR", help="where everything is written")
     return parser

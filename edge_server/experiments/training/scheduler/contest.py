@@ -32,7 +32,7 @@ from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.report.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
-from freshfield.files import write_json
+from freshfield.files import out_file, write_json
 from freshfield.scenario import ScenarioError, load
 
 LEARNT = "learnt"
@@ -168,7 +168,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--slower", type=float, default=1.0, metavar="K",
         help="an edge on which all computing takes K times as long [%(default)g]")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes [%(default)s]")
-    parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="finished runs: beside it")
+    parser.add_argument("--json", type=out_file, required=True, metavar="FILE",
+        help="finished runs: beside it")  # fmt: skip
     add_folders(parser)
     args = parser.parse_args(argv)
     try:

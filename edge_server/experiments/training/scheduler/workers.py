@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.worker import end_at_once, init_worker
+from edge_server.experiments.common.worker import WorkerContext, end_at_once, init_worker
 from edge_server.experiments.training.scheduler.deployed import Decided, Judged, judge, play
 from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
@@ -199,8 +198,7 @@ class WorkerPool:
             return done
         if not self._pools:
             # Fresh processes: forking one that has threads of kernels in it would hang.
-            context = get_context("spawn")
-            self._pools = [ProcessPoolExecutor(1, context, _init_process) for _ in range(self.jobs)]
+            self._pools = [ProcessPoolExecutor(1, WorkerContext(), _init_process) for _ in range(self.jobs)]
         return self._pools[seed % self.jobs].submit(work, setting, self.folders, what)
 
     def _key(self, setting: Setting, request: Request) -> str:
