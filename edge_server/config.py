@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from edge_server.scheduler import Policy, resolve_checkpoint
-from edge_server.scheduler.policy import LONGEST_MS
+from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario, ScenarioError, read_section
 from freshfield.untrusted import read_json
 

@@ -14,13 +14,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from edge_server.scheduler.learned.state import STATE_PARTS, State
+from freshfield.limits import LONGEST_MS
 
 if TYPE_CHECKING:  # loaded only by the policies that need them
     from edge_server.scheduler.learned.decision import Decision
     from edge_server.treatments import Treatment
-
-LONGEST_MS = 3_600_000.0
-"""Of a wait, a period, a deadline or an update: in an hour every scene has changed."""
 
 
 class Observer(Protocol):

@@ -122,6 +122,9 @@ a word opens another one."""
 
 # --- time -------------------------------------------------------------------------------------
 
+LONGEST_MS = 3_600_000.0
+"""Of a wait, a period, a deadline or an update: in an hour every scene has changed."""
+
 MAX_STAMP_S = 4.6e9
 """Of a stamp in a file, either way: the difference of two fits 64 bits in nanoseconds. Since 1970 it is the
 year 2115; larger ones are in another unit."""

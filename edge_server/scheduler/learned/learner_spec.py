@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from edge_server.scheduler.learned.state import StateLayout, require_int
-from edge_server.scheduler.policy import LONGEST_MS
+from freshfield.limits import LONGEST_MS
 
 Action = Literal["select", "wait", "wait-arrived", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "wait-arrived", "threshold")

@@ -79,7 +79,7 @@ def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says,
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--decision", "9"], "decision 9 is not recorded"),
+        (["--decision", "-1"], "the decision of update -1 is not kept; the oldest kept is"),
         (["--camera", "cam01"], "this policy looks at no pictures"),
     ],
 )
