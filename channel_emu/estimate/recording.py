@@ -164,10 +164,14 @@ def _from_rows(path: Path, discipline: str) -> Recording:
 def _check_drop_new(recording: Recording) -> None:
     """Refuse rows of another kind of link: their waits would be counted as delays. A few frames may be out of
     order where clocks are coarse."""
-    came = [c.offered_ms[went] for c in recording.cameras if (went := ~np.isnan(c.delay_ms)).any()]
-    ends = [offered + c.delay_ms[~np.isnan(c.delay_ms)] for offered, c in zip(came, recording.cameras)]
-    meanwhile = sum(int((o[1:] < np.maximum.accumulate(e)[:-1]).sum()) for o, e in zip(came, ends))
-    share = meanwhile / max(sum(map(len, came)), 1)
+    came = meanwhile = 0
+    for camera in recording.cameras:
+        went = ~np.isnan(camera.delay_ms)
+        offered = camera.offered_ms[went]
+        free = np.maximum.accumulate(offered + camera.delay_ms[went])
+        came += len(offered)
+        meanwhile += int((offered[1:] < free[:-1]).sum())
+    share = meanwhile / max(came, 1)
     if share > _MOST_OVERLAPPING:
         raise RecordingError(
             f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was "
