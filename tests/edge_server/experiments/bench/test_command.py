@@ -60,14 +60,12 @@ def test_embed(tmp_path, capsys, monkeypatch):
 def test_field(tmp_path, monkeypatch):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(1, (0.3, 2.0), (2.0,), 1))
-    found = bench("field", tmp_path / "bench.json", "--field", "ngp")
+    found = bench("field", tmp_path / "bench.json", "--field", "ngp", "--scene", "tile")
     assert found["start"]["ngp"]["peak_rss_mb"] > 50.0
-    for scene in ("tile", "room"):
-        row = found[scene]["ngp"]
-        assert row["steps_per_s"] > 0.0 and row["samples_per_s"] > row["rays_per_s"]
-        assert row["render_128_ms"] < row["render_256_ms"]
-        assert row["best_db"] > found[scene]["baseline"]["mean_colour_db"]
-    assert found["tile"]["ngp"]["best_db"] > 18.0
+    row = found["tile"]["ngp"]
+    assert row["steps_per_s"] > 0.0 and row["samples_per_s"] > row["rays_per_s"]
+    assert row["render_128_ms"] < row["render_256_ms"]
+    assert row["best_db"] > max(18.0, found["tile"]["baseline"]["mean_colour_db"])
     assert (tmp_path / "field.png").stat().st_size > 1000
     assert "| tile | ngp | 1 | 0.3: " in (tmp_path / "bench.md").read_text()
 
