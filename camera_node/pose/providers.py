@@ -146,7 +146,7 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
             raise TrajectoryError(f"{path}:{number}: expected t tx ty tz qx qy qz qw") from None
         if abs(t) > MAX_STAMP_S:
             raise TrajectoryError(
-                f"{path}:{number}: the time {t:g} is none in seconds: are these milliseconds or nanoseconds?"
+                f"{path}:{number}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?"
             )
         times.append(_nanoseconds(fields[0]))
         poses.append(Pose(tuple(map(float, q)), (x, y, z)))  # type: ignore[arg-type]

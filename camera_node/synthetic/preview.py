@@ -48,6 +48,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=256, metavar="PX", help="side of each picture")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scene parameter")
     args = parser.parse_args(arguments)
+    if args.out.suffix != ".png":
+        parser.error(f"--out {args.out}: expected a file.png")
     params = {k: yaml.safe_load(v) for k, _, v in (s.partition("=") for s in args.set)}
     try:
         scene = make_scene(args.scene, {"count": 19, "width": args.size, "height": args.size, **params})

@@ -119,28 +119,23 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 def _from_rows(path: Path, discipline: str) -> Recording:
     rows: dict[str, list[tuple[float, float]]] = {}
-    separators: set[str] = set()
+    separator = ""
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        separators |= {mark for mark in ",;\t" if mark in line}
-        if len(separators) > 1:
-            raise RecordingError(
-                f"{path}: line {number}: expected the same separator throughout (comma, semicolon or tab) "
-                f"and a point in numbers, got {line.strip()!r}"
-            )
-        words = [w.strip() for w in line.split(next(iter(separators), ","))]
+        separator = separator or next((mark for mark in "\t;" if mark in line.strip()), ",")
+        words = [w.strip() for w in line.strip().split(separator)]
         try:
             offered = float(words[0])
             delivered = float(words[1]) if len(words) > 1 and words[1] else math.nan
             if len(words) > 3 or abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):
                 raise ValueError
         except ValueError:
-            if not rows and number == 1:
+            if not rows and number == 1 and not words[0][:1].isdigit():
                 continue  # names of the columns
             raise RecordingError(
                 f"{path}: line {number}: expected offered_ms, delivered_ms (not earlier, or blank) and "
-                f"perhaps a camera, got {line.strip()!r}"
+                f"perhaps a camera, numbers with a point, one separator in all lines, got {line.strip()!r}"
             ) from None
         rows.setdefault(words[2] if len(words) > 2 else "cam00", []).append((offered, delivered))
     if not rows:
@@ -175,7 +170,8 @@ def _check_drop_new(recording: Recording) -> None:
     if share > _MOST_OVERLAPPING:
         raise RecordingError(
             f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was "
-            "on its way, and a drop-new link drops those: say what the link does with --discipline"
+            "on its way, and a drop-new link drops those: say what this one does, --discipline newest-waits, "
+            "fcfs or parallel, or drop-new to fit it all the same"
         )
 
 

@@ -41,13 +41,16 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
     except OSError:
         lock.close()
         raise FolderError(f"another run is writing to {out}; end it, or name another with --out") from None
-    earlier = out / EARLIER
-    before = set(out.iterdir()) - {marker, earlier}
-    keep = not earlier.exists()  # else the last start failed, and what lies there is worth more than its logs
-    if before and keep:
-        earlier.mkdir()
-    for path in before:
-        path.rename(earlier / path.name) if keep else _delete(path)
+    earlier, part = out / EARLIER, out / f".{EARLIER}"
+    before = set(out.iterdir()) - {marker, earlier, part}
+    if earlier.exists():  # the last start failed: what lies there is worth more than its logs
+        for path in before:
+            _delete(path)
+    elif before or part.exists():  # what a start that was killed has moved already
+        part.mkdir(exist_ok=True)
+        for path in before:
+            path.rename(part / path.name)
+        part.rename(earlier)
     lock.truncate(0)
     json.dump(about, lock, indent=1)
     lock.flush()
@@ -56,7 +59,8 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
 
 def forget_earlier(out: Path) -> None:
     """Delete the files of the run that this one replaces."""
-    _delete(out / EARLIER)
+    if (earlier := out / EARLIER).exists():
+        _delete(earlier.rename(out / f".{EARLIER}"))  # killed meanwhile, this run is the earlier one
 
 
 def _delete(path: Path) -> None:

@@ -93,6 +93,8 @@ class Launcher:
                     self._stop()
             self._export()
             self._report()
+            if (earlier := options.out / folder.EARLIER).exists():
+                self._display.message(f"the run was never up; an earlier run's files are in {earlier}")
         finally:
             lock.close()
         return 1 if self._failures else 0
@@ -238,9 +240,7 @@ class Launcher:
         """Write the report, whatever happened since the run was up."""
         out = self.options.out
         if self._failures and self._ready_s is None:
-            earlier = out / folder.EARLIER
-            kept = f"; the earlier run's files are in {earlier}" if earlier.exists() else ""
-            self._display.message(f"no report: the run did not start{kept}")
+            self._display.message("no report: the run did not start")
             return
         if not any(out.glob("ledger-*.tsv")):
             self._display.message("no report: no process has written about a frame")

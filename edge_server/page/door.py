@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
-from websockets.exceptions import ConnectionClosedError
+from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
@@ -192,10 +192,16 @@ class Door:
         return False
 
     def _worth_a_line(self, record: logging.LogRecord) -> bool:
-        """Whether websockets may log it: a failed handshake, which anybody may cause, is only counted."""
-        if record.msg != "opening handshake failed":
+        """Whether websockets may log it: a request that it cannot read, which anybody may send, is counted;
+        a connection that closes without one is nothing."""
+        error = record.exc_info[1] if record.exc_info else None
+        if error is None:
             return True
-        return self._refuse("a request that is no GET of HTTP/1.1")
+        if not isinstance(error, InvalidMessage):  # a fault of our own, of which viser would keep silent
+            log.error("page: %s", record.getMessage(), exc_info=record.exc_info)
+        elif not isinstance(error.__cause__, EOFError):
+            self._refuse("a request that is no GET of HTTP/1.1")
+        return False
 
     def _answer(self, connection: VisitorConnection, request: Request, process: Process) -> Response | None:
         """What to answer a request with; None lets a visitor in."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Required, TypedDict
+from typing import Annotated, Any, NotRequired, Required, TypedDict
 
 import msgspec
 from msgspec import Meta
@@ -45,6 +45,7 @@ class _Histogram(TypedDict):
 
 
 class _Delays(TypedDict, total=False):
+    count: Number | None
     mean: Number | None
     p50: Number | None
     p95: Number | None
@@ -72,6 +73,9 @@ class _Measured(TypedDict):
 class _Mesh(TypedDict):
     file: str
     triangles: int
+    vertices: NotRequired[int]
+    watertight: NotRequired[bool]
+    cameras: NotRequired[int]
     seconds: Number
     stages_s: dict[str, Number]
     measured: _Measured | None

@@ -40,6 +40,9 @@ def write_bytes(path: Path, data: bytes) -> None:
     Any number of threads, processes and machines that share the folder may do so at once. OSError where the
     file cannot be written: the old one then stays, and nothing is left beside it.
     """
+    if path.exists() and not path.is_file():  # /dev/stdout, a pipe
+        path.write_bytes(data)
+        return
     # The process id is not enough: threads share it, and containers that share a folder often do.
     part = path.with_name(f".{path.name}.{os.urandom(6).hex()}.part")
     try:
@@ -76,6 +79,8 @@ def _to_write(text: str, is_folder: bool) -> Path:
     if there == path and not is_folder:
         if path.is_dir():
             raise argparse.ArgumentTypeError(f"{path} is a folder, not a file: name another")
+        if path.is_file() and not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # it is replaced
+            raise argparse.ArgumentTypeError(f"{path.parent} cannot be written to: name another place")
     elif not there.is_dir():
         raise argparse.ArgumentTypeError(f"{there} is a file, not a folder: name another")
     elif not os.access(there, os.W_OK | os.X_OK):

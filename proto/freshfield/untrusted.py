@@ -35,12 +35,14 @@ class _Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
-        seen = set()
-        for key, _ in node.value:  # as the constructor reads them: 1 and 01 are one key
-            name = str(self.construct_object(key)) if key.tag in self.yaml_constructors else key.value
-            if name in seen:
-                raise UntrustedError(f"line {key.start_mark.line + 1}: {_repeated(name)}")
-            seen.add(name)
+        seen: set[Any] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):  # others are refused later: no mapping can have them as keys
+                # As the constructor reads them: 1 and 01 are one key.
+                name = key.value if key.tag == "tag:yaml.org,2002:merge" else self.construct_object(key)
+                if name in seen:
+                    raise UntrustedError(f"line {key.start_mark.line + 1}: {_repeated(str(name))}")
+                seen.add(name)
         return node
 
     def construct_whole_number(self, node: Any) -> int:

@@ -36,6 +36,17 @@ def test_an_earlier_run_outlives_starts_that_fail(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-edge.txt"}
 
 
+def test_a_start_that_is_killed_while_it_moves_files_loses_none(tmp_path: Path) -> None:
+    prepare(tmp_path, {"run": 1}).close()
+    for name in ("a", "b"):
+        (tmp_path / name).write_text(name)
+    part = tmp_path / f".{EARLIER}"
+    part.mkdir()
+    (tmp_path / "a").rename(part / "a")
+    prepare(tmp_path, {"run": 2}).close()
+    assert {p.name for p in (tmp_path / EARLIER).iterdir()} == {"a", "b"} and not part.exists()
+
+
 def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) -> None:
     precious = tmp_path / "precious"
     precious.mkdir()

@@ -176,7 +176,7 @@ def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) ->
     run = Up(tmp_path, "--policy", "foo")
     assert run.end() == 1
     assert "'foo' is not known" in run.output and "PSNR" not in run.output
-    assert run.output.endswith(f"the run did not start; the earlier run's files are in {run.out / EARLIER}\n")
+    assert run.output.endswith(f"the run was never up; an earlier run's files are in {run.out / EARLIER}\n")
     assert (run.out / EARLIER / "report.json").exists()
 
 

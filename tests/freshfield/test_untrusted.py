@@ -59,7 +59,10 @@ def test_an_alias_bomb_is_refused_at_once(text):
         ("a: &a {b: 1}\nc: {<<: *a, <<: *a}", "line 2: the key '<<' is there twice"),
         (f"? {'k' * 10**4}\n? {'k' * 10**4}", "is there twice"),
         ("{? [1]: a}", "unhashable key"),
-        (f"{LISTS}z: {{? *p : 1, ? *p : 2}}", "is there twice"),
+        (f"{LISTS}z: {{? *p : 1, ? *p : 2}}", "stand for more than"),
+        ("? !x [1]\n: 2", "not YAML"),
+        ("? !x {a: 1}\n: 2", "not YAML"),
+        ("{1: a, 1.0: b}", "the key '1.0' is there twice"),
     ],
     ids=lambda v: v[:12],
 )
@@ -85,6 +88,7 @@ def test_honest_references_are_followed():
     assert read_yaml(text)["two"] == {"width": 64, "height": 96} and read_yaml(text)["one"]["width"] == 128
     assert read_yaml("") is None and read_yaml("3") == 3
     nested = "a: &a {x: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3}\n"
+    assert read_yaml("{'1': a, 1: b, ~: c, None: d}") == {"1": "a", 1: "b", None: "c", "None": "d"}
     assert read_yaml(nested) == {"a": {"x": 1}, "b": {"x": 2}, "c": {"x": 3}}, (
         "what is merged is no repetition"
     )

@@ -113,8 +113,8 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
 
     if not 0.0 < request.seconds <= 1e6:
         raise OptionError(f"--seconds {request.seconds:g}: expected more than 0")
-    if not request.scale >= 1.0:
-        raise OptionError(f"--scale {request.scale:g}: expected 1 or more (2 halves the images)")
+    if not 0.0 < request.scale <= 1e3:  # data sets take 1 or more
+        raise OptionError(f"--scale {request.scale:g}: expected more than 0 (2 halves the images)")
     options = parse_options(request.option)
     data = _open(request)
     if any(v.image.shape[2] == 4 for v in data.training):

@@ -109,8 +109,8 @@ class RecordedDecision:
 
 
 def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
-    """Read the decision of the run in folder ``run`` that update ``number`` was made by, the last one until
-    then; None: the newest. ValueError: it is not kept, or its file is damaged."""
+    """Read the decision of the run in folder ``run`` that update ``number`` was made by: its own, or the one
+    that its policy held until then; None: the newest. ValueError: it is not kept, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(
@@ -141,6 +141,11 @@ def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
                 continue  # it was delivered damaged, so that the policy did not see it
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: damaged: {error}") from None
+    if number not in (None, decision.number) and not actor.spec.hold_ms:
+        raise ValueError(
+            f"{run}: update {number} has no decision of a learned policy; the last before it is that of "
+            f"update {decision.number}"
+        )
     return RecordedDecision(decision, images, about["embedding"])
 
 

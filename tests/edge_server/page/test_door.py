@@ -204,6 +204,7 @@ def test_requests_that_no_page_answers_are_counted_and_logged_once(caplog) -> No
     with page_of(bare_state()) as page, Visitor(page.port):
         wait_until(lambda: page._server.get_clients(), "the visitor")
         refused = door_of(page).refused
+        socket.create_connection(("127.0.0.1", page.port)).close()  # no request at all
         for request in (b"HEAD / HTTP/1.1", b"POST / HTTP/1.1", b"GET / HTTP/1.0", b"\x00\xff"):
             with socket.create_connection(("127.0.0.1", page.port), timeout=10) as raw:
                 raw.sendall(request + b"\r\nHost: 127.0.0.1\r\n\r\n")
@@ -215,6 +216,21 @@ def test_requests_that_no_page_answers_are_counted_and_logged_once(caplog) -> No
     said = [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")]
     assert sum("no GET of HTTP/1.1" in r.getMessage() for r in said) == 1
     assert not any(r.exc_info for r in said)
+
+
+def test_a_fault_of_our_own_is_logged_as_such(monkeypatch, caplog) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("a fault")
+
+    def logged() -> bool:
+        return any(r.exc_info and "a fault" in str(r.exc_info[1]) for r in caplog.records)
+
+    with page_of(bare_state()) as page, Visitor(page.port):
+        wait_until(lambda: page._server.get_clients(), "the visitor")
+        monkeypatch.setattr(Door, "_answer", broken)
+        assert get(page.port)[0] == 500
+        wait_until(logged, "the fault")
+        assert not door_of(page).refused
 
 
 @pytest.mark.parametrize("port", [99_999_999_999, 65536, -5])

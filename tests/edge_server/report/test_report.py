@@ -152,7 +152,15 @@ def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
     assert "mesh" not in run[1] and "<h2>Mesh" not in (run[0] / "report.html").read_text()
     measured = {"chamfer_mm": 6.926, "complete": 0.6074, "accuracy_median_mm": 1.1, "within_mm": 3.0,
                 "target_chamfer_mm": 1.5, "target_complete": 0.95}  # fmt: skip
-    mesh = {"file": "tile.ply", "triangles": 19794, "seconds": 11.6, "stages_s": {"fuse": 0.4}}
+    mesh = {
+        "file": "tile.ply",
+        "triangles": 19794,
+        "seconds": 11.6,
+        "stages_s": {"fuse": 0.4},
+        "vertices": 9900,
+        "watertight": False,
+        "cameras": 18,
+    }
     for found in (measured, None):
         write_run(tmp_path)
         (tmp_path / "mesh.json").write_text(json.dumps({**mesh, "measured": found}))

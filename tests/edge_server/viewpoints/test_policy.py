@@ -92,6 +92,7 @@ def test_embeddings_of_captured_pictures_are_part_of_the_state():
         policy.values(state)
 
 
+@pytest.mark.alone
 def test_a_policy_comes_back_from_its_file_and_decides_within_50_ms(trained, tmp_path):
     policy, _ = trained
     policy.save(tmp_path / "policy.npz")

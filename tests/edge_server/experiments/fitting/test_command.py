@@ -134,7 +134,7 @@ def test_an_instant_of_a_recording_and_scores_on_training_views(tmp_path):
         (["--field", "nothing"], "no field is called 'nothing'"),
         (["--seconds", "0"], "--seconds 0"),
         (["--holdout", "x"], "no image or camera 'x'"),
-        (["--scale", "0.5"], "--scale 0.5"),
+        (["--scale", "0.5"], "scale is 0.5"),
         (["--resume"], "no fit to go on from"),
     ],
 )
@@ -167,8 +167,8 @@ def test_cameras_that_a_field_refuses_are_refused_in_one_line(tmp_path, capsys, 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--scale", "0"], "--scale 0: expected 1 or more"),
-        (["--scale", "-1"], "--scale -1: expected 1 or more"),
+        (["--scale", "0"], "--scale 0: expected more than 0"),
+        (["--scale", "-1"], "--scale -1: expected more than 0"),
         (["--holdout", "0"], "--holdout is for data sets; the scene tile holds out cam00"),
         (["--format", "colmap"], "--format is for data sets"),
     ],

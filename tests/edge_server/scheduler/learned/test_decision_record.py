@@ -18,8 +18,8 @@ from tests.edge_server.scheduler.learned.problems import state
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
 
 
-def a_decision(number=0, seed=0, n=4):
-    actor = Learner(Spec("select", LAYOUT), seed).actor
+def a_decision(number=0, seed=0, n=4, hold_ms=0.0):
+    actor = Learner(Spec("select", LAYOUT, hold_ms=hold_ms), seed).actor
     s = state(n, np.random.default_rng(number), d=3, silent=1)
     s = replace(s, frames={c: frame(c, sequence=number) for c in s.cameras[:2]})
     actions, logps = actor.act([s])
@@ -105,8 +105,11 @@ def test_what_is_not_there_is_said(tmp_path):
 def test_a_decision_that_is_held_is_that_of_later_updates_too(tmp_path):
     record = DecisionWriter(tmp_path)
     for number in (5, 9):
-        record.write(a_decision(number))
+        record.write(a_decision(number, hold_ms=1000.0))
     assert [read_decision(tmp_path, n).decision.number for n in (5, 8, 9, 40)] == [5, 5, 9, 9]
+    record.write(a_decision(50))
+    with pytest.raises(ValueError, match=r"update 51 has no decision .* that of update 50"):
+        read_decision(tmp_path, 51)
 
 
 def test_damage_is_named(tmp_path):
