@@ -44,11 +44,10 @@ class Panel:
         self._pair: Any = None
         self._compared_update: int | None = None
         self._refreshes = 0
-        self._folder = gui.add_folder("Controls")
-        with self._folder:
+        self._explanation = DecisionExplanation(gui, state)
+        with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
             self.surface = MeshLayer(server, state)
-        self._explanation = DecisionExplanation(gui, state)
         if state.scores is not None:
             with gui.add_folder("What policies reach"):
                 gui.add_html(markup.policy_scores(state.scores))
@@ -100,7 +99,7 @@ class Panel:
         )
         pair = side_by_side(comparison.truth, comparison.rendered)
         if self._pair is None:
-            order = 0.5 * (self._caption.order + self._folder.order)
+            order = self._caption.order + 0.5  # below its caption
             self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=88, order=order)
         else:
             self._pair.image = pair
