@@ -6,7 +6,6 @@ busy machine a step ends late. ``UpdateBudget`` measures this overhead and reser
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections import deque
@@ -19,6 +18,7 @@ from typing import Any
 from edge_server.config import EdgeConfig
 from edge_server.fields import Budget
 from freshfield.scenario import Scenario
+from freshfield.untrusted import read_json
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
     """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
     try:
-        data = json.loads(source.read_text())
+        data = read_json(source.read_text())
         rows: Sequence[Mapping[str, Any]] = data["updates"]
         points = [
             FrontierPoint(

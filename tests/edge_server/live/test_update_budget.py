@@ -119,7 +119,7 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
     assert len({p.effort for p in shipped}) >= 2 and all(p.update_ms > 0 for p in shipped)
     with pytest.raises(ValueError, match="edge-server frontier --field nothing"):
         read_frontier(None, "nothing")
-    for text in ("", "[]", "{}", '{"updates": [{}]}', '{"updates": 3}'):
+    for text in ("", "[]", "{}", '{"updates": [{}]}', '{"updates": 3}', '{"updates": [], "updates": []}'):
         (tmp_path / "f.json").write_text(text)
         with pytest.raises(ValueError, match=r"f\.json: not a frontier"):
             read_frontier(tmp_path / "f.json", "ngp")
