@@ -157,6 +157,8 @@ class Export:
         if a.voxel is not None and not a.voxel > 0:
             raise ExportError(f"--voxel {a.voxel:g}: expected more than 0 mm")
         box = None if a.bounds is None else (tuple(a.bounds[:3]), tuple(a.bounds[3:]))
+        if box is not None and not all(low < high for low, high in zip(*box)):
+            raise ExportError("--bounds: each lower corner must be below its upper one")
         return MeshSettings(
             method=a.method, sharpen=not a.no_sharpen,
             voxel_m=None if a.voxel is None else 1e-3 * a.voxel, bounds=box, watertight=a.watertight,
