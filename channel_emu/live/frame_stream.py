@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import gc
 import logging
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,7 @@ class FrameStream:
         self.rejected: dict[str, int] = {}
         """Frames refused here, by reason."""
         self._out = out
+        self._status_lock, self._status_is_final = threading.Lock(), False
         self._priority = priority
         self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(self.cameras))
         self._sessions = SessionStreams(self.cameras)
@@ -180,8 +182,10 @@ class FrameStream:
             raise AssertionError("abort raises") from None
 
     def _write_status(self, state: dict[str, Any]) -> None:
-        with contextlib.suppress(OSError):  # a full disk costs a status, not the emulator
-            write_json(self._out / "channel.json", state)
+        with self._status_lock, contextlib.suppress(OSError):  # a full disk costs a status, not the emulator
+            if not self._status_is_final:  # a thread may still hold an earlier one when the last is written
+                self._status_is_final = not state["running"]
+                write_json(self._out / "channel.json", state)
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
         return snapshot(

@@ -195,3 +195,10 @@ def test_without_an_edge_they_are_let_in_a_moment_later(
         await proxy.stop()
 
     run(live())
+
+
+def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path: Path) -> None:
+    hook = frame_stream.FrameStream(["cam00"], tmp_path)
+    hook._write_status({"running": False})
+    hook._write_status({"running": True})
+    assert json.loads((tmp_path / "channel.json").read_text()) == {"running": False}
