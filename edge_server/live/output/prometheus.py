@@ -11,7 +11,7 @@ from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.ingest import Ingest
 from edge_server.live.output.guarded_http import serve_guarded
 from edge_server.live.state import EdgeState
-from freshfield.transport import Transport
+from freshfield.transport import Transport, TransportError
 
 
 class EdgeCollector:
@@ -60,8 +60,13 @@ class EdgeCollector:
 def serve_metrics(
     state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None
 ) -> None:
-    """Serve /metrics on a thread until the process ends. Raises TransportError if they would be open to
-    others (see ``Transport.guard``)."""
+    """Serve /metrics on a thread until the process ends. Raises TransportError if the port is not available,
+    or if they would be open to others (see ``Transport.guard``)."""
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
-    serve_guarded(make_wsgi_app(registry), "metrics", host, port, transport)
+    try:
+        serve_guarded(make_wsgi_app(registry), "metrics", host, port, transport)
+    except OSError as error:
+        raise TransportError(
+            f"metrics: cannot listen on {host}:{port} ({error.strerror}); see --metrics-port"
+        ) from None

@@ -239,6 +239,11 @@ def test_what_is_no_port_is_refused(port: int) -> None:
         serve_metrics(bare_state(), INGEST, "127.0.0.1", port)
 
 
+def test_a_port_that_is_taken_is_refused_by_its_option(metrics: int) -> None:
+    with pytest.raises(TransportError, match=rf"{metrics} \(Address already in use\); see --metrics-port"):
+        serve_metrics(bare_state(), INGEST, "127.0.0.1", metrics)
+
+
 # --- what a visitor may send --------------------------------------------------------------------------
 
 
