@@ -18,6 +18,7 @@ from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Work
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
 from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Field
 from edge_server.report.style import figure, label_lines
 from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import TASTES, SimulatedExpert
@@ -102,40 +103,47 @@ class Preferences(Study):
             print(f"  embeddings are left out: {missing}")
         pictures = [stage.take(k).image for k in range(len(stage.candidates))]
         seen = embed(pictures).astype(np.float64) if embed else None
+
+        def taught(taste: str, label: str, embedded: bool, seed: int) -> Row:
+            """The returns of a training, what the reward model says, and the policy's capture."""
+            expert = SimulatedExpert(taste, scores[taste], np.random.default_rng(seed), wrong=0.1)
+            model = ask(expert, features, ASKED[-1])
+            policy, returns = train_policy(
+                stage.candidates, model.reward, config, seed, seen if embedded else None, embed
+            )
+            if seed == 0:
+                policy.save(request.out / f"policy-{scene}-{label.replace(', ', '-')}.npz")
+            # The seed draws the same first view as for the others.
+            made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
+            says = f"{expert.label}: {model.says()}"
+            return {"returns": returns, "says": says, "capture": _measured(stage, made, work, seed)}
+
         for seed in request.repeats(3, 5):
             for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
                 key = content_key([arm, scene, seed, vars(work), source_digest()], 40)
                 run = partial(_capture, stage, arm, seed, work)
                 captures.append({"arm": arm, "seed": seed, **store.get(key, compute=run)})
             for taste, embedded in [*((t, False) for t in TASTES), *([(_EMBEDDED, True)] if embed else [])]:
-                expert = SimulatedExpert(taste, scores[taste], np.random.default_rng(seed), wrong=0.1)
-                model = ask(expert, features, ASKED[-1])
-                policy, returns = train_policy(
-                    stage.candidates, model.reward, config, seed, seen if embedded else None, embed
-                )
                 label = f"{taste}, embeddings" if embedded else taste
+                about = [label, scene, seed, len(features), vars(work), vars(config), source_digest()]
+                run = partial(taught, taste, label, embedded, seed)
+                found = store.get(content_key(["policy", *about], 40), compute=run)
                 for n in range(0, config.updates, 5):
                     of_seed = curves.setdefault(label, {}).setdefault(float(n), {})
-                    of_seed[seed] = float(np.mean(returns[n : n + 5]))
-                if seed == 0:
-                    policy.save(request.out / f"policy-{scene}-{label.replace(', ', '-')}.npz")
-                # The seed draws the same first view as for the others.
-                made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
-                measured = _measured(stage, made, work, seed)
-                captures.append({"arm": f"policy, {label}", "seed": seed, **measured})
-                print(f"  seed {seed}, {expert.label}: {model.says()}", flush=True)
+                    of_seed[seed] = float(np.mean(found["returns"][n : n + 5]))
+                captures.append({"arm": f"policy, {label}", "seed": seed, **found["capture"]})
+                print(f"  seed {seed}, {found['says']}", flush=True)
         return captures, curves
 
 
 def reconstruct(stage: Stage, k: int, work: Workload) -> Row:
     """A reconstruction of the pool: its views, chosen in various ways, and the score of each taste."""
     made = varied_plan(stage, k, JUDGED)
-    return {"order": made.order, **_tastes(stage, made, work, k)}
+    return {"order": made.order, **_tastes(stage, stage.fit(made.views, work.steps, k))}
 
 
-def _tastes(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
-    """The score of each taste, of the field fitted to a plan's views."""
-    field = stage.fit(made.views, work.steps, seed)
+def _tastes(stage: Stage, field: Field) -> Row:
+    """The score of each taste."""
     return {taste: taste_score(stage, field, taste) for taste in TASTES}
 
 
@@ -145,11 +153,12 @@ def _capture(stage: Stage, arm: str, seed: int, work: Workload) -> Row:
 
 def _measured(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
     """Quality on the views held out, path, milliseconds of a choice, and the score of each taste."""
-    score = stage.score(stage.fit(made.views, work.steps, seed), Scorer(background=stage.background))
+    field = stage.fit(made.views, work.steps, seed)
+    score = stage.score(field, Scorer(background=stage.background))
     choice_ms = 1e3 * float(np.mean([stop.seconds for stop in made.stops[1:]]))
     return {
         "psnr_db": score.psnr_db, "ssim": score.ssim, "path_m": made.path_m, "choice_ms": choice_ms,
-        **_tastes(stage, made, work, seed),
+        **_tastes(stage, field),
     }  # fmt: skip
 
 

@@ -107,3 +107,9 @@ def test_both_studies_run_whole(tmp_path, monkeypatch):
     first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage" and r["views"] == "3"}
     assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
     assert (tmp_path / "policy-tile-edges.npz").exists() and (tmp_path / "viewpoints-tile-paths.png").exists()
+
+    # The same command again finds everything done: not even a policy is trained.
+    before = (tmp_path / "preferences-captures.csv").read_bytes()
+    monkeypatch.setattr(preferences, "train_policy", None)
+    run_study(preferences.Preferences(), request, Engine(tmp_path))
+    assert (tmp_path / "preferences-captures.csv").read_bytes() == before
