@@ -1,9 +1,8 @@
 """A camera in the synthetic world, carried by a simulated arm (thesis 4.2, 4.3).
 
 It renders from the arm's true joints at the frame's instant, which the simulated controller knows. The
-frame's
-pose is computed as on a real bench: joint states with their own stamps, paired by time, forward kinematics
-and hand-eye calibration. The difference of both is the pose error.
+frame's pose is computed as on a real bench: joint states with their own stamps, paired by time, forward
+kinematics and hand-eye calibration. The difference of both is the pose error.
 """
 
 from __future__ import annotations

@@ -11,11 +11,11 @@ import sys
 
 import cv2
 import numpy as np
-import yaml
 
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import SCENES, Scene, SceneError, make_scene
 from freshfield.files import out_file, write_bytes
+from freshfield.untrusted import UntrustedError, read_yaml
 
 
 def contact_sheet(scene: Scene, t_s: float) -> Image:
@@ -50,11 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.out.suffix != ".png":
         parser.error(f"--out {args.out}: expected a file.png")
-    params = {k: yaml.safe_load(v) for k, _, v in (s.partition("=") for s in args.set)}
     try:
+        params = {k: read_yaml(v) for k, _, v in (s.partition("=") for s in args.set)}
         scene = make_scene(args.scene, {"count": 19, "width": args.size, "height": args.size, **params})
         sheet = contact_sheet(scene, args.at)
-    except SceneError as error:
+    except (SceneError, UntrustedError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
         print("\nstopped; nothing was written", file=sys.stderr)

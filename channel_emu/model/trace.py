@@ -24,6 +24,7 @@ from typing import Any, TextIO
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
+from freshfield.untrusted import UntrustedError, read_json
 
 VERSION = 2
 _INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
@@ -114,23 +115,23 @@ def read(path: Path) -> Trace:
     except (OSError, UnicodeDecodeError) as error:
         raise TraceError(f"{path}: cannot be read: {error}") from None
     try:
-        head = json.loads(lines[0])
+        head = read_json(lines[0])
         if head["freshfield_trace"] != VERSION:
             version = head["freshfield_trace"]
             raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
         config = channel_from_mapping(head["channel"], f"{path}: channel")
         seed = int(head["seed"])
-    except (json.JSONDecodeError, KeyError, TypeError, OverflowError, RecursionError):
+    except (UntrustedError, KeyError, TypeError, OverflowError):
         raise TraceError(f"{path}: not a freshfield trace: the first line has no trace header") from None
     records = []
     for number, line in enumerate(lines[1:-1], start=2):
         try:
-            values = json.loads(line)
+            values = read_json(line)
             values["flips"] = tuple((float(place), int(mask)) for place, mask in values["flips"])
             record = Record(**values)
             if any(type(values[key]) is not kind for key, kind in _KINDS.items()):
                 raise TypeError
-        except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise TraceError(f"{path}: line {number} is not a trace record") from None
         for key in _INSTANTS:
             instant = getattr(record, key)

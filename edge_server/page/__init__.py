@@ -99,12 +99,12 @@ def start_page(
     server.on_client_connect(joined)
     server.on_client_disconnect(left)
 
-    def told(connection: Any) -> None:
+    def on_refused(connection: Any) -> None:
         for number, each in list(server._websock_server._live_connections.items()):
             if each is connection:
                 notify(server.get_clients().get(number), "Not done", "You logged in to look only.", bad=True)
 
-    door.controls, door.told = server.gui._gui_input_handle_from_uuid, told
+    door.controls, door.on_refused = server.gui._gui_input_handle_from_uuid, on_refused
     renders.start()
     refresher.start()
     port = server.get_port()

@@ -97,15 +97,15 @@ _DECODER = msgspec.msgpack.Decoder(Viewpoint | Click | Update)
 class Door:
     """access: what requests are asked. tls: for the port, or None.
 
-    controls: by their id, those whose values may be set; told: called with the connection of a viewer who
-    tried to. Both are set once the page has been made.
+    controls: by their id, those whose values may be set. on_refused: called with the connection of a viewer
+    who tried to. Both are set once the page has been made.
     """
 
     def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
         self.visitors: set[ServerConnection] = set()
         self.refused: Counter[str] = Counter()
         self.controls: dict[str, Any] = {}
-        self.told: Callable[[ServerConnection], None] = lambda connection: None
+        self.on_refused: Callable[[ServerConnection], None] = lambda connection: None
         self._access = access
         self._tls = tls
         self._secret = secrets.token_bytes(32)
@@ -180,7 +180,7 @@ class Door:
             return self._refuse("more than a person can click")
         if isinstance(message, Update):
             if not connection.caller.may(CHANGE):
-                self.told(connection)
+                self.on_refused(connection)
                 return self._refuse("a change by a viewer")
             return message.sound(self.controls) or self._refuse("a value that no control takes")
         return True

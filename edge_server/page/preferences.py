@@ -139,13 +139,13 @@ class PreferencePage:
                 except ViewpointError as error:
                     raise _Refused(400, f"Not imported: {error}") from None
             else:
-                told = _told(body)
-                if told.get("turn") != self._turn:
+                message = _message(body)
+                if message.get("turn") != self._turn:
                     raise _Refused(409, "This was answered elsewhere; now see the present pair.")
-                if path == "/answer" and told.get("choice") in ("left", "right", "neither"):
+                if path == "/answer" and message.get("choice") in ("left", "right", "neither"):
                     if session.question is None:
                         raise _Refused(409, "All questions are answered.")
-                    session = session.answered(told["choice"])
+                    session = session.answered(message["choice"])
                 elif path == "/undo":
                     session = session.undone()
                 elif path == "/finish":
@@ -160,14 +160,14 @@ class PreferencePage:
             self.session, self._turn = session, secrets.token_hex(8)
 
 
-def _told(body: bytes) -> dict[str, Any]:
+def _message(body: bytes) -> dict[str, Any]:
     try:
-        told = json.loads(body)
+        message = json.loads(body)
     except (ValueError, RecursionError):
-        told = None
-    if not isinstance(told, dict):
+        message = None
+    if not isinstance(message, dict):
         raise _Refused(400, "Expected a JSON object.")
-    return told
+    return message
 
 
 def _body(environ: dict[str, Any]) -> bytes:

@@ -88,8 +88,10 @@ class PreferenceSession:
     @cached_property
     def model(self) -> RewardModel:
         """What the answers say. "neither" is half a vote for each side: y = 1/2 in (4.13)."""
-        told = {"left": True, "right": False, "neither": None}
-        return fit_reward(self.features, [Answer(a.left, a.right, told[a.choice]) for a in self.answers])
+        prefers_first = {"left": True, "right": False, "neither": None}
+        return fit_reward(
+            self.features, [Answer(a.left, a.right, prefers_first[a.choice]) for a in self.answers]
+        )
 
     @cached_property
     def question(self) -> Question | None:

@@ -8,6 +8,7 @@ twice is refused: which of the two values was meant, nobody knows.
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -46,12 +47,27 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_whole_number(self, node: Any) -> int:
-        value = self.construct_yaml_int(node)
+        text = self.construct_scalar(node)
+        value = int(text, {"0x": 16, "0o": 8}.get(text[:2], 10))
         str(value)  # ValueError for thousands of digits in hexadecimal: no message could quote them
-        return int(value)
+        return value
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_whole_number)
+# Numbers as YAML 1.2 writes them. In 1.1, which PyYAML reads, 1:30 is 90, 010 is 8, and 1e-3 is a word.
+_INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, form) for tag, form in known if tag not in (_INT, _FLOAT)]
+    for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    _INT, re.compile(r"([-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    _FLOAT,
+    re.compile(r"[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"),
+    list("-+.0123456789"),
+)
+_Loader.add_constructor(_INT, _Loader.construct_whole_number)
 
 
 def _repeated(key: str) -> str:

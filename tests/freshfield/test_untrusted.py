@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 from itertools import pairwise
 
@@ -47,14 +48,14 @@ def test_an_alias_bomb_is_refused_at_once(text):
         ("x" * (MAX_YAML_CHARS + 1), "characters, more than"),
         ("!!python/object/apply:os.system [true]", "could not determine a constructor"),
         ("a: 0x" + "f" * 5000, "not YAML"),  # a message could not quote it
-        ("a: 1" + ":00" * 300 + ":00.5", "not YAML"),
+        ("a: !!float 1" + ":00" * 300 + ":00.5", "not YAML"),
         ("a: !!bool maybe", "not YAML"),
         ("a: !!int", "not YAML"),
         ("a: !!timestamp soon", "not YAML"),
         ("a: 1\nb: 2\na: 3", "line 3: the key 'a' is there twice"),
         ("a: {b: 1, c: 2, 'b': 1}", "line 1: the key 'b' is there twice"),
         ("[{b: 1}, {b: 1, b: 1}]", "the key 'b' is there twice"),
-        ("{1: a, 01: b}", "the key '1' is there twice"),  # octal
+        ("{1: a, 01: b}", "the key '1' is there twice"),
         ("{yes: a, true: b}", "the key 'True' is there twice"),
         ("a: &a {b: 1}\nc: {<<: *a, <<: *a}", "line 2: the key '<<' is there twice"),
         (f"? {'k' * 10**4}\n? {'k' * 10**4}", "is there twice"),
@@ -92,6 +93,13 @@ def test_honest_references_are_followed():
     assert read_yaml(nested) == {"a": {"x": 1}, "b": {"x": 2}, "c": {"x": 3}}, (
         "what is merged is no repetition"
     )
+
+
+def test_numbers_are_those_of_yaml_1_2():
+    """In YAML 1.1, 1:30 is 90, 010 is 8, 1_000 a thousand, and 1e-3 a word."""
+    found = read_yaml("[1:30, 1_000, 010, 0x1F, 0o17, -5, 1e-3, .5, 5., -.inf, on, 1-2]")
+    assert found == ["1:30", "1_000", 10, 31, 15, -5, 0.001, 0.5, 5.0, -math.inf, True, "1-2"]
+    assert math.isnan(read_yaml(".nan")) and read_yaml("!!int '12'") == 12
 
 
 @pytest.mark.parametrize(

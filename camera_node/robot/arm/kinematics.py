@@ -68,10 +68,9 @@ class ArmModel:
 
     @property
     def nominal_model(self) -> ArmModel:
-        """The uncalibrated model. Its link frames lie within the arm's parts, as clearances require. Those of
-        a
-        calibrated model do not: the factory's fit puts metres into lengths along parallel axes, which nearly
-        cancel at the flange, so the elbow's frame may lie metres away."""
+        """The uncalibrated model. Its link frames lie within the arm's parts, as clearances require. Those
+        of a calibrated model do not: the factory's fit puts metres into lengths along parallel axes, which
+        nearly cancel at the flange, so the elbow's frame may lie metres away."""
         return self.nominal or self
 
     def link_frames(self, joints: ArrayLike) -> Array:

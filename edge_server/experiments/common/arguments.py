@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from edge_server.experiments.common.folders import Folders
 from edge_server.fidelity.lpips_weights import weights_folder
+from freshfield.untrusted import UntrustedError, read_yaml
 
 
 class OptionError(ValueError):
@@ -59,8 +58,8 @@ def parse_options(words: Sequence[str]) -> dict[str, Any]:
         if not key or not equals:
             raise OptionError(f"--option {word}: expected KEY=VALUE")
         try:
-            options[key] = yaml.safe_load(value)
-        except yaml.YAMLError:
+            options[key] = read_yaml(value)
+        except UntrustedError:
             raise OptionError(f"--option {word}: {value!r} is not a value") from None
     return options
 

@@ -89,12 +89,12 @@ def _on_the_page(
 
     transport.guard(page[0], "preference page", http=True)  # before minutes are spent on fits
 
-    def told(k: int) -> None:
+    def progress(k: int) -> None:
         print(
             f"\rreconstruction {k + 1} of {len(plans)}", end="\n" if k + 1 == len(plans) else "", flush=True
         )
 
-    made = sprites(stage, plans, about.steps, about.seed, about.out / "reconstructions", told)
+    made = sprites(stage, plans, about.steps, about.seed, about.out / "reconstructions", progress)
     path = about.out / ANSWERS
     asking = PreferencePage(session, made, FRAMES, COLUMNS, lambda s: write_json(path, s.as_json()))
     try:

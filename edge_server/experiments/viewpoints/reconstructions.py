@@ -96,10 +96,11 @@ def identity(stage: Stage, plans: Sequence[Plan], steps: int, seed: int) -> str:
 
 
 def sprites(
-    stage: Stage, plans: list[Plan], steps: int, seed: int, folder: Path, told: Callable[[int], None]
+    stage: Stage, plans: list[Plan], steps: int, seed: int, folder: Path, progress: Callable[[int], None]
 ) -> list[bytes]:
-    """The ``sprite`` of each plan, kept in ``folder`` for the next time. told: is called with the number of
-    each that is made. Raises OSError."""
+    """The ``sprite`` of each plan, kept in ``folder`` for the next time.
+
+    progress: called with the number of each that is made. Raises OSError."""
     about = {"scenario": stage.name, "made_of": identity(stage, plans, steps, seed)}
     files = [folder / f"{k:03d}.jpg" for k in range(len(plans))]
     try:
@@ -111,6 +112,6 @@ def sprites(
     (folder / "about.json").unlink(missing_ok=True)  # until all are of this kind
     for k, plan in enumerate(plans):
         write_bytes(files[k], sprite(stage, stage.fit(plan.views, steps, seed)))
-        told(k)
+        progress(k)
     write_json(folder / "about.json", about)
     return [file.read_bytes() for file in files]

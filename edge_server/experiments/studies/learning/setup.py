@@ -223,7 +223,7 @@ class StudyTrainer:
         """As ``evaluate``, scored by the cameras that reward; it supplements the other evaluation."""
         return evaluate_policies(
             setting, self.pool, seeds(seed, "test", count), candidates, reward,
-            lambda line: print(f"  contest: {line}", flush=True),
+            lambda line: print(f"  evaluation: {line}", flush=True),
         )  # fmt: skip
 
 

@@ -21,13 +21,13 @@ from edge_server.experiments.common.arguments import (
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.contest import LEAD_MS, LEARNT, contest
 from edge_server.experiments.training.scheduler.evaluation import (
     Evaluation,
     baseline_policies,
     evaluate_policies,
 )
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
+from edge_server.experiments.training.scheduler.policy_comparison import LEAD_MS, LEARNT, score_policies
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.scheduler.trainer import (
@@ -78,7 +78,7 @@ In a world each episode has a motion of its own, so that it is tested on motions
 small (--size) and the field is quick (--field), so that there are many decisions.
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
-apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. With --hold these two
+apart, OUT/evaluation.csv and summary.json how it does on seeds it was never trained on. With --hold these two
 are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
 Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
 """
@@ -126,7 +126,7 @@ def _train_and_evaluate(
         return
     if config.spec.hold_ms:
         draw_curve(args.out / "training.png", rows)
-        _contest(args, setting, learner.actor, pool)
+        _score(args, setting, learner.actor, pool)
         return
     kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
@@ -143,15 +143,15 @@ def _train_and_evaluate(
     _report(args.out, evaluation, kinds[0], rows, about)
 
 
-def _contest(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
+def _score(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
     """Fixed policies and the learnt one in the scenario as it is: its own size, all its training cameras."""
     scenario = load(args.scenario)
     report = () if set(setting.report) == set(scenario.held_out) else setting.report
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
     weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
-    found = contest(
-        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "contest.jsonl",
+    found = score_policies(
+        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "runs.jsonl",
         lambda line: print(f"  {line}", flush=True),
     )  # fmt: skip
     write_json(args.out / "scores.json", found, indent=1)
@@ -161,7 +161,7 @@ def _contest(args: argparse.Namespace, setting: Setting, actor: Actor, pool: Wor
 def _report(
     out: Path, evaluation: Evaluation, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
 ) -> None:
-    write_csv(out / "contest.csv", rows_of(evaluation))
+    write_csv(out / "evaluation.csv", rows_of(evaluation))
     found = summary(evaluation, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
     levels = {label: found["rewards"][name][0] for label, name in names.items()}

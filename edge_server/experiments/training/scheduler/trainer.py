@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 _PROGRESS_EVERY_S = 5.0
 # What train-scheduler writes of a finished training beside it.
-REPORTS = ("summary.json", "contest.csv")
+REPORTS = ("summary.json", "evaluation.csv")
 
 
 class TrainingError(ValueError):

@@ -14,7 +14,7 @@ import yaml
 
 from edge_server.config import ComputeConfig
 from edge_server.experiments.common.statistics import paired
-from edge_server.experiments.training.scheduler import command, contest
+from edge_server.experiments.training.scheduler import command, policy_comparison
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
 from edge_server.experiments.training.scheduler.deployed import (
@@ -188,8 +188,8 @@ def test_shares_run_from_random_to_hindsight(evaluation):
 
 
 def test_an_evaluation_is_reported_as_table_and_text(evaluation, tmp_path: Path):
-    write_csv(tmp_path / "contest.csv", rows(evaluation))
-    found = {row["policy"]: row for row in csv.DictReader((tmp_path / "contest.csv").open())}
+    write_csv(tmp_path / "evaluation.csv", rows(evaluation))
+    found = {row["policy"]: row for row in csv.DictReader((tmp_path / "evaluation.csv").open())}
     assert found.keys() == {*evaluation.outcomes, HINDSIGHT}
     assert float(found["all"]["views"]) >= 3.0 and float(found["random"]["share"]) == 0.0
     text = " ".join(lines(evaluation, "learnt", "threshold"))
@@ -256,7 +256,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     # The scenario asks for no LPIPS, so that the reward has no such term, wherever weights lie about.
     learner = Learner.load(out / "policy.npz")
     assert learner.reward_fields["name"] == "corrected" and learner.reward_fields["distance"] == 0.0
-    for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
+    for name in ("training.csv", "training.png", "evaluation.csv", "policy.npz"):
         assert (out / name).stat().st_size > 0
     policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
     with WorkerPool(NOTHING) as pool:
@@ -270,18 +270,18 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     # What is refused costs nothing that was there.
     assert main([*words[:3], *words[5:]]) == 2 and "other settings" in capsys.readouterr().err
     assert json.loads((out / "summary.json").read_text())["best_fixed"] == kept["best_fixed"]
-    assert (out / "contest.csv").exists() and (out / "policy.npz").exists()
+    assert (out / "evaluation.csv").exists() and (out / "policy.npz").exists()
     assert main([*words[:-3], "1", "--test", "0", "--out", str(out)]) == 0
-    assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
+    assert not (out / "summary.json").exists() and not (out / "evaluation.csv").exists()
 
 
 @pytest.mark.slow  # some 6 s of virtual deployments
 def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored_beside_fixed_ones(
     tmp_path: Path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(contest, "CONTESTANTS", ("all", "learnt", "age-driven"))
-    monkeypatch.setattr(contest, "SPAN_MS", 600.0)
-    for module in (command, contest):
+    monkeypatch.setattr(policy_comparison, "POLICIES", ("all", "learnt", "age-driven"))
+    monkeypatch.setattr(policy_comparison, "SPAN_MS", 600.0)
+    for module in (command, policy_comparison):
         monkeypatch.setattr(module, "LEAD_MS", 1200.0)
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
     edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals", "update_ms": 20}
@@ -299,14 +299,14 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     assert found["all"]["psnr_db_over_all"][0] == 0.0 and found["learnt"]["own_seed"]["psnr_db"] > 5.0
     assert found["age-driven"]["own_seed"]["views"] < found["all"]["own_seed"]["views"] == 4.0
     assert set(found["learnt"]["own_seed"]["omega_ms"]) <= {"low", "high"}
-    before = (out / "contest.jsonl").read_text()
+    before = (out / "runs.jsonl").read_text()
     assert main(words) == 0  # finished: nothing is run again
-    assert (out / "contest.jsonl").read_text() == before
+    assert (out / "runs.jsonl").read_text() == before
     assert json.loads((out / "scores.json").read_text())["policies"] == found
     actor = Actor.load(out / "actor.npz")
     assert actor.spec.hold_ms == 200.0 and (out / "actor.npz").stat().st_size < 4e5
     compared = tmp_path / "policies.json"
-    contest.main(
+    policy_comparison.main(
         [
             words[0],
             "all",
@@ -332,7 +332,7 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     ahead = shown["hindsight:50,200"]
     assert ahead["psnr_db"][0] > 5.0 and len(ahead["psnr_db_over_fixed"]) == 3
     with pytest.raises(SystemExit):
-        contest.main([words[0], "all", "--slower", "0", "--json", str(compared)])
+        policy_comparison.main([words[0], "all", "--slower", "0", "--json", str(compared)])
     assert "--slower 0: expected more than 0" in capsys.readouterr().err
 
 
@@ -417,7 +417,9 @@ def test_a_policy_may_show_nothing_in_the_span(tmp_path: Path):
             return [shown for _ in seeds]
 
     actor = Learner(CONFIG.spec, 0).actor
-    found = contest.contest(setting(), Judge(), range(2), actor, "", tmp_path / "known", said.append)  # type: ignore[arg-type]
+    found = policy_comparison.score_policies(
+        setting(), Judge(), range(2), actor, "", tmp_path / "known", said.append
+    )  # type: ignore[arg-type]
     assert said[0] == "all: - dB shown with seed 3"
     assert found["policies"]["learnt"]["psnr_db_over_all"] == [None] * 3
 

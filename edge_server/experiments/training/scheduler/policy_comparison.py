@@ -4,8 +4,8 @@ All policies with the scenario's own seed, for the page; the learnt one and its 
 too: one channel, one motion and the same instants for both. Policies without learning, with other seeds, and
 what hindsight of each second would win with these thresholds:
 
-    python -m edge_server.experiments.training.scheduler.contest card all whittle:1 hindsight:100,250,1000
-        --json FILE
+    python -m edge_server.experiments.training.scheduler.policy_comparison card all whittle:1
+        hindsight:100,250,1000 --json FILE
 
 Also on a machine of other costs: --costs, --slower.
 """
@@ -37,9 +37,9 @@ from freshfield.scenario import ScenarioError, load
 
 LEARNT = "learnt"
 REFERENCE = "all"
-CONTESTANTS = (
-    REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:6", "whittle:1",
-    "aoii:1", "covariance:1", "age-driven",
+POLICIES = (
+    REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:1", "aoii:1",
+    "covariance:1", "age-driven",
 )  # fmt: skip
 # Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
 LEAD_MS = 5000.0
@@ -49,7 +49,7 @@ HINDSIGHT, HINDSIGHT_HOLD_MS = "hindsight:", 1000.0
 _SHOWN = ("psnr_db", "psnr_moving_db")
 
 
-def contest(
+def score_policies(
     setting: Setting,
     pool: WorkerPool,
     seeds: range,
@@ -67,7 +67,7 @@ def contest(
     own = dataclasses.replace(setting, motions=False)
     own_seed = range(setting.scenario.seed, setting.scenario.seed + 1)
     found: dict[str, Any] = {}
-    for name in CONTESTANTS:
+    for name in POLICIES:
         who = learnt if name == LEARNT else name
         found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
         shown = number(found[name]["own_seed"]["psnr_db"])
@@ -124,7 +124,7 @@ def compare(
     also minus the fixed policy that is best on other seeds.
 
     names: policies without learning, and their values; ``hindsight:`` and its thresholds. known: as in
-    ``contest``.
+    ``score_policies``.
     """
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for seed in seeds:  # of one motion after the other: its pictures are rendered once
