@@ -420,8 +420,13 @@ def figures() -> str:
         longer = tuple(n for n in names if n != name and n.startswith(name))
         drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
                  if not (longer and p.name.startswith(longer))]  # fmt: skip
-        drawn.sort(key=lambda p: ("room" not in p, p))  # the usual scene first
+        # The usual scene first, and of it the curves.
+        drawn.sort(
+            key=lambda p: (not re.search("room|tile", p), bool(re.search("-(pictures|images|paths)", p)), p)
+        )
         more = "".join(f", [{p.removesuffix('.png')}]({p})" for p in drawn[1:])
+        if (DOCS / "results" / "thesis" / f"{name}-tables.md").exists():
+            more = f", [tables]({name}-tables.md){more}"
         parts += [
             f"## {study['title']}\n",
             f"`{study['command']}`: {'quick pass' if study['quick'] else 'full run'}{seeds}"
