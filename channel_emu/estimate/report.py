@@ -10,6 +10,7 @@ import yaml
 
 from channel_emu.estimate.fit import Fit, IntervalEstimate
 from freshfield.files import picture
+from freshfield.untrusted import YamlWriter
 
 _MIN_FRAMES, _MAX_FRAMES, _CYCLES = 300, 4000, 40
 _COLORS, _GREY = ("#0072B2", "#D55E00"), "#777777"
@@ -118,4 +119,4 @@ def _row(name: str, value: IntervalEstimate) -> str:
 
 
 def _yaml(document: dict[str, Any]) -> str:
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return yaml.dump(document, Dumper=YamlWriter, sort_keys=False, default_flow_style=None, width=100)

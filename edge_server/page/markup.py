@@ -82,7 +82,7 @@ def status(s: Summary) -> str:
         ("update", number(s.update_ms), "ms each"),
         ("mean age", number(s.mean_age_ms), "ms", s.mean_age_ms),
         ("worst age", number(s.worst_age_ms), "ms", s.worst_age_ms),
-        ("cameras reporting", f"{s.reporting}/{s.cameras}", ""),
+        ("cameras", f"{s.reporting}/{s.cameras}", ""),
     )
     cells = "".join(_tile(*tile) for tile in tiles)
     grid = "display:grid;grid-template-columns:repeat(3,1fr);gap:.4em;padding:0 .9em .5em"

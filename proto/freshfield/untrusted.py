@@ -53,20 +53,23 @@ class _Loader(yaml.SafeLoader):
         return value
 
 
+class YamlWriter(yaml.SafeDumper):
+    """For ``yaml.dump``: quotes the words that ``read_yaml`` would take for numbers."""
+
+
 # Numbers as YAML 1.2 writes them. In 1.1, which PyYAML reads, 1:30 is 90, 010 is 8, and 1e-3 is a word.
 _INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, form) for tag, form in known if tag not in (_INT, _FLOAT)]
-    for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+_NUMBERS = {
+    _INT: r"([-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$",
+    _FLOAT: r"[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$",
 }
-_Loader.add_implicit_resolver(
-    _INT, re.compile(r"([-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$"), list("-+0123456789")
-)
-_Loader.add_implicit_resolver(
-    _FLOAT,
-    re.compile(r"[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"),
-    list("-+.0123456789"),
-)
+for _kind in (_Loader, YamlWriter):
+    _kind.yaml_implicit_resolvers = {
+        first: [(tag, form) for tag, form in known if tag not in _NUMBERS]
+        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+    for _tag, _form in _NUMBERS.items():
+        _kind.add_implicit_resolver(_tag, re.compile(_form), list("-+.0123456789"))
 _Loader.add_constructor(_INT, _Loader.construct_whole_number)
 
 

@@ -8,10 +8,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import yaml
 
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
-from freshfield.untrusted import UntrustedError, read_json, read_yaml, refuse_expansion, stored_bytes
+from freshfield.untrusted import (
+    UntrustedError,
+    YamlWriter,
+    read_json,
+    read_yaml,
+    refuse_expansion,
+    stored_bytes,
+)
 from tests.work import work_ms
 
 LEVELS = "abcdefghijklmnop"
@@ -100,6 +108,8 @@ def test_numbers_are_those_of_yaml_1_2():
     found = read_yaml("[1:30, 1_000, 010, 0x1F, 0o17, -5, 1e-3, .5, 5., -.inf, on, 1-2]")
     assert found == ["1:30", "1_000", 10, 31, 15, -5, 0.001, 0.5, 5.0, -math.inf, True, "1-2"]
     assert math.isnan(read_yaml(".nan")) and read_yaml("!!int '12'") == 12
+    kept = ["08", "1e3", "1:30", "7", 8, 1e-5, 1e300, 0.1, True, None, "cam00", "0x1F", ".5", math.inf]
+    assert read_yaml(yaml.dump(kept, Dumper=YamlWriter)) == kept, "names stay words, numbers stay themselves"
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from camera_node.robot.calibration.hand_eye.calibrate import Calibration, Method
 from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
 from camera_node.robot.calibration.hand_eye.samples import rotation_vectors
 from freshfield import files
+from freshfield.untrusted import YamlWriter
 
 _BLUE, _RED = "#0072B2", "#D55E00"
 
@@ -69,7 +70,7 @@ def write_yaml(found: Calibration, path: Path) -> None:
         "arm_noise_deg": float(np.degrees(found.refined.arm_noise_rad)),
         "warnings": warnings,
     }
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
+    text = yaml.dump(data, Dumper=YamlWriter, sort_keys=False, default_flow_style=None, width=200)
     try:
         files.write_text(path, text)
     except OSError as error:
