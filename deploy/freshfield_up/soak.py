@@ -1,7 +1,7 @@
 """Real processes under faults, for minutes: does each fault end within two seconds, does memory stay flat?
 
     python -m freshfield_up.soak --minutes 30 --json docs/results/soak.json
-    python -m freshfield_up.soak --kills 100 --every 8 --json docs/results/kills.json
+    python -m freshfield_up.soak --kills 34 --every 8 --json docs/results/kills.json
 
 starts a scenario's camera node, emulator and edge with a wire between each two. Every minute it does one
 thing to them: first KILLS, then FAULTS again and again, at last a full disk (where it may mount a tmpfs).

@@ -25,13 +25,13 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
     "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
-    "whittle": (index.Whittle, "the k views that take most from the squared ages of what is known; value: k"),
-    "aoii": (index.IncorrectAge, "the k views of whose change the field has not known for longest; value: k"),
+    "whittle": (index.Whittle, "the k views that most reduce the squared ages of used views; value: k"),
+    "aoii": (index.IncorrectAge, "the k views with the largest age of incorrect information; value: k"),
     "covariance": (index.PredictedCovariance, "the k views whose predicted variance falls most; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-arrived": (WaitArrived, "as wait, but frames that arrive meanwhile, however old (6.16)"),
-    "wait-flush": (WaitFlush, "as wait, what is on its way at the decision broken off (6.5)"),
+    "wait-flush": (WaitFlush, "as wait, and aborts the transmissions under way at the decision (6.5)"),
 }
 
 
