@@ -30,7 +30,7 @@ EVERY = 2  # steps between corrections of a pose, of one camera after the other
 PIXELS = 384  # compared for one correction
 _STEP_SHARE = 0.8  # of a Gauss-Newton step that is taken
 _LONGEST = 1.0  # pixels, of one step in one parameter
-_PRIOR = 1e-2  # of the squared error, at the bound: a picture without detail leaves the pose as given
+_PRIOR = 1e-2  # squared error that a correction at its bound costs: without detail, poses stay as given
 _OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
 
 
@@ -92,6 +92,8 @@ class PoseCorrections:
     A correction rotates a camera about its own center by exp(rotation) and shifts it. Gauss-Newton with
     finite differences of the rendered colors by small motions of the camera, so any representation will do.
     The mean correction of all cameras is kept at 0: the scene stays where it is.
+
+    most_m, most_deg: largest shift in metres and largest rotation in degrees.
     """
 
     def __init__(self, most_m: float, most_deg: float) -> None:

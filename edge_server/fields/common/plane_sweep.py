@@ -1,5 +1,5 @@
-"""Where surfaces are likely before anything is learned, from whole pictures (``kernels.plane_sweep``): for
-the first Gaussians of a splat, and to guide fields that would have to find depth by themselves."""
+"""Plane sweep: finds where surfaces are likely from whole pictures, before anything is learned
+(``kernels.plane_sweep``). It places the first Gaussians of a splat and guides the depth of other fields."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class SweepSettings(Protocol):
 
 
 def empty_color(settings: SweepSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The pictures' plain background color (3,), if they have one and it is rendered where nothing is: with a
-    background of the user's choice, a plain sky has to be learned like everything else."""
+    """The pictures' plain background color (3,), if they have one and the field renders it where nothing is.
+    With another background, which the user chose, a plain sky has to be learned like everything else."""
     return plain_background(views) if settings.background == "auto" and views else None
 
 

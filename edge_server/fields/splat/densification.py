@@ -91,8 +91,8 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
 def color_sensitivity(cloud: GaussianCloud) -> NDArray[np.float32]:
     """How much the loss depends on each Gaussian, float32 (N,), on an arbitrary scale: Adam's mean square of
     the gradient by color. That gradient sums, over the pixels a Gaussian covers, its weight in the pixel
-    times the error there. It is small for small, hidden and faint Gaussians, and where the error is small:
-    there are enough Gaussians there, and once there are not, error and gradient return. Infinite for
+    times the error there. It is small for small, hidden and faint Gaussians, and where the error is small,
+    because enough Gaussians are there; if too many are pruned, error and gradient return. Infinite for
     Gaussians that have made no step."""
     square = cloud.v[:, COLOR:BASE].sum(axis=1) / (1.0 - BETA2 ** np.maximum(cloud.age, 1))
     return np.where(cloud.age > 0, square, np.inf).astype(np.float32)

@@ -109,8 +109,9 @@ class RecordedDecision:
 
 
 def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
-    """Read the decision of the run in folder ``run`` that update ``number`` was made by: its own, or the one
-    that its policy held until then; None: the newest. ValueError: it is not kept, or its file is damaged."""
+    """Read the decision behind update ``number`` of the run in folder ``run``: its own, or the earlier one
+    that its policy still held (``Spec.hold_ms``). number: None takes the newest. Raises ValueError if the
+    decision is not kept, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(
