@@ -30,8 +30,8 @@ _NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 class Embedder:
     """A frozen map from images to ``dim`` numbers each.
 
-    name: what was learned with one embedder holds for any other of the same name. failed: number of images
-    for which the model gave NaN or infinity.
+    name: identifies the map: what was learned with one embedder holds for any other of the same name.
+    failed: number of images for which the model gave NaN or infinity.
     """
 
     def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:

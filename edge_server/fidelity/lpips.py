@@ -103,7 +103,7 @@ class Lpips:
 
 
 def _shapes(network: str) -> dict[str, tuple[int, ...]]:
-    """Of every array by its name: a weight and a bias for each convolution."""
+    """The shape of every array by its name: a weight and a bias for each convolution."""
     layers = dict(_ALEX)
     if network == "squeeze":
         layers = {"0": (64, 3, 3)}

@@ -88,8 +88,8 @@ class Layers:
 
 
 def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | None]:
-    """(metric, None), or (None, reason) in one line where it cannot be used. folder: with the detector and
-    the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
+    """(metric, None), or (None, reason) in one line where it cannot be used. folder: folder with the detector
+    and the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
     try:
         with np.load(folder / COEFFICIENTS, allow_pickle=False) as archive:
             taps = tuple(str(tap) for tap in archive["taps"])

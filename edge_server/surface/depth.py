@@ -27,9 +27,14 @@ Camera = tuple[NDArray[np.float64], Pinhole]
 
 @dataclass(frozen=True)
 class DepthMap:
-    """depth: float32 (H, W), meters along the ray; 0: unknown, inf: the ray hits nothing. trust: float32
-    (H, W), weight (w_new of 3.9); 0: unknown. cosine: float32 (H, W), of the angle between ray and normal.
-    color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters."""
+    """What one camera sees of a surface.
+
+    depth: float32 (H, W), meters along the ray; 0: unknown, inf: the ray hits nothing.
+    trust: float32 (H, W), weight (w_new of 3.9); 0: unknown.
+    cosine: float32 (H, W), of the angle between ray and normal.
+    color: uint8 (H, W, 3).
+    camera_to_world: (4, 4), OpenCV axes, meters.
+    """
 
     depth: NDArray[np.float32]
     trust: NDArray[np.float32]

@@ -36,9 +36,14 @@ class Truth:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Distances in millimeters. accuracy: from the mesh to the surface; completeness: from the surface that
-    two cameras see to the mesh; chamfer: the mean of the two means. complete: share of that surface within
-    ``WITHIN_M`` of the mesh; precise: share of the mesh within ``WITHIN_M`` of the surface."""
+    """Distances in millimeters.
+
+    accuracy: from the mesh to the surface (mean, median, 95th percentile).
+    completeness: mean from the surface that two cameras see to the mesh.
+    chamfer: the mean of the two means.
+    complete: share of that surface within ``WITHIN_M`` of the mesh.
+    precise: share of the mesh within ``WITHIN_M`` of the surface.
+    """
 
     chamfer_mm: float
     accuracy_mm: float

@@ -127,8 +127,8 @@ def _smoothed(
 ) -> NDArray[np.float32]:
     """Flow of the moving pixels averaged over their neighborhood by confidence; 0 elsewhere.
 
-    Pixels that were hidden in the frame before have no flow of their own and take that of their body. Small
-    errors must not tear a body apart that is warped several times as far as it was seen to move.
+    Pixels that were hidden in the frame before have no flow of their own and take that of their body. A body
+    is warped several times as far as it was seen to move: small errors must not tear it apart.
     """
     share = (np.maximum(confidence, _LEAST_CONFIDENCE) * moving).astype(np.float32)
     total = np.maximum(cv2.GaussianBlur(share, (0, 0), _SMOOTHING_PX), np.float32(1e-9))

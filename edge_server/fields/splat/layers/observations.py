@@ -60,7 +60,7 @@ class FixedCamera:
         self.plate.fill_unknown(rendering.color)
 
     def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
-        """Take its exposure as ``ratio`` times what it was thought to be."""
+        """Multiply the assumed exposure by ``ratio``, float32 (3,), one factor a channel."""
         self.plate.correct_exposure(ratio)
         if self.fine is not None:
             self.fine.color /= ratio
@@ -71,7 +71,7 @@ class Observation:
     """A frame, and its linearization in the anchors' displacements.
 
     instant_s: what it shows, seconds from the field's origin.
-    foreground: bool (H, W). share: of the pixels, of the foreground.
+    foreground: bool (H, W). share: the foreground's share of the pixels.
     weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
@@ -121,7 +121,7 @@ class Observations:
 
     @property
     def newest_knot(self) -> int:
-        """The knot at or before that."""
+        """The knot at or before ``newest_s``."""
         return self._sorted[-1].knot
 
     def add(self, observation: Observation) -> None:

@@ -1,4 +1,4 @@
-"""The static field: Gaussians that learn from plates alone, in one schedule, again where plates change."""
+"""The static field: Gaussians trained on plates alone, in one schedule, and again where plates change."""
 
 from __future__ import annotations
 
