@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class PolicyConfig:
     """Which views an update uses.
 
-    name: of edge_server.scheduler, or bandit:FILE, relative to the scenario.
+    name: a policy of edge_server.scheduler, or bandit:FILE, relative to the scenario.
     value: the policy's one parameter (omega_ms, k, period_ms); None takes its default.
     """
 
@@ -93,7 +93,7 @@ class ExportConfig:
     """What ``edge-server export`` makes of the field at the end of a run of deploy/up.py.
 
     mesh: file in the run's folder, .ply or .glb.
-    voxel_mm: of the mesh; None: the size of a pixel at the surface.
+    voxel_mm: side of a voxel; None: the size of a pixel at the surface.
     """
 
     mesh: str

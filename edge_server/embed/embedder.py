@@ -94,8 +94,8 @@ class Embedder:
 
 
 def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[ort.InferenceSession, str]:
-    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. name: for errors. Raises
-    EmbeddingError."""
+    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. provider, threads: as in
+    ``EmbeddingConfig``. name: the model's name in error messages. Raises EmbeddingError."""
     available = [short for short, long in _NAMES.items() if long in ort.get_available_providers()]
     chosen = ("cuda" if "cuda" in available else "cpu") if provider == "auto" else provider
     if chosen not in available:

@@ -110,7 +110,7 @@ def decode(
     a score per class, in pixels of the model's input, and the weights of the masks.
 
     Returns rows (left, top, right, bottom, score, kind, *coefficients), best score first, without those that
-    are not finite or have no area. name: of the model, for errors. Raises ForegroundError."""
+    are not finite or have no area. name: the model's name in errors. Raises ForegroundError."""
     if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5 + coefficients:
         raise ForegroundError(
             f"{name}: gives {output.shape}, not the boxes and scores (1, 4 + kinds, cells) of a YOLO v8 or "

@@ -130,7 +130,7 @@ class FrameBuffer:
                         ranked.append(((k, waits_on, older, last, -item.generated_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
-            for k, item in enumerate(taken):  # of those of one take, whoever came first waits longest
+            for k, item in enumerate(taken):  # within one take, the first camera has waited longest
                 self._last_take[item.frame.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
             self.held_back = 0

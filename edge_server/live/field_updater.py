@@ -30,8 +30,8 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
     from edge_server.scheduler.learned.state import State
 
 
-INTAKE_SHARE = 0.4  # of a budget in seconds, for new frames where the field wants every frame
-LEAST_TAKEN = 4  # new frames, however short the budget is
+INTAKE_SHARE = 0.4  # share of a budget in seconds for taking in new frames, if the field wants every frame
+LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 
 
 @dataclass(frozen=True)

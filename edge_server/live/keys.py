@@ -20,7 +20,7 @@ from freshfield.scenario import load
 from freshfield.transport import TransportError
 
 _DAYS = 365
-_MOST_NAME_CHARS = 64  # of a certificate's common name
+_MOST_NAME_CHARS = 64  # in a certificate's common name
 _HERE = ("localhost", "127.0.0.1", "::1")
 
 

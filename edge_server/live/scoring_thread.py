@@ -85,7 +85,7 @@ class ScoringThread:
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
         self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
-        self._shown_count, self._shown_cost_s = 0, np.inf  # of the last one, CPU seconds
+        self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
         self._allowance_s, self._asked_s, self._used_s = _ALLOWANCE_S, time.monotonic(), 0.0
         self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
@@ -128,7 +128,7 @@ class ScoringThread:
             log.debug("thread priority cannot be lowered here")
         try:
             self._scorer.warm_up()
-        except Exception:  # whatever it is costs scores, not the thread
+        except Exception:  # it costs scores, not the thread
             log.exception("a metric could not be loaded")
         # Loading is not charged: the allowance would be gone for half a minute.
         self._asked_s, self._used_s = time.monotonic(), time.thread_time()

@@ -76,7 +76,7 @@ class FrontierPoint:
     effort, options: name and field options of the setting.
     speed_m_per_s: speed of what moves in the scene it was measured on.
     update_ms: time from decision to publication; for a field in layers, from one update to the next.
-    psnr_db: of the whole image; psnr_moving_db: where the scene moves.
+    psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
     error_db: upper bound of the standard error of their mean; 0 with one seed.
     measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
     """
@@ -208,7 +208,7 @@ def open_budget(
 
 
 def options_for(frontier: Frontier, config: EdgeConfig) -> dict[str, Any]:
-    """The field's options: the scenario's own, over those of the frontier point that a deadline leads to."""
+    """The field's options: those of the best point within a deadline, overridden by the scenario's own."""
     point = None if config.deadline_ms is None else frontier.best(config.deadline_ms)
     if config.deadline_ms is None or point is None:
         return config.field_options

@@ -23,7 +23,7 @@ ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#222222", "#777777", "#E4E4E4"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
 WIDTH_INCH = 8.4
-_COLORS = 64  # of a file: a quarter of the bytes, and no difference that one sees in a curve
+_COLORS = 64  # in a file: a quarter of the bytes, without a visible difference in curves
 
 _RC: Any = {
     "font.family": "sans-serif",

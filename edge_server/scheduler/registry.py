@@ -119,7 +119,7 @@ def policy_label(policy: Policy) -> str:
 
 
 def short_name(name: str) -> str:
-    """A policy's name for people to read: of a checkpoint only the file's name, not its folder."""
+    """A policy's name for people to read: of ``bandit:FILE`` without the file's folder."""
     return BANDIT + Path(name.removeprefix(BANDIT)).name if name.startswith(BANDIT) else name
 
 

@@ -64,8 +64,10 @@ def make_depth_maps(
 ) -> list[DepthMap]:
     """Make the depth maps that ``mesh_from_depth_maps`` fuses.
 
-    renderer: of the field. views: the cameras, with their images. say: called with each stage and its
-    completed share. SurfaceError: there are no views.
+    renderer: renders the field. views: the cameras, with their images.
+    say: called with each stage and its completed share.
+    pool: threads; None: the shared ones.
+    Raises SurfaceError if there are no views.
     """
     if not views:
         raise SurfaceError("the field knows no cameras yet: fit it first")

@@ -33,7 +33,7 @@ from edge_server.surface.kernels.patch_match import (
     offer,
 )
 
-REACH = 0.18  # of the initial depth to each side that is searched
+REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
 GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
 GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
 SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction

@@ -41,7 +41,7 @@ class Motion:
 
 
 def estimate_motion(before: View, now: View, changes: Changes) -> Motion:
-    """Motion of the pixels of ``now``. changes: of the two views, by ``compare``."""
+    """Motion of the pixels of ``now``. changes: what ``compare`` found between the two views."""
     shape = now.image.shape[:2]
     speed, moving = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool)
     if not changes.changed.any():

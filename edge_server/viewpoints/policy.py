@@ -60,8 +60,8 @@ class PolicyConfig:
 class Rows:
     """Turns a capture under way into the rows of a network.
 
-    embeddings: (N, d), those of the candidates' pictures; a row shows its own only once it is captured. None:
-        geometry only.
+    embeddings: (N, d), embeddings of the candidates' pictures; a row has its own only once it is captured.
+        None: geometry only.
     """
 
     def __init__(self, candidates: Candidates, embeddings: Array | None, layout: StateLayout) -> None:
@@ -109,7 +109,7 @@ def layout_of(
 class CandidatePolicy:
     """A trained policy as a selector: its values are logits.
 
-    weights: those of the actor.
+    weights: weights of the actor.
     embed: pictures to embeddings, as in training; needed if the policy was trained with embeddings.
     """
 
@@ -153,7 +153,7 @@ def train_policy(
     """Train a policy. Returns it with the mean return of each update (figure 4.6).
 
     reward: maps step features (..., GEOMETRY) to rewards (...), such as ``RewardModel.reward``.
-    embeddings: (N, d), those of the candidates' pictures, which the policy sees once they are captured.
+    embeddings: (N, d), embeddings of the candidates' pictures; the policy sees one once it is captured.
     embed: computes them when the policy is used.
 
     Raises ViewpointError for fewer reachable candidates than views, and for fewer than two views: the first

@@ -17,8 +17,8 @@ from edge_server.viewpoints.candidates import ViewpointError
 
 Array = NDArray[np.float64]
 
-# Widths of the prior (standard deviations of the weights) that the evidence chooses from. Features are scaled
-# such that they are those of the reward difference of a usual pair.
+# Widths of the prior (standard deviations of the weights) that the evidence chooses from. By the scale of the
+# features, a width is also the standard deviation of the reward difference of a usual pair.
 WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
 # Odds against a coin from which on answers count as informative. Answers by a coin reach them at most once in
 # this many times (Markov's inequality, for exact evidence).
@@ -44,7 +44,7 @@ class RewardModel:
     """The posterior after some answers.
 
     scale: (d,) by which features are divided.
-    mean, covariance: (d,) and (d, d), those of the weights of scaled features.
+    mean, covariance: (d,) and (d, d), of the weights of scaled features.
     odds: how much likelier the answers are under the model than by a coin.
     answers: number of answers.
     """
@@ -98,8 +98,8 @@ class RewardModel:
 
 
 def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
-    """The posterior of the weights. features: (N, d) of the trajectories, of which any were compared. Raises
-    ViewpointError for features that are not finite or answers about unknown trajectories."""
+    """The posterior of the weights. features: (N, d), one row per trajectory, by the numbers in ``answers``.
+    Raises ViewpointError for features that are not finite or answers about unknown trajectories."""
     features = np.asarray(features, np.float64)
     if features.ndim != 2 or len(features) < 2 or not np.isfinite(features).all():
         raise ViewpointError("a reward model needs finite features of at least two trajectories")

@@ -71,7 +71,7 @@ class PreferenceSession:
 
     scenario: name of the reconstructions' scenario.
     orders: the views of each reconstruction, as in ``AnswersFile``.
-    features: (N, d), those of the reconstructions as trajectories.
+    features: (N, d), features of the reconstructions as trajectories.
     wanted: number of questions.
     seed: determines the questions, with the answers.
     by: who answers, PERSON or the label of a simulated expert.
@@ -117,7 +117,7 @@ class PreferenceSession:
             k = int(rng.choice(new[: max(len(new) - _REMEMBERED, 1)]))
             return Question(self.answers[k].right, self.answers[k].left, k)
         pair = next_pair(self.model, self.features, rng)
-        # Both orders of a pair tell as much but for rounding, which would put the better one on the left.
+        # Both orders of a pair are equally informative up to rounding, which would put the better one left.
         left, right = rng.permutation(pair).tolist()
         return Question(left, right)
 

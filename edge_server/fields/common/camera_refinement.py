@@ -121,7 +121,7 @@ class PoseCorrections:
     ) -> None:  # fmt: skip
         """One Gauss-Newton step for one camera.
 
-        view: of that camera. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
+        view: the camera's view. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
         pixel_m: width of a pixel at the scene, the scale of all parameters.
         rng: chooses the pixels. background: float32 (3,), behind transparent pixels.
         """
@@ -197,7 +197,7 @@ class CameraRefinement:
     ) -> Views:  # fmt: skip
         """Learn from a step; returns the corrected data.
 
-        step: number of steps made. seed: of the field.
+        step: number of steps made. seed: the field's.
         sums: float64 (chunks, V, 3, 5), see ``Exposures.learn``; cleared.
         make_renderer: returns a renderer of the field as it is.
         """

@@ -153,7 +153,7 @@ def pack_views(
 ) -> Views:
     """Everything one fit reads. Opaque and transparent pictures may be mixed.
 
-    memory: by camera; says which pixels moved.
+    memory: camera -> its newest view, and which of its pixels moved.
     weights: float32 (H, W) of each view (``view_outliers.pixel_weights``); None: all 1.
     """
     packed = pack_cameras(views, box)

@@ -18,7 +18,7 @@ BETA1, BETA2 = 0.9, 0.99
 BETA1_FIELD = 0.65
 # The smoothness prior visits whole levels: applied now and then, and stronger for it, it does as well.
 SMOOTH_EVERY = 4
-LATE = 1.1  # of a budget in seconds: a fit may end so late rather than make no step
+LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
 

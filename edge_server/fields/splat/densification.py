@@ -55,7 +55,7 @@ class GaussianCloud:
         return len(self.params)
 
     def gaussians(self, which: slice | NDArray[np.int64] = slice(None)) -> Gaussians:
-        """The arrays that are projected: of all Gaussians and not copied, or copies for some."""
+        """The arrays that are projected: without a copy for all Gaussians, copied for some of them."""
         harmonics = (self.params.shape[1] - BASE) // 3 + 1
         return Gaussians(self.params[which], harmonics, self.velocity[which])
 

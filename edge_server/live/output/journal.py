@@ -49,8 +49,8 @@ class Journal:
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
         self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages", "poses")}
-        self._last_s: float | None = None  # of the last publication
-        self._usual_s: float | None = None  # from one publication to the next
+        self._last_s: float | None = None  # instant of the last publication
+        self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
         self._last_pose: dict[str, Pose] = {}
         self._poses_left = _MOST_POSES

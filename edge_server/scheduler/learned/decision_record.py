@@ -36,7 +36,8 @@ class DecisionWriter:
     """Writes decisions under ``out``. A full disk costs decisions, counted in ``lost``, never the edge. Not
     thread-safe.
 
-    embedding: settings of the embedder, to embed the frames again. max_decisions, max_bytes: to keep on disk.
+    embedding: settings of the embedder, to embed the frames again; None: nothing was embedded.
+    max_decisions, max_bytes: how much to keep on disk.
     """
 
     def __init__(

@@ -98,7 +98,7 @@ class OnlinePolicy(Policy):
 
     learner: owned by this policy from now on.
     fixed: the policy beside it.
-    name: of the whole, as people write it.
+    name: name of this policy, as people write it.
     rng: draws which of the two decides, and the actions that explore.
     settings: None takes the defaults.
     Threads: the update loop's calls ``plan`` and ``select``, one other ``learn``, any ``add_reward`` and

@@ -140,9 +140,9 @@ def choose_reward(
 
     action: the learner's, as in ``Spec``.
     given: NAME or NAME:moving; None or empty: not given.
-    path: that of the checkpoint.
+    path: the checkpoint.
     lpips_missing: why there is no LPIPS (the reward then drops its LPIPS term); None where there is.
-    reward_fields: those of the training's reward, if the checkpoint has them.
+    reward_fields: fields of the training's reward, if the checkpoint has them.
     Raises ValueError for an unknown name or damaged fields.
     """
     if reward_fields is not None and not given:

@@ -17,7 +17,7 @@ from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_field import PlateImage
 
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
-BACKGROUND_WEIGHT = 0.5  # of other pixels
+BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
 OCCLUDED_M = 0.15  # pixels do not count where the static field is nearer than the moving set by this
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
 
@@ -145,8 +145,8 @@ def pixel_weights(
     """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
     field hides what moves.
 
-    foreground: bool (H, W). depth_m: float32 (H, W), of the static field, or None.
-    distance_m: of the moving set. given: float32 (H, W), ``View.weight``, or None.
+    foreground: bool (H, W). depth_m: float32 (H, W), depth of the static field; None: unknown.
+    distance_m: distance of the moving set. given: float32 (H, W), ``View.weight``, or None.
     """
     square = np.ones((NEAR_FOREGROUND_PX, NEAR_FOREGROUND_PX), np.uint8)
     near = cv2.dilate(foreground.astype(np.uint8), square)
