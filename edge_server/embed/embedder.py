@@ -35,8 +35,8 @@ class Embedder:
     """
 
     def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:
-        """EmbeddingError: ``dim`` exceeds the backbone's channels, ONNX Runtime has no such provider, or the
-        model does not run."""
+        """dim, provider, threads: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the
+        backbone's channels, ONNX Runtime has no such provider, or the model does not run."""
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
@@ -80,7 +80,8 @@ class Embedder:
         return out
 
     def run(self, part: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels)."""
+        """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels). Raises
+        EmbeddingError if the model fails or gives another shape."""
         try:
             found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
         except Exception as error:  # ONNX Runtime's exceptions share no base class

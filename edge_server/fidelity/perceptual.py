@@ -34,7 +34,8 @@ class Perceptual:
     minimum_side = MINIMUM_SIDE
 
     def __init__(self, layers: Layers, weights: list[NDArray[np.float64]], power: float) -> None:
-        """weights: w_l^2 (C_l,) of each layer, not negative. ValueError where they do not fit the layers."""
+        """weights: w_l^2 (C_l,) of each layer, not negative. power: exponent of g. Raises ValueError if they
+        do not fit the layers."""
         if len(weights) != len(layers.taps) or not 0.0 < power <= 4.0:
             raise ValueError(f"{len(weights)} weights for {len(layers.taps)} layers, power {power}")
         if not all(np.isfinite(w).all() and (w >= 0.0).all() for w in weights):

@@ -158,7 +158,8 @@ class Scorer:
 
     def publish(self, camera: str, rendering: Render, published_ns: int) -> list[Score]:
         """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``, or a function of the truth's
-        generation time that makes it; returns the scores that are complete already."""
+        generation time that makes it, published at ``published_ns``; returns the scores that are complete
+        already."""
         pending = self._camera(camera).pending
         if len(pending) == MAX_PENDING:
             self.unscored += 1  # the oldest falls off the deque
@@ -326,7 +327,7 @@ def open_listed_perceptual(metrics: Sequence[str]) -> PerceptualMetric | None:
 
 def mean_score(scores: Sequence[Score]) -> Score:
     """Mean over several held-out cameras of one publication; a metric is averaged over the cameras that have
-    it."""
+    it. Raises ImageError for no scores."""
     if not scores:
         raise ImageError("no scores to average")
     means: dict[str, Any] = {}

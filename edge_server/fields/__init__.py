@@ -92,7 +92,9 @@ class Rendering:
 class Renderer(Protocol):
     """Renders one scene; safe to use from any thread while a field trains on."""
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """Render a camera. camera_to_world: (4, 4), OpenCV axes, metres."""
+        ...
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` surface points (N, 3) in world metres and colors (N, 3) in [0, 1]."""

@@ -70,6 +70,7 @@ class TreatmentCost:
 class FieldUpdater:
     """Decides on and carries out the updates of one field from one buffer. Owns no thread, reads no clock.
 
+    start_ns: when the run began; ``Publication.t_s`` counts from it.
     embedder: for policies that look at what the cameras see.
     keyframes: earlier viewpoints of moving cameras.
     foreground: cuts the background out of views.

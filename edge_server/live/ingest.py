@@ -212,5 +212,6 @@ class RollingPercentiles:
         self._values.append(value)
 
     def percentile(self, percent: float) -> float | None:
+        """The value that ``percent`` of the values (0 to 100) do not exceed; None without values."""
         values = sorted(self._values)
         return values[min(len(values) - 1, int(len(values) * percent / 100))] if values else None

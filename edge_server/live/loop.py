@@ -72,7 +72,8 @@ class UpdateLoop:
         self._thread.start()
 
     def stop(self, timeout_s: float = STOP_S) -> None:
-        """Ask the loop to end after the current update, and wait for it; ``alive`` says whether it has."""
+        """Ask the loop to end after the current update, and wait up to ``timeout_s`` for it; ``alive`` says
+        whether it still runs."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)

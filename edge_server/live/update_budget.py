@@ -136,7 +136,7 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
 
 
 def best_point(points: Sequence[FrontierPoint], deadline_ms: float, speed_m_per_s: float) -> FrontierPoint:
-    """The best point within the deadline, among those measured at the speed nearest to the scene's.
+    """The best point within the deadline, among those measured at the speed nearest to ``speed_m_per_s``.
 
     More time is not always better: what moves ages meanwhile. Of the points that are within the standard
     error of the best, the fastest is taken. If none meets the deadline, it is the fastest of all.

@@ -43,6 +43,8 @@ Process = Callable[[ServerConnection, Request], Response | None]
 
 
 class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    """viser's message about a visitor's camera."""
+
     wxyz: tuple[float, float, float, float]
     position: Vector
     fov: float
@@ -54,6 +56,7 @@ class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields
     up_direction: Vector
 
     def sound(self) -> bool:
+        """Whether the camera can be rendered: finite, with a rotation, a field of view and a size."""
         numbers = (*self.wxyz, *self.position, *self.look_at, *self.up_direction)
         sides = (self.image_height, self.image_width)
         return (
@@ -65,6 +68,8 @@ class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields
 
 
 class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=True):
+    """viser's message about a click on a scene node."""
+
     name: str
     instance_index: int | None
     ray_origin: Vector
@@ -75,6 +80,8 @@ class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=T
 
 
 class Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    """viser's message about new values of a control."""
+
     uuid: str
     updates: dict[str, bool | int | float | str]
 

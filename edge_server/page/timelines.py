@@ -25,7 +25,8 @@ HEIGHT = 104
 
 
 class History:
-    """Ages and the channel's state, sampled by the page with or without visitors. Bounded."""
+    """Ages and the channel's state, sampled by the page with or without visitors: at most the last
+    ``window_s`` seconds and ``most`` samples."""
 
     def __init__(self, window_s: float = WINDOW_S, most: int = 1200) -> None:
         self._window_s = window_s

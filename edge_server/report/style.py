@@ -60,7 +60,7 @@ def figure(
 ) -> Iterator[tuple]:
     """``with figure(path, rows) as (fig, axes):`` draws in the common style and writes ``path`` (PNG).
 
-    axes: array (rows, columns). kwargs go to ``plt.subplots``.
+    axes: array (rows, columns). height_inch: height of a row. kwargs go to ``plt.subplots``.
     """
     with plt.rc_context(_RC):
         fig, axes = plt.subplots(

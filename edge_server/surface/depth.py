@@ -65,11 +65,15 @@ def depth_map(
     sure: NDArray[np.float32] | None = None,
     steepest_deg: float = STEEPEST_DEG,
 ) -> DepthMap:
-    """A depth map from depth along rays (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond
-    ``MAX_DEPTH_M``: unknown. sure: float32 (H, W), factor of the trust of pixels that see a surface.
-    SurfaceError: shapes do not match.
+    """A depth map from depth along rays. Trust is the cosine between ray and normal: uncertainty grows as the
+    surface turns away.
 
-    Trust is the cosine between ray and normal: uncertainty grows as the surface turns away.
+    depth: float32 (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond ``MAX_DEPTH_M``:
+        unknown.
+    color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters.
+    sure: float32 (H, W), factor of the trust of pixels that see a surface; None: 1.
+    steepest_deg: largest angle between ray and normal; beyond it depth is unknown.
+    Raises SurfaceError if shapes do not match or the pose is not finite.
     """
     shape = (intrinsics.height, intrinsics.width)
     if depth.shape != shape or color.shape != (*shape, 3):
@@ -128,8 +132,11 @@ def render_depth_maps(
     solid: float = SOLID,
     on_map: Callable[[int], None] | None = None,
 ) -> Iterator[DepthMap]:
-    """Render depth maps for ``cameras``, one at a time. on_map: called with the count done. For a ``planar``
-    renderer, ``render_surface`` gives unbiased depth."""
+    """Render depth maps for ``cameras``, one at a time. For a ``planar`` renderer, ``render_surface`` gives
+    unbiased depth.
+
+    solid: least opacity of a ray that hits a surface. on_map: called with the count done.
+    """
     show = renderer.render_surface if getattr(renderer, "planar", False) else renderer.render  # type: ignore[attr-defined]
     for k, (pose, lens) in enumerate(cameras):
         found = show(pose, lens)

@@ -55,7 +55,8 @@ class Comparison:
 
 
 def thin_points(points: Points, spacing_m: float) -> NDArray[np.int64]:
-    """Indices of the first of points (N, 3) in every grid cell."""
+    """Indices of the first of points (N, 3) in every grid cell of side ``spacing_m``. Raises SurfaceError if
+    the points span too many cells."""
     cells = np.floor(points / spacing_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     x, y, z = (int(n) + 1 for n in cells.max(axis=0, initial=0))

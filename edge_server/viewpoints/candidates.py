@@ -96,8 +96,13 @@ def from_poses(
     target: ArrayLike | None = None,
     bounds: ArrayLike | None = None,
 ) -> Candidates:
-    """Candidates at any poses (4, 4), all reachable. target: None takes the point nearest to all lines of
-    sight. Raises ViewpointError for none, or for poses that are not finite."""
+    """Candidates at any poses (4, 4), all reachable.
+
+    lens: intrinsics of the camera.
+    target: (3,); None takes the point nearest to all lines of sight.
+    bounds: (2, 3), lower and upper corner of the object; None: not known.
+    Raises ViewpointError for no poses, or for poses that are not finite.
+    """
     array = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     if not len(array):
         raise ViewpointError("no candidate viewpoints: give at least one pose")

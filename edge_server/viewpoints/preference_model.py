@@ -85,7 +85,7 @@ class RewardModel:
 
     def information(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
         """(M,) nats that the answer to each pair is expected to give about the weights: the entropy of the
-        answer less what would remain if the weights were known."""
+        answer less what would remain if the weights were known. Arguments as in ``probability``."""
         mean, entropy = _expected(*self._difference(features, first, second))
         return _entropy(mean) - entropy
 

@@ -60,6 +60,8 @@ class AnswersFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Question:
+    """The reconstructions to show on either side. repeats: as in ``Given``."""
+
     left: int
     right: int
     repeats: int | None = None

@@ -168,7 +168,10 @@ class PoseCorrections:
 
 
 class CameraRefinement:
-    """Exposures and pose corrections of one field's cameras, each None unless enabled."""
+    """Exposures and pose corrections of one field's cameras, each None unless enabled.
+
+    exposure: whether exposures are learned. most_m, most_deg: as in ``PoseCorrections``; both 0: no poses.
+    """
 
     def __init__(self, exposure: bool, most_m: float, most_deg: float) -> None:
         self.exposures = Exposures() if exposure else None

@@ -41,6 +41,7 @@ class GaussianCloud:
 
     @classmethod
     def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
+        """Static Gaussians that have made no step, with parameters float32 (N, P)."""
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
         age, guest, velocity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.float32)
