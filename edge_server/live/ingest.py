@@ -167,7 +167,7 @@ class Ingest:
     def take(self, message: bytes | pb.PushRequest, stream: ServedCall | None = None) -> pb.PushResponse:
         """Check one frame, buffer it and enter it in the ledger; the response says what became of it.
 
-        stream: the call that it came on; None: it came on none, and sessions are not checked for it.
+        stream: the call that it came on, which claims the frame's session; None: nothing claims it.
         """
         start_s = time.perf_counter()
         now_ns = self._clock.now_ns()

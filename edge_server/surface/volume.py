@@ -28,7 +28,7 @@ OUTLIERS = 0.002  # share of points at each end of each axis
 @dataclass(frozen=True)
 class Grid:
     """The voxel grid. lower, upper: (3,) meters, corners of the box. voxel_m: side of a voxel. band_m:
-    truncation, d_max of (3.8). Raises SurfaceError for a grid that is not finite or too fine."""
+    truncation, d_max of (3.8). Raises SurfaceError for an impossible or too fine grid."""
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
