@@ -104,8 +104,8 @@ class FrameBuffer:
 
         ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
         Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
-        longest wait first; then the youngest frame, and of equally young ones that of the camera that has
-        waited longest. What exceeds ``most`` is dropped and counted in ``shed``, except for a camera's newest
+        longest wait first; then the youngest frame; among equally young ones, the camera that has waited
+        longest. What exceeds ``most`` is dropped and counted in ``shed``, except for a camera's newest
         frame, which waits on. Frames of cameras that were not selected are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)

@@ -52,8 +52,8 @@ class IndexPolicy(Policy):
 class Whittle(IndexPolicy):
     """Whittle-type index: selects the k views that most reduce the squared ages of the frames used last.
 
-    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D that of its frame used last:
-    where a new frame is always at hand (a = 0) that is the Whittle index of the age of information over a
+    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D the age of its frame used
+    last. If a new frame is always at hand (a = 0), this is the Whittle index of the age of information over a
     reliable channel (Kadota et al., IEEE/ACM ToN 2018, with p = 1 and up to half a slot).
     """
 
@@ -85,9 +85,9 @@ class IncorrectAge(_SeeingPolicy):
     """Age of incorrect information: selects the k views whose change the field has missed for longest.
 
     A camera's index is D |z - z'|, with D the age of its frame used last, z' the embedding of that frame and
-    z that of its newest: the age of incorrect information with linear time and distance as penalty (Maatouk
-    et al., IEEE/ACM ToN 2020). The edge cannot see the source itself: its newest frame stands for it, and
-    what the field knows was correct when the frame used last was taken.
+    z the embedding of its newest: the age of incorrect information with linear time and distance as penalty
+    (Maatouk et al., IEEE/ACM ToN 2020). The edge cannot see the source itself: the newest frame stands for
+    it, and what the field knows was correct when the frame used last was taken.
     """
 
     name = "aoii"

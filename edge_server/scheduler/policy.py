@@ -32,7 +32,7 @@ class Epoch:
     """What a policy may look at.
 
     now_ns: time of the decision on the edge's clock.
-    number: counts the epochs; at the edge it is that of the update to decide on.
+    number: counts the epochs; at the edge it is the number of the update to decide on.
     generated_ns, received_ns: when the newest frame of each camera was generated, and when it arrived;
     cameras that have not reported are missing.
     state: computes the state of all cameras, with poses and embeddings, for policies that look at more than
@@ -85,7 +85,7 @@ class Policy:
     embedding: tuple[int | None, str] = (0, "")
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        """value: that of ``parameter``; None keeps the default. rng: for policies that draw. Raises
+        """value: value of ``parameter``; None keeps the default. rng: for policies that draw. Raises
         ValueError for a value out of range."""
         self._rng = rng
         if self.parameter is None or value is None:

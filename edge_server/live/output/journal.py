@@ -78,8 +78,8 @@ class Journal:
                 self._write_oldest()
 
     def shown(self, t_s: float, score: Score, publication: Publication) -> None:
-        """Write a line with ``score``, that of what was shown at ``t_s``: ``publication``, extrapolated to
-        then. The age of its views is the sum of network, waiting, computing and display."""
+        """Write a line with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated
+        to ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
         waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
         line = {
             "t_s": round(t_s, 4),

@@ -86,8 +86,8 @@ class ExploringActor(Actor):
 
 @dataclass(frozen=True)
 class _Pending:
-    """A decision whose reward may still come. decision: None where the fixed policy took it. probability:
-    that with which the learned policy was to take it."""
+    """A decision whose reward may still come. decision: None if the fixed policy took it. probability:
+    probability with which the learned policy would be drawn to take it."""
 
     decision: Decision | None
     probability: float

@@ -136,7 +136,7 @@ def choose_reward(
     lpips_missing: str | None,
     reward_fields: dict[str, Any] | None = None,
 ) -> Reward:
-    """The reward to learn by: ``given``, else that of the training, else the default of ``action``.
+    """The reward to learn by: ``given``, else the training's reward, else the default of ``action``.
 
     action: the learner's, as in ``Spec``.
     given: NAME or NAME:moving; None or empty: not given.

@@ -75,7 +75,8 @@ class SequentialTest:
     def update(self, learned: bool, probability: float, reward: float) -> bool:
         """Take the reward of a decision; returns whether the difference is now detected.
 
-        learned: whether the learned policy took it. probability: that with which it was to take it.
+        learned: whether the learned policy took the decision.
+        probability: the probability with which the learned policy would be drawn to take it.
         """
         above = self._above_usual(reward)  # judged by earlier rewards, or it would depend on who decided
         self._rewards.append((learned, reward))
