@@ -231,7 +231,7 @@ def _open_page(host: str, port: int, secure: transport.Transport, state: EdgeSta
 
 
 def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:
-    """How the policy goes on learning. A fixed policy that --policy puts in its place does not."""
+    """How the policy goes on learning; None: it does not, e.g. if --policy replaces it by a fixed one."""
     from edge_server.config import LearnConfig
     from edge_server.scheduler import BANDIT
 

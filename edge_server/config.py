@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class PolicyConfig:
     """Which views an update uses.
 
-    name: of edge_server.scheduler, or bandit:FILE, relative to the scenario.
+    name: a policy of edge_server.scheduler, or bandit:FILE, relative to the scenario.
     value: the policy's one parameter (omega_ms, k, period_ms); None takes its default.
     """
 
@@ -45,9 +45,13 @@ class LearnConfig:
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server frontier``
-    measures what a machine takes. ms_per_treated_view: of policies that treat views. ms_per_view: of each
-    frame that has arrived since the last update."""
+    """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server costs``
+    measures what a machine takes.
+
+    ms_per_step: for each optimizer step. ms_per_update: for each update.
+    ms_per_treated_view: for each view that a policy's treatment takes.
+    ms_per_view: for each frame that has arrived since the last update.
+    """
 
     ms_per_step: float = 0.0
     ms_per_update: float = 0.0
@@ -69,7 +73,7 @@ class ComputeConfig:
 class KeyframesConfig:
     """Earlier viewpoints of moving cameras (``live.keyframes``).
 
-    most: of each camera.
+    most: largest number of keyframes of each camera.
     apart_m, apart_deg: a view becomes a keyframe at this distance or angle from all others.
     """
 
@@ -89,7 +93,7 @@ class ExportConfig:
     """What ``edge-server export`` makes of the field at the end of a run of deploy/up.py.
 
     mesh: file in the run's folder, .ply or .glb.
-    voxel_mm: of the mesh; None: the size of a pixel at the surface.
+    voxel_mm: side of a voxel; None: the size of a pixel at the surface.
     """
 
     mesh: str
@@ -111,12 +115,13 @@ class EdgeConfig:
     updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame
     has arrived since.
     update_ms: fitting time of an update.
-    deadline_ms: instead of it, the time from decision to publication. The setting that spends it best is
-    looked up in ``frontier``, and the fitting time follows how busy the machine is.
+    deadline_ms: time from decision to publication, instead of ``update_ms``. The setting that spends it best
+    is looked up in ``frontier``, and the fitting time follows how busy the machine is.
     frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; page and report draw it,
     too. None: the shipped one.
-    steps, compute: of an update in virtual time, its optimizer steps and what it costs: ``zero``, the
-    milliseconds of ``ComputeConfig``, or a file of ``edge-server costs``, relative to the scenario.
+    steps: optimizer steps of an update in virtual time.
+    compute: what an update costs in virtual time: ``zero``, the milliseconds of ``ComputeConfig``, or a file
+    of ``edge-server costs``, relative to the scenario.
     scores: what policies reach in virtual time, for the page: the values of a scores.json of ``edge-server
     train-scheduler --hold``, which a scenario names relative to itself.
     grace_ms: how long the first update waits for cameras that have not reported.
@@ -167,8 +172,8 @@ class EdgeConfig:
 
 
 def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
-    """How frames are embedded: as the scenario says, else, if the policy needs embeddings, as policies are
-    trained. None where neither asks for them."""
+    """How frames are embedded: as the scenario says, else, if the policy needs embeddings, with the defaults
+    that policies are trained with. None where neither asks for embeddings."""
     if config.embedding is not None or policy.embedding[0] == 0:
         return config.embedding
     from edge_server.embed import EmbeddingConfig

@@ -37,10 +37,12 @@ class SizeError(EmbeddingError):
 class EmbeddingConfig:
     """The section ``edge.embedding`` of a scenario.
 
-    model: a YOLO detection ONNX, relative to the scenario, or ``default``. dim: length of an embedding, at
-    most the channels of the tapped layer. size: side of the model's input, pixels; None: the model's own.
+    model: a YOLO detection ONNX, relative to the scenario, or ``default``.
+    dim: length of an embedding, at most the channels of the tapped layer.
+    size: side of the model's input, pixels; None: the model's own.
     tap: the tensor to embed, or a module of the exporter's such as ``model.9``; None: the backbone's end.
-    provider: auto uses CUDA if ONNX Runtime has it. threads: of the CPU.
+    provider: auto uses CUDA if ONNX Runtime has it.
+    threads: number of CPU threads.
     """
 
     model: str = DEFAULT

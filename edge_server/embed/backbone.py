@@ -30,7 +30,7 @@ from edge_server.embed import EmbeddingError, SizeError
 OUTPUT = "pooled"
 # Twice the largest detectors of the family, 230 MB.
 MAX_FILE_BYTES = 512 * 2**20
-# Of one tensor per image: six times the largest of YOLO11x at 640 pixels.
+# Largest tensor per image, elements: six times the largest of YOLO11x at 640 pixels.
 MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
 # The training size of these detectors, unless the file states another.
@@ -69,8 +69,10 @@ class Backbone:
     """A detector up to its backbone's end: images (n, 3, height, width) in [0, 1] -> ``pooled`` (n,
     channels).
 
-    model: the ONNX bytes. tap: the tensor that is pooled. batch: images per run; None: any number. digest: of
-    the source file.
+    model: the ONNX bytes.
+    tap: the tensor that is pooled.
+    batch: images per run; None: any number.
+    digest: start of the source file's SHA-256.
     """
 
     name: str

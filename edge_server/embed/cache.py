@@ -39,7 +39,7 @@ class EmbeddingCache(Generic[Item]):
 
     def __init__(self, embedder: Embedder, decode: Callable[[Item], Any], capacity: int = CAPACITY) -> None:
         """decode: gives a frame's view with its ``image``, None if it is damaged. Share it with the field, so
-        that a frame that both use is decoded once."""
+        that a frame that both use is decoded once. capacity: number of embeddings to keep."""
         self._embedder, self._decode, self._capacity = embedder, decode, capacity
         # None: the frame has no embedding.
         self._rows: OrderedDict[_Key, _Row] = OrderedDict()

@@ -30,13 +30,13 @@ _NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 class Embedder:
     """A frozen map from images to ``dim`` numbers each.
 
-    name: what was learned with one embedder holds for any other of the same name. failed: number of images
-    for which the model gave NaN or infinity.
+    name: identifies the map: what was learned with one embedder holds for any other of the same name.
+    failed: number of images for which the model gave NaN or infinity.
     """
 
     def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:
-        """EmbeddingError: ``dim`` exceeds the backbone's channels, ONNX Runtime has no such provider, or the
-        model does not run."""
+        """dim, provider, threads: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the
+        backbone's channels, ONNX Runtime has no such provider, or the model does not run."""
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
@@ -80,7 +80,8 @@ class Embedder:
         return out
 
     def run(self, part: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels)."""
+        """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels). Raises
+        EmbeddingError if the model fails or gives another shape."""
         try:
             found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
         except Exception as error:  # ONNX Runtime's exceptions share no base class
@@ -94,8 +95,8 @@ class Embedder:
 
 
 def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[ort.InferenceSession, str]:
-    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. name: for errors. Raises
-    EmbeddingError."""
+    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. provider, threads: as in
+    ``EmbeddingConfig``. name: the model's name in error messages. Raises EmbeddingError."""
     available = [short for short, long in _NAMES.items() if long in ort.get_available_providers()]
     chosen = ("cuda" if "cuda" in available else "cpu") if provider == "auto" else provider
     if chosen not in available:

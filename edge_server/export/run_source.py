@@ -23,7 +23,7 @@ POSES = "poses.jsonl"
 
 @dataclass(frozen=True)
 class Source:
-    """A saved field. file: its checkpoint. name: of the representation. views: the last one of each
+    """A saved field. file: its checkpoint. name: name of the representation. views: the last view of each
     camera."""
 
     file: Path

@@ -1,4 +1,4 @@
-"""Trajectories as the TUM RGB-D benchmark has them, which evo and others read: one pose a line.
+"""Trajectories in the format of the TUM RGB-D benchmark, which evo and others read: one pose per line.
 
 ``t tx ty tz qx qy qz qw``: camera-to-world, metres, seconds, quaternions w-last.
 """

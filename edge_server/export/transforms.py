@@ -1,4 +1,4 @@
-"""transforms.json as nerfstudio and instant-ngp read it: OpenGL camera axes, intrinsics a frame."""
+"""transforms.json as nerfstudio and instant-ngp read it: OpenGL camera axes, intrinsics per frame."""
 
 from __future__ import annotations
 

@@ -76,8 +76,9 @@ def _fetch(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
 def convert(network: str, features: Mapping[str, Any], lins: Mapping[str, Any], out: Path) -> list[Path]:
     """Write the two files of ``network`` into ``out`` and check that they load; returns their paths.
 
-    features: torchvision's ``features`` of the backbone, "0.weight" and so on. lins: the package's
-    "lin0.model.1.weight" (1, C, 1, 1) and so on. FetchError where they do not make a working LPIPS.
+    features: torchvision's ``features`` of the backbone, "0.weight" and so on.
+    lins: the package's "lin0.model.1.weight" (1, C, 1, 1) and so on.
+    Raises FetchError if they do not make a working LPIPS.
     """
     learned = {}
     for k in range(len(lins)):

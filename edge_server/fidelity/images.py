@@ -19,8 +19,10 @@ def to_unit(image: NDArray, what: str = "image", background: Color = BLACK) -> I
     """``image`` as float64 (H, W, 3) in [0, 1].
 
     image: uint8 in 0..255 or floating in [0, 1], (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA. Floating
-    values outside [0, 1] are clipped, as on a screen. what: its name in error messages. background: under the
-    alpha. ImageError for any other shape or type, an empty image, NaN or infinity (any metric of those would
+    values outside [0, 1] are clipped, as on a screen.
+    what: its name in error messages.
+    background: color in [0, 1] that RGBA is composited over.
+    Raises ImageError for any other shape or type, an empty image, NaN or infinity (any metric of those would
     be NaN).
     """
     array = np.asarray(image)

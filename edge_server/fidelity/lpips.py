@@ -66,7 +66,8 @@ class Lpips:
         return float(self.batch(a[None], b[None])[0])
 
     def batch(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
-        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1], finite."""
+        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1], finite. Raises ImageError for other
+        shapes, a side shorter than ``minimum_side``, or a distance that is not finite."""
         if renderings.shape != truths.shape or renderings.ndim != 4 or renderings.shape[3] != 3:
             raise ImageError(f"expected two (N, H, W, 3) stacks, got {renderings.shape} and {truths.shape}")
         height, width = renderings.shape[1:3]
@@ -103,7 +104,7 @@ class Lpips:
 
 
 def _shapes(network: str) -> dict[str, tuple[int, ...]]:
-    """Of every array by its name: a weight and a bias for each convolution."""
+    """The shape of every array by its name: a weight and a bias for each convolution."""
     layers = dict(_ALEX)
     if network == "squeeze":
         layers = {"0": (64, 3, 3)}

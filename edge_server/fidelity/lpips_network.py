@@ -24,7 +24,9 @@ Parameters = dict[str, Tensor]
 class Network:
     """Distances by one network. Stateless once built, so that threads may share it.
 
-    name: "alex" or "squeeze". parameters: its arrays by name. lin: a vector of channel weights each slice.
+    name: "alex" or "squeeze".
+    parameters: its arrays by name.
+    lin: one vector of channel weights (C,) per slice.
     """
 
     def __init__(
@@ -38,7 +40,7 @@ class Network:
         self._lin = [torch.from_numpy(each) for each in lin]
 
     def distances(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
-        """Of image pairs (N, H, W, 3), floating in [0, 1]: (N,)."""
+        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1]."""
         n = len(renderings)
         with torch.inference_mode(), one_torch_thread():
             x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)

@@ -40,9 +40,9 @@ def open_lpips(
 ) -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, reason) where the weights are missing or unusable.
 
-    folder: of the weights; None takes the environment variable FRESHFIELD_LPIPS. The reason, one line for
-    people, says what was looked for, where, and what to do; reports print it as ``lpips_missing``. ValueError
-    for an unknown network.
+    folder: folder with the weights; None takes that of the environment variable FRESHFIELD_LPIPS.
+    The reason, one line for people, says what was looked for, where, and what to do; reports print it as
+    ``lpips_missing``. Raises ValueError for an unknown network.
     """
     if network not in FILES:
         raise ValueError(f"no LPIPS network {network!r}: choose one of {', '.join(FILES)}")

@@ -47,7 +47,8 @@ def frames_at_lags(
     present_ns: int,
     lags_ms: Sequence[float] = LAGS_MS,
 ) -> list[int]:
-    """Indices into ``times_ns`` of the frames nearest to each lag before ``present_ns``, without repeats.
+    """Indices into ``times_ns`` of the frames nearest to each of ``lags_ms`` before ``present_ns``, without
+    repeats.
 
     Only frames before the present count, however far from their lag: even two frames a second show what
     moved.

@@ -34,7 +34,8 @@ class Perceptual:
     minimum_side = MINIMUM_SIDE
 
     def __init__(self, layers: Layers, weights: list[NDArray[np.float64]], power: float) -> None:
-        """weights: w_l^2 (C_l,) of each layer, not negative. ValueError where they do not fit the layers."""
+        """weights: w_l^2 (C_l,) of each layer, not negative. power: exponent of g. Raises ValueError if they
+        do not fit the layers."""
         if len(weights) != len(layers.taps) or not 0.0 < power <= 4.0:
             raise ValueError(f"{len(weights)} weights for {len(layers.taps)} layers, power {power}")
         if not all(np.isfinite(w).all() and (w >= 0.0).all() for w in weights):
@@ -88,8 +89,8 @@ class Layers:
 
 
 def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | None]:
-    """(metric, None), or (None, reason) in one line where it cannot be used. folder: with the detector and
-    the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
+    """(metric, None), or (None, reason) in one line where it cannot be used. folder: folder with the detector
+    and the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
     try:
         with np.load(folder / COEFFICIENTS, allow_pickle=False) as archive:
             taps = tuple(str(tap) for tap in archive["taps"])

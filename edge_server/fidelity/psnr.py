@@ -13,7 +13,8 @@ PSNR_CEILING_DB = 100.0
 
 
 def psnr_of_mse(mse: float) -> float:
-    """PSNR in dB of a mean squared error on [0, 1] values, at most ``PSNR_CEILING_DB``."""
+    """PSNR in dB of a mean squared error on [0, 1] values, at most ``PSNR_CEILING_DB``. Raises ValueError for
+    one that is negative or not finite."""
     if not np.isfinite(mse) or mse < 0.0:
         raise ValueError(f"mean squared error must be finite and not negative, got {mse}")
     floor = 10.0 ** (-PSNR_CEILING_DB / 10.0)
@@ -23,7 +24,8 @@ def psnr_of_mse(mse: float) -> float:
 def psnr(rendering: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float | None:
     """PSNR in dB over all pixels and channels, or over the pixels of ``mask`` (H, W).
 
-    Images are as ``images.to_unit`` takes them. None only where ``mask`` selects nothing.
+    Images are as ``images.to_unit`` takes them. None only where ``mask`` selects nothing. Raises ValueError
+    for a mask of another size, ImageError (a ValueError) for images that cannot be compared.
     """
     a, b = to_unit(rendering, "rendering"), to_unit(truth, "truth")
     same_size(a, b)

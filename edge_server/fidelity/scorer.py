@@ -40,7 +40,7 @@ GAP_PERIODS = 0.55
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")
 """The scores that are reported of what was shown."""
 SELECTED = "selected"
-"""In place of a held-out camera's name where nothing is held out: a score on the views trained on."""
+"""Stands for a held-out camera's name where nothing is held out: a score on the views trained on."""
 
 Load = Callable[[], NDArray]
 # A rendering, or a function that makes it once the truth's generation time is known: by then a moving
@@ -49,7 +49,8 @@ Render = NDArray | Callable[[int], NDArray]
 
 
 def fidelity_title(scored_on: Iterable[str | None]) -> str:
-    """What a score of these (``Publication.scored_on``) is: training views are no truth at the present."""
+    """Title of scores on these kinds of truth (``Publication.scored_on``): training views are no truth at the
+    present."""
     return f"Fidelity on {NOTHING_HELD_OUT}" if SELECTED in scored_on else "Fidelity at the present"
 
 
@@ -66,11 +67,16 @@ class PerceptualMetric(Protocol):
 class Score:
     """Fidelity of one rendering.
 
-    published_ns: the present. psnr_moving_db: None where nothing is known to move; psnr_still_db: of the
-    pixels that are not known to move, None where all do. ssim, lpips: None where
-    the image is too small, lpips also without weights. truth_gap_ms: capture of the truth minus the present
-    (None on selected views). on: the kind of truth. perceptual: None unless it was asked for; it is not
-    LPIPS, see fidelity.perceptual.
+    camera: the held-out camera, or several joined by commas.
+    published_ns: the present.
+    psnr_db: over the whole image.
+    psnr_moving_db: over the pixels that are known to move; None where none are.
+    psnr_still_db: over the other pixels; None where all move.
+    ssim, lpips: None where the image is too small, lpips also without weights.
+    truth_gap_ms: capture of the truth minus the present; None on selected views.
+    moving_share: share of the pixels that are known to move.
+    on: the kind of truth.
+    perceptual: None unless it was asked for; it is not LPIPS, see fidelity.perceptual.
     """
 
     camera: str
@@ -122,9 +128,11 @@ class _Camera:
 class Scorer:
     """Keeps a short history of each held-out camera and the renderings that wait for it.
 
-    lpips: an ``Lpips`` or None. noisy_truth: held-out frames are real video, so that the bound of moving
-    pixels follows their noise. period_ms: of the held-out cameras; None takes the median gap of their frames.
-    background: under held-out images with alpha. perceptual: a ``Perceptual`` or None. Not thread-safe.
+    lpips: an ``Lpips`` or None. perceptual: a ``Perceptual`` or None.
+    noisy_truth: held-out frames are real video, so that the bound of moving pixels follows their noise.
+    period_ms: period of the held-out cameras; None takes the median gap of their frames.
+    background: color that held-out images with alpha are composited over.
+    Not thread-safe.
     """
 
     def __init__(
@@ -144,13 +152,14 @@ class Scorer:
         self.unscored = 0  # renderings whose truth never came within half a period
 
     def warm_up(self) -> None:
-        """Load what the metrics load at their first distance: of LPIPS, two CPU seconds."""
+        """Load what the metrics would load at their first distance; for LPIPS this takes two CPU seconds."""
         blank = np.zeros((64, 64, 3), np.uint8)
         self.score("", blank, 0, blank, 0)
 
     def publish(self, camera: str, rendering: Render, published_ns: int) -> list[Score]:
         """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``, or a function of the truth's
-        generation time that makes it; returns the scores that are complete already."""
+        generation time that makes it, published at ``published_ns``; returns the scores that are complete
+        already."""
         pending = self._camera(camera).pending
         if len(pending) == MAX_PENDING:
             self.unscored += 1  # the oldest falls off the deque
@@ -163,9 +172,9 @@ class Scorer:
         """Take a held-out frame; returns the scores it completes, oldest first.
 
         image: uint8 or floating (H, W, 3 or 4), or a function that decodes it when it is needed.
-        generated_ns: of its capture; a frame that is not later than the one before means a clock jump or a
-        new session, and restarts the history. viewpoint: a moving camera's pose; moving pixels are looked for
-        among frames of the same viewpoint.
+        generated_ns: time of its capture; a frame that is not later than the one before means a clock jump or
+        a new session, and restarts the history.
+        viewpoint: a moving camera's pose; moving pixels are looked for among frames of the same viewpoint.
         """
         state = self._camera(camera)
         if state.frames and generated_ns <= state.frames[-1].generated_ns:
@@ -183,9 +192,12 @@ class Scorer:
     def newest(
         self, camera: str, rendering: Callable[[int], NDArray], psnr_only: bool = False
     ) -> Score | None:
-        """Score what was shown when the newest held-out frame of ``camera`` was taken; None where nothing is
-        known of the camera's period yet, or its frame cannot be decoded. rendering: of its generation time.
-        ImageError as ``score``."""
+        """Score what was shown when the newest held-out frame of ``camera`` was taken; None if the camera's
+        period is not known yet, or its frame cannot be decoded.
+
+        rendering: makes the rendering for the frame's generation time.
+        psnr_only: as for ``score``. Raises ImageError as ``score``.
+        """
         state, period = self._camera(camera), self.period_ms(camera)
         if not state.frames or period is None:
             return None
@@ -203,9 +215,15 @@ class Scorer:
         bound: float = BOUND,
         psnr_only: bool = False,
     ) -> Score:
-        """Score one rendering against one truth; ``earlier`` truths show which pixels move. ImageError for
-        NaN, infinity or a wrong shape in either image. psnr_only: the other metrics, which cost more, are
-        None."""
+        """Score one rendering against one truth.
+
+        rendering, truth: as ``images.to_unit`` takes them, of one size.
+        published_ns, generated_ns: the present, and the capture time of the truth.
+        earlier: earlier truths of the same camera, which show what pixels move.
+        bound: difference in [0, 1] above which a pixel moves.
+        psnr_only: the other metrics, which cost more, are None.
+        Raises ImageError for NaN, infinity or a wrong shape in either image.
+        """
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self._background)
         moving = moving_mask(b, earlier, bound)
@@ -309,7 +327,7 @@ def open_listed_perceptual(metrics: Sequence[str]) -> PerceptualMetric | None:
 
 def mean_score(scores: Sequence[Score]) -> Score:
     """Mean over several held-out cameras of one publication; a metric is averaged over the cameras that have
-    it."""
+    it. Raises ImageError for no scores."""
     if not scores:
         raise ImageError("no scores to average")
     means: dict[str, Any] = {}

@@ -22,12 +22,13 @@ class View:
     """One decoded, posed image that supervises a field.
 
     image: uint8 (H, W, 3) RGB, or (H, W, 4) straight-alpha RGBA; matches ``intrinsics``.
-    camera_to_world: float64 (4, 4), OpenCV axes, metres. generated_ns: capture time, edge clock.
+    camera_to_world: float64 (4, 4), OpenCV axes, metres.
+    generated_ns: capture time, edge clock.
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
     carried_to_ns: the instant that the image has been carried forward to since its capture
     (``treatments.flow_warp``); None: it shows the instant of its capture.
-    whole: decodes the same frame at its full resolution (None: it cannot be decoded), where ``image`` is
-    smaller, see ``Field.most_pixels``.
+    whole: where ``image`` was decoded smaller (``Field.most_pixels``), decodes the same frame at its full
+    resolution and returns that view, or None if the frame is damaged.
     """
 
     camera: str
@@ -91,7 +92,9 @@ class Rendering:
 class Renderer(Protocol):
     """Renders one scene; safe to use from any thread while a field trains on."""
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """Render a camera. camera_to_world: (4, 4), OpenCV axes, metres."""
+        ...
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` surface points (N, 3) in world metres and colors (N, 3) in [0, 1]."""
@@ -112,10 +115,10 @@ class Snapshot(Renderer, Protocol):
 class Field(Renderer, Protocol):
     """A radiance field. Every implementation is deterministic for one seed and one sequence of calls.
 
-    frame_s: seconds that ``fit`` takes for each new frame, where it now wants every frame since the last one;
-    0.0 if that is not known yet. None: it wants only the newest of each camera.
-    most_pixels: of one image of every camera together, where larger images take more time than what moves
-    leaves; None: as many as there are.
+    frame_s: seconds that ``fit`` takes for each new frame (0.0: not known yet), if the field now wants every
+    frame since the last fit. None: it wants only the newest frame of each camera.
+    most_pixels: largest number of pixels of one image of every camera together, if larger images would take
+    too much time for following what moves; None: no limit.
     """
 
     @property
@@ -124,7 +127,8 @@ class Field(Renderer, Protocol):
     def most_pixels(self) -> int | None: ...
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""
+        """Warm-start from the present parameters and train on ``views``. An empty set does nothing. Raises
+        ValueError for a view that no field can use."""
         ...
 
     def snapshot(self, present_ns: int | None = None) -> Snapshot:

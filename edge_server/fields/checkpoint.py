@@ -36,11 +36,11 @@ def save(
     """Write a checkpoint. A temporary file is renamed into place, so a crash leaves the old checkpoint or the
     new one.
 
-    path: of the npz file; its folder is made.
+    path: the npz file; its folder is made.
     state: ``Field.state()``, or the state of another ``kind``.
-    about: facts for JSON.
+    about: facts, ready for JSON, that ``load`` returns.
     durable: wait for the disk, so that this also holds if the machine crashes.
-    OSError: the folder cannot be written.
+    Raises OSError if the folder cannot be written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,8 +63,8 @@ def load(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """The state and the facts of a checkpoint.
 
-    most_bytes: of all arrays, unpacked; a larger file is not read.
-    CheckpointError: the file is missing, damaged, or of another kind.
+    most_bytes: largest unpacked size of all arrays together; None: no limit.
+    Raises CheckpointError if the file is missing, damaged, larger, or of another kind.
     """
     path, expected = Path(path), _FORMAT.format(kind=kind)
     try:

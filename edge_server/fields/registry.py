@@ -1,6 +1,7 @@
 """Representations by name. A package is imported only when its representation is asked for.
 
-A package has ``field.make(settings)`` and, in ``settings``, the class ``SETTINGS`` and presets, ``EFFORTS``.
+A package has ``field.make(settings)`` and, in ``settings``, the settings class ``SETTINGS`` and ``EFFORTS``,
+presets of its options.
 """
 
 from __future__ import annotations
@@ -39,7 +40,14 @@ def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
 
 
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
-    """A fresh field. ValueError: unknown representation or option (the message lists the known ones)."""
+    """A fresh field.
+
+    name: one of ``field_names``.
+    options: see ``option_help``, and ``effort``, one of ``efforts_of``; None: the defaults.
+    seed: of the field, unless ``options`` has one.
+    Raises ValueError for an unknown representation or option (the message lists the known ones), or for a
+    value that it cannot have.
+    """
     make: Callable[[Any], Field] = _module(name, "field").make
     return make(settings_of(name, options, seed))
 

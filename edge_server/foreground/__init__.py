@@ -40,12 +40,15 @@ class ForegroundConfig:
 
     detector: YOLO detection or segmentation ONNX (v8, v11), relative to the scenario, or a shipped one:
     ``tile`` finds the tile and gives its masks (``edge-server train-detector --of tile``), ``default``
-    people, carts, balls and drums of our scenes. box: [left, top, right, bottom] as shares of the image,
-    instead of a detector; boxes: one per camera. kinds: class names to detect; none: any. confidence: minimum
-    score; of several detections the surest counts. margin: added to each side of a detected box, as a share
-    of it. segment: ``detector`` (its own masks, of a segmentation model), ``grabcut`` or ``box`` (the whole
-    box); none: the detector's masks if it has some, else grabcut.
-    iterations: of grabcut. side: longest side, pixels, for grabcut; the mask is then enlarged.
+    people, carts, balls and drums of our scenes.
+    box: [left, top, right, bottom] as shares of the image, instead of a detector. boxes: one per camera.
+    kinds: class names to detect; none: any.
+    confidence: minimum score; of several detections the surest counts.
+    margin: added to each side of a detected box, as a share of it.
+    segment: ``detector`` (its own masks, of a segmentation model), ``grabcut`` or ``box`` (the whole box);
+    none: the detector's masks if it has some, else grabcut.
+    iterations: number of grabcut iterations.
+    side: longest side, pixels, that grabcut works at; the mask is then enlarged.
     doubt: supervision weight, 0 to 1, of background pixels within the box, against 1 outside: a false hole in
     the object contradicts all other views, an unsupervised pixel does not.
     """

@@ -30,8 +30,8 @@ _MOST = 300
 
 @dataclass(frozen=True)
 class Detection:
-    """box: left, top, right, bottom in pixels of the image, not clipped to it; kind: the model's name; mask:
-    computes the object's mask (H, W), not clipped to the box, None of a model that gives no masks."""
+    """box: left, top, right, bottom in pixels of the image, not clipped to it. kind: the model's name of the
+    class. mask: computes the object's mask (H, W), not clipped to the box; None if the model gives none."""
 
     box: tuple[float, float, float, float]
     score: float
@@ -91,8 +91,8 @@ class Detector:
         return scale, size, ((self.width - size[0]) // 2, (self.height - size[1]) // 2)
 
     def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """The weighted sum of prototypes (n, h, w), which cover the model's input, where it is positive, as a
-        mask of the image's ``shape``."""
+        """Where the weighted sum of prototypes (n, h, w) is positive, as a mask of the image's ``shape``. The
+        prototypes cover the model's input."""
         h, w = shape
         _, size, (left, top) = self._placed(shape)
         logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
@@ -110,7 +110,7 @@ def decode(
     a score per class, in pixels of the model's input, and the weights of the masks.
 
     Returns rows (left, top, right, bottom, score, kind, *coefficients), best score first, without those that
-    are not finite or have no area. name: of the model, for errors. Raises ForegroundError."""
+    are not finite or have no area. name: the model's name in errors. Raises ForegroundError."""
     if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5 + coefficients:
         raise ForegroundError(
             f"{name}: gives {output.shape}, not the boxes and scores (1, 4 + kinds, cells) of a YOLO v8 or "

@@ -46,9 +46,10 @@ class Foreground:
         self._said: set[tuple[str, str]] = set()
 
     def apply(self, camera: str, image: Image) -> tuple[Image, Weight | None]:
-        """Mask uint8 ``image`` (H, W, 3 or 4). Return RGBA (H, W, 4) and each pixel's supervision weight,
-        float32 (H, W), None: all 1. The background gets alpha 0 and black, so that changes there do not count
-        as motion. Transparent pixels stay transparent. Without a mask, return ``image`` itself."""
+        """Mask uint8 ``image`` (H, W, 3 or 4). Returns RGBA (H, W, 4) and each pixel's supervision weight,
+        float32 (H, W), or None if all are 1. Background pixels become transparent and black, so that changes
+        there do not count as motion; transparent pixels stay transparent. Without a mask, returns ``image``
+        itself."""
         begun = time.perf_counter()
         try:
             found = self._mask(camera, image)
@@ -74,7 +75,7 @@ class Foreground:
         return out, weight
 
     def _say(self, camera: str, why: str) -> None:
-        """Log a camera's first image that passes whole, for each reason; nothing where it has no name."""
+        """Log a camera's first unmasked image for each reason, if the camera has a name."""
         if camera and (camera, why) not in self._said:
             self._said.add((camera, why))
             log.warning("camera %s: an image is used whole: %s (further ones: edge.json)", camera, WHY[why])
@@ -104,8 +105,8 @@ class Foreground:
 
 @dataclass(frozen=True)
 class Found:
-    """The object: box (left, top, right, bottom), pixels, possibly beyond the image; mask: the detector's own
-    (H, W), None without one."""
+    """The object. box: left, top, right, bottom in pixels, possibly beyond the image. mask: computes the
+    detector's own mask (H, W); None without one."""
 
     box: tuple[float, float, float, float]
     mask: Callable[[], NDArray[np.bool_]] | None = None

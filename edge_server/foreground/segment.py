@@ -38,8 +38,11 @@ def whole_box(image: NDArray[np.uint8], box: Box) -> Mask:
 
 def grabcut(image: NDArray[np.uint8], box: Box, iterations: int, side: int) -> Mask:
     """A graph cut between color mixtures of the box's inside and outside. The mask covers everything if the
-    box leaves no background to learn from. side: longest side of the crop, pixels; a larger crop is shrunk,
-    and its mask enlarged."""
+    box leaves no background to learn from.
+
+    iterations: rounds of GrabCut.
+    side: longest side of the crop, pixels; a larger crop is shrunk, and its mask enlarged.
+    """
     part, (left, top, right, bottom) = _surroundings(image.shape, box)
     crop = image[part[1] : part[3], part[0] : part[2]]
     h, w = crop.shape[:2]

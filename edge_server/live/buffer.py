@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from freshfield.frame import BufferedFrame, Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 
-MOST_UNSELECTED = 8  # frames of a camera that wait for a field that wants every frame
-LONGEST_WAIT = 16  # takes since the last frame of a camera: its next one goes first, also after a blackout
-_AS_YOUNG_NS = 1_000_000  # frames of as many nanoseconds, counted from the youngest, are equally young
+MOST_UNSELECTED = 8  # most frames of a camera that are kept for a field that wants every frame
+# After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
+LONGEST_WAIT = 16
+_AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length
 
 
 class FrameBuffer:
@@ -25,7 +26,7 @@ class FrameBuffer:
     with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
     held_back: newest frames that the last ``take`` had no room for.
-    shed: those that were left out for lack of time since the first ``take``, with ``keep_every_frame``.
+    shed: frames left out for lack of time since the first ``take``, with ``keep_every_frame``.
     """
 
     def __init__(self, cameras: Sequence[str]) -> None:
@@ -40,7 +41,7 @@ class FrameBuffer:
         self.held_back = 0
         self._unselected: dict[str, deque[BufferedFrame]] | None = None
         self._takes = 0
-        self._last_take = dict.fromkeys(self.cameras, 0.0)  # that took a frame of a camera
+        self._last_take = dict.fromkeys(self.cameras, 0.0)  # the last one that took a frame of each camera
 
     def put(self, frame: Frame, received_ns: int) -> None:
         """Keep ``frame`` unless a newer one of its camera is here.
@@ -94,14 +95,18 @@ class FrameBuffer:
     def take(
         self, selected: Sequence[BufferedFrame], most: int | None = None
     ) -> tuple[tuple[BufferedFrame, ...], tuple[BufferedFrame, ...]]:
-        """Which of the newest frames ``selected`` to use, and which others of their cameras that have arrived
-        up to then, in the order of their arrival. ``selected`` and none without ``keep_every_frame``.
+        """Take frames for an update.
 
-        most: number of frames that have not been taken before. The newest of each camera come first: of these
-        those of cameras of which ``LONGEST_WAIT`` takes have had none, by how long that is; then the
-        youngest, and of equally young ones those of the cameras that have waited longest. Then the second
-        newest of each, and so on. What exceeds it is dropped and counted in ``shed``, except for a camera's
-        newest frame, which waits on. Frames of other cameras are dropped.
+        selected: newest frames that the policy selected.
+        most: largest number of frames to take that were not taken before; None: all.
+        Returns the frames of ``selected`` to use, and the other frames of their cameras that had arrived by
+        then, in the order of their arrival. Without ``keep_every_frame`` these are ``selected`` and none.
+
+        ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
+        Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
+        longest wait first; then the youngest frame; among equally young ones, the camera that has waited
+        longest. What exceeds ``most`` is dropped and counted in ``shed``, except for a camera's newest
+        frame, which waits on. Frames of cameras that were not selected are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.frame.camera: item for item in selected}
@@ -125,7 +130,7 @@ class FrameBuffer:
                         ranked.append(((k, waits_on, older, last, -item.generated_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
-            for k, item in enumerate(taken):  # of those of one take, whoever came first waits longest
+            for k, item in enumerate(taken):  # within one take, the first camera has waited longest
                 self._last_take[item.frame.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
             self.held_back = 0

@@ -30,8 +30,8 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
     from edge_server.scheduler.learned.state import State
 
 
-INTAKE_SHARE = 0.4  # of a budget in seconds, for new frames where the field wants every frame
-LEAST_TAKEN = 4  # new frames, however short the budget is
+INTAKE_SHARE = 0.4  # share of a budget in seconds for taking in new frames, if the field wants every frame
+LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Selection:
 
     now_ns: instant of the selection.
     items: selected frames, without the new ones that the field has no time for.
-    earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
+    earlier: the frame before each selected one, where there is one and the policy treats views.
     others: other frames that these cameras delivered since the last selection, where the field wants every
     frame and has time for them.
     arrivals: number of frames since the last selection, of all cameras; where the field wants every frame, of
@@ -70,11 +70,12 @@ class TreatmentCost:
 class FieldUpdater:
     """Decides on and carries out the updates of one field from one buffer. Owns no thread, reads no clock.
 
+    start_ns: when the run began; ``Publication.t_s`` counts from it.
     embedder: for policies that look at what the cameras see.
     keyframes: earlier viewpoints of moving cameras.
     foreground: cuts the background out of views.
-    on_arrivals: nothing is selected before a frame has arrived since the last selection.
-    number: of the next update.
+    on_arrivals: select only after a frame has arrived since the last selection.
+    number: number of the next update.
     materialize: gives buffered frames their images and poses where these are made late (virtual time).
     """
 
@@ -169,10 +170,12 @@ class FieldUpdater:
     def select(
         self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, most_new: int | None = None
     ) -> Selection | None:
-        """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on.
+        """The second half of a decision: the frames in the buffer at ``now_ns`` that the policy uses; None:
+        wait on.
 
-        budget: of the fit that follows, which bounds the new frames where it is one of seconds.
-        most_new: of them at most (virtual time, where no clock tells what the field has time for).
+        For a field that wants every frame, the number of new frames is limited:
+        budget: what the fit that follows may spend; one in seconds sets the limit.
+        most_new: the limit otherwise (virtual time, where no clock tells what the field has time for).
         """
         arrivals = self.buffer.arrivals - self._selected_of
         nothing_new = not arrivals and not self.buffer.held_back
@@ -225,7 +228,7 @@ class FieldUpdater:
         return views, replace(report, refused=tuple(c for c in report.refused if c in current))
 
     def use_field(self, field: Field) -> None:
-        """Go on with another field, which begins the scene anew."""
+        """Continue with another field, which learns the scene anew."""
         self.field = field
         self.reset()
 

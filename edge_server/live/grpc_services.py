@@ -152,7 +152,7 @@ class GrpcThread:
         self._thread = threading.Thread(target=self._main, name="grpc", daemon=True)
 
     def start(self) -> None:
-        """Returns once the server listens. Raises what kept it from that."""
+        """Start, and return once the server listens. Raises the error that kept it from listening."""
         self._thread.start()
         self._ready.wait()
         if self._failure is not None:

@@ -1,4 +1,4 @@
-"""Frames arrive: the checks that need memory, the buffer, the ledger, the response.
+"""Frames arrive: the checks against earlier frames, the buffer, the ledger, the response.
 
 Ingest never waits for the field and never decodes: it answers as soon as checksum, headers and limits are
 checked and the frame is buffered.
@@ -39,16 +39,17 @@ class _Session:
     began_ns: int = 0
     """Capture time of its first admitted frame, on the edge's clock."""
     newest_ns: int = 0
-    """Of its last one, on the edge's clock."""
+    """Capture time of its last admitted frame, on the edge's clock."""
 
 
-_SILENT_NS = 3 * 10**9  # a node that has sent nothing for so long is no second node
+_SILENT_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
 
 
 class FrameAdmission:
     """Checks the order and the time of frames, by camera and session, and their size.
 
-    max_side_px: of an image, see ``Scenario.max_side_px``.
+    training, held_out: ids of the cameras in each role.
+    max_side_px: longest side of an image, pixels; see ``Scenario.max_side_px``.
     """
 
     def __init__(
@@ -104,7 +105,8 @@ class FrameAdmission:
             sessions.popitem(last=False)
 
     def _look_for_two_nodes(self, frame: Frame, sessions: OrderedDict[str, _Session]) -> None:
-        """A node that restarts captures nothing for its old session any more; two go on side by side."""
+        """Count ``frame`` if two nodes send as its camera. A node that restarts ends its old session, whereas
+        two nodes keep two sessions going side by side."""
         now_ns, mine = frame.generated_edge_ns, sessions[frame.session]
         other = max(sessions.values(), key=lambda session: session.began_ns)
         goes_on = now_ns - other.newest_ns < _SILENT_NS
@@ -152,7 +154,8 @@ class Ingest:
         self._sessions = SessionStreams(cameras)
 
     def add_to_server(self, server: grpc.aio.Server) -> None:
-        """Messages are parsed in ``take``: gRPC would end the stream at one that cannot be."""
+        """Register the service. Messages are parsed in ``take``: gRPC would end the stream at the first one
+        that cannot be parsed."""
         push = grpc.stream_stream_rpc_method_handler(self._push, None, pb.PushResponse.SerializeToString)
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, {"Push": push}),))
 
@@ -162,8 +165,10 @@ class Ingest:
                 await stream.write(self.take(message, stream))
 
     def take(self, message: bytes | pb.PushRequest, stream: ServedCall | None = None) -> pb.PushResponse:
-        """Check and buffer one frame, which came on ``stream``, and enter it in the ledger; the response says
-        what became of it."""
+        """Check one frame, buffer it and enter it in the ledger; the response says what became of it.
+
+        stream: the call that it came on, which claims the frame's session; None: nothing claims it.
+        """
         start_s = time.perf_counter()
         now_ns = self._clock.now_ns()
         header = pb.FrameHeader()
@@ -207,5 +212,6 @@ class RollingPercentiles:
         self._values.append(value)
 
     def percentile(self, percent: float) -> float | None:
+        """The value that ``percent`` of the values (0 to 100) do not exceed; None without values."""
         values = sorted(self._values)
         return values[min(len(values) - 1, int(len(values) * percent / 100))] if values else None

@@ -2,15 +2,15 @@
 time.
 
 The buffer holds the newest frame of a camera and nothing else. That suffices for a camera that stands still;
-with one that moves, the field would forget, update by update, what it no longer looks at. So each view that
-was used becomes a keyframe if it lies apart from those before, and otherwise replaces the image of the one it
-lies at. Distances are measured from where a keyframe was first taken, never from the image that replaced it:
-a slow camera would otherwise push one keyframe along for ever. Keyframes go to the field as views of cameras
-of their own, named ``hand#3``: no camera of a scenario may have such a name. Their ages are real: a scene
-that changes asks for few keyframes, or for a field that trusts old views less (``age_tau_ms``).
+with one that moves, the field would forget, update by update, what it no longer looks at. So each used view
+becomes a keyframe if it lies apart from all earlier ones of its camera; otherwise it replaces the image of
+the nearest one. Distances are measured from where a keyframe was first taken, never from the image that
+replaced it: a slow camera would otherwise push one keyframe along for ever. Keyframes go to the field as
+views of cameras of their own, named ``hand#3``: no camera of a scenario may have such a name. Their ages are
+real: a scene that changes asks for few keyframes, or for a field that trusts old views less (``age_tau_ms``).
 
-A field trained on one or two viewpoints fits only those, and that stays in the way of all that follow
-(measured: 3 dB in the cell). So the field restarts each time their number has doubled, up to
+A field trained on one or two viewpoints fits only those, and later viewpoints do not undo that (measured: 3
+dB in the cell). So the field restarts each time the number of viewpoints has doubled, up to
 ``RESTARTS_BELOW``.
 """
 
@@ -70,8 +70,8 @@ class Keyframes:
         return True
 
     def with_earlier(self, views: Sequence[View]) -> list[View]:
-        """``views`` under their own names, followed by the keyframes of their cameras, except those they are
-        at."""
+        """``views`` under their own names, followed by the keyframes of their cameras, except the one that
+        each view lies at."""
         earlier: list[View] = []
         for view in views:
             camera = self._cameras.setdefault(view.camera, _CameraKeyframes())

@@ -1,6 +1,6 @@
-"""``edge-server keys``: an authority of one's own, and for each process what it needs for mutual TLS.
+"""``edge-server keys``: makes a certificate authority, and for each process what it needs for mutual TLS.
 
-For development and a bench in one's own network: keys have no password, certificates hold for a year.
+For development and tests in a private network: keys have no password, certificates are valid for a year.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from freshfield.scenario import load
 from freshfield.transport import TransportError
 
 _DAYS = 365
-_MOST_NAME_CHARS = 64  # of a certificate's common name
+_MOST_NAME_CHARS = 64  # in a certificate's common name
 _HERE = ("localhost", "127.0.0.1", "::1")
 
 
@@ -45,9 +45,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: Sequence[str]) -> None:
-    """Write ``out``, whole or not at all. edge, emulator: their hosts. Raises TransportError for what is no
-    host, a camera named like another process and where openssl cannot make a certificate, FileExistsError
-    where ``out`` is there already."""
+    """Write the folder ``out``, whole or not at all.
+
+    cameras: their ids.
+    edge, emulator: names or addresses under which they are reached, besides localhost.
+    Raises TransportError for an invalid host, for a camera named like another process, or if openssl cannot
+    make a certificate; FileExistsError if ``out`` exists.
+    """
     names = {"edge": "edge", "emulator": "camera:*", "operator": "operator", "viewer": "viewer"}
     if doubled := names.keys() & set(cameras):
         raise TransportError(f"keys: a camera cannot be called {' or '.join(sorted(doubled))}: rename it")

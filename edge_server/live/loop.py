@@ -33,9 +33,9 @@ class UpdateLoop:
     on_published(publication, renderer, views): called after each update, on the loop's thread.
     on_status(line): says what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
-    budget: of the updates to come; others may set it.
-    Changes of the policy, of the field, pause and reset, asked for by other threads, take effect with the
-    next decision.
+    budget: fitting time of the updates to come; other threads may replace it.
+    Other threads may also change the policy or the field, pause, or reset: it takes effect with the next
+    decision.
     """
 
     def __init__(
@@ -72,7 +72,8 @@ class UpdateLoop:
         self._thread.start()
 
     def stop(self, timeout_s: float = STOP_S) -> None:
-        """Ask the loop to end after the current update, and wait for it; ``alive`` says whether it has."""
+        """Ask the loop to end after the current update, and wait up to ``timeout_s`` for it; ``alive`` says
+        whether it still runs."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
@@ -86,7 +87,7 @@ class UpdateLoop:
             self._next_policy = policy
 
     def use_field(self, field: Field) -> None:
-        """Go on with a field that knows nothing yet."""
+        """Replace the field by ``field``, which starts untrained."""
         with self._lock:
             self._next_field = field
 
@@ -95,7 +96,8 @@ class UpdateLoop:
             self._reset = True
 
     def request_checkpoint(self, path: Path) -> Future[Path]:
-        """Have the field written to ``path`` between two updates; the future gives the path once it is."""
+        """Ask for a checkpoint at ``path``, written between two updates. The future returns the path, or
+        raises the error (OSError: it could not be written)."""
         future: Future[Path] = Future()
         self._checkpoints.put((path, future))
         return future
@@ -136,7 +138,7 @@ class UpdateLoop:
         if selection is None:
             return
         self._on_status(f"fitting {len(selection.items)} views")
-        # An update takes about as long as the last one: so far ahead lies its present.
+        # Expected instant of publication: an update takes about as long as the last one.
         publishes_ns = self._clock.now_ns() + round(self._last_update_ms * 1e6)
         fitted = self._updater.fit(selection, budget, publishes_ns)
         if fitted is None:
@@ -208,7 +210,7 @@ class UpdateLoop:
                 raise
 
     def _select(self, budget: Budget) -> Selection | None:
-        """SelectionWindow, wait as the plan says, and select; None if the controls changed meanwhile."""
+        """Plan, wait as the plan says, and select; None if the controls changed or the loop was stopped."""
         plan = self._updater.plan(self._clock.now_ns())
         arrivals = self._updater.buffer.arrivals
         while not self._stop.is_set():

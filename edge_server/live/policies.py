@@ -18,8 +18,8 @@ class ServerPolicies:
     """Makes the policies of a server.
 
     first: the policy it starts with.
-    offered: names that may be chosen during the run. Of learned policies this is only the first one: nobody
-    outside names files to open.
+    offered: names that may be chosen during the run. The only learned policy among them is the first one: no
+    client can name a file to open.
     trainer: trains the policy while it is used; None where nothing learns.
     """
 

@@ -6,8 +6,8 @@ renders that capture's pose, and the two images are compared. If scoring falls b
 unscored (nulls in the series) and nothing queues up. The thread's own computing, without the
 rendering in the field's workers, is a bounded share of the machine's.
 
-What is shown: at random captures of each held-out camera, the newest publication of that instant, carried on
-to it (``Snapshot.at``), as the page renders it for a visitor who moves.
+What was shown is scored at random captures of each held-out camera: the publication that was the newest one
+at that instant, extrapolated to it (``Snapshot.at``), as the page renders it for a visitor who moves.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _OPEN_PUBLICATIONS = 16
 _KEPT_FRAMES = 128
 _BASELINE_EVERY = 5
 _KEPT_RENDERINGS = 32
-# Publications that may be the newest one of a held-out capture that is still on its way.
+# A held-out frame may arrive late; the publication that was shown at its capture must still be kept then.
 _KEPT_PUBLICATIONS = 32
 _SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
-_FULL_EVERY = 4  # scores of what is shown: one of so many has more than PSNR
-# Largest share of the cores' time that this thread takes, beyond an allowance of CPU seconds. What is shown
-# has its part of the share first: publications are scored while this much of the allowance is left.
+_FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
+# This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
+# its part of that share; publications are scored only while the reserve, CPU seconds, is left for it.
 _SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
 
 
@@ -65,9 +65,9 @@ class ScoringThread:
     held_out: ids of the held-out cameras; where there are none, the selected views are scored.
     on_scored(publication with scores, comparison or None, final): called on this thread. final: the scores of
     all held-out cameras are in.
-    on_shown(score, publication): what was shown at ``score.published_ns``, ``publication`` carried on to that
-    instant, has a score. Called on this thread.
-    seed: of the random instants.
+    on_shown(score, publication): ``score`` rates what was shown at ``score.published_ns``, ``publication``
+    extrapolated to that instant. Called on this thread.
+    seed: determines the random instants.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class ScoringThread:
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
         self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
-        self._shown_count, self._shown_cost_s = 0, np.inf  # of the last one, CPU seconds
+        self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
         self._allowance_s, self._asked_s, self._used_s = _ALLOWANCE_S, time.monotonic(), 0.0
         self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
@@ -128,7 +128,7 @@ class ScoringThread:
             log.debug("thread priority cannot be lowered here")
         try:
             self._scorer.warm_up()
-        except Exception:  # whatever it is costs scores, not the thread
+        except Exception:  # it costs scores, not the thread
             log.exception("a metric could not be loaded")
         # Loading is not charged: the allowance would be gone for half a minute.
         self._asked_s, self._used_s = time.monotonic(), time.thread_time()
@@ -151,8 +151,8 @@ class ScoringThread:
                 log.exception("a publication could not be scored")
 
     def _affordable(self, reserve_s: float = 0.0) -> bool:
-        """Whether more than ``reserve_s`` is left of this thread's allowance, which its share of the cores'
-        time fills up."""
+        """Refill this thread's allowance with its share of the cores' time; whether more than ``reserve_s``
+        CPU seconds are left."""
         now_s, used_s = time.monotonic(), time.thread_time()
         gained_s = _SHARE * usable_cores() * (now_s - self._asked_s) - (used_s - self._used_s)
         self._allowance_s = min(self._allowance_s + gained_s, _ALLOWANCE_S)
@@ -160,8 +160,8 @@ class ScoringThread:
         return self._allowance_s > reserve_s
 
     def _score_shown(self, frame: Frame) -> None:
-        """Score what was shown when a held-out frame was taken, if it is time for that: as often as
-        _SHOWN_SHARE allows for."""
+        """Score what was shown when a held-out frame was taken, if the next random instant has come; these
+        are as frequent as _SHOWN_SHARE allows."""
         taken_ns = frame.generated_edge_ns
         found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
         if found is None or taken_ns < self._next_shown_ns[frame.camera] or not self._affordable():

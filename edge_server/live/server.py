@@ -52,16 +52,16 @@ log = logging.getLogger(__name__)
 _STATUS_PERIOD_S = 0.5
 _AGES_PERIOD_S = 0.2
 _SNAPSHOT_TIMEOUT_S = 30.0
-_UPDATE_TIMES = 4096  # of which percentiles are shown
+_UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
 
 
 class OpenPage(Protocol):
-    """The live page, being served. url: its address on this machine."""
+    """A live page that is being served. url: its address on this machine."""
 
     url: str
 
     def stop(self) -> None:
-        """Serve it no longer."""
+        """Stop serving the page."""
         ...
 
 
@@ -69,11 +69,16 @@ class OpenPage(Protocol):
 class ServerOptions:
     """How one server process runs; the scenario says what it does.
 
-    listen: HOST:PORT for frames. out: folder of the run's files. transport: security of connections.
-    page_host, metrics_port: where the page and Prometheus metrics listen; without a port there are none.
-    open_page: shows the state to visitors; None: no page.
-    lpips_folder: with weights. resume: checkpoint to start from. checkpoint_s: period of writing one.
-    record: MCAP file to write the session to. emulator_out: folder with the emulator's status; None: ``out``.
+    listen: HOST:PORT for frames.
+    out: folder of the run's files.
+    transport: security of connections.
+    page_host: address on which page and metrics listen.
+    open_page: starts the live page of a state; None: no page.
+    metrics_port: port of Prometheus metrics; None: no metrics.
+    lpips_folder: folder with LPIPS weights; None: that of $FRESHFIELD_LPIPS, if any.
+    resume: checkpoint to start from. checkpoint_s: period of writing one, seconds; None: only at the end.
+    record: MCAP file to write the session to; None: not recorded.
+    emulator_out: folder with the emulator's status; None: ``out``.
     """
 
     listen: str
@@ -116,7 +121,7 @@ class EdgeServer:
             field = self._make_field()
         else:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
-            # An operator may have changed it since the scenario was read.
+            # An operator may have changed the effort during the run that wrote the checkpoint.
             saved = about.get("options")
             effort = str(saved.get("effort", "medium")) if isinstance(saved, dict) else None
             if effort in efforts_of(config.field):
@@ -230,7 +235,7 @@ class EdgeServer:
             raise self.loop.failure
 
     def _warnings(self) -> list[str]:
-        """What the page says of every port."""
+        """Security warnings for the page, one for each port that needs one."""
         options = self.options
         ports = [(host_port(options.listen)[0], "gRPC", False)]
         ports += [(options.page_host, "page", True)] if options.open_page is not None else []
@@ -343,7 +348,7 @@ class EdgeServer:
     def _write_checkpoint(self, path: Path) -> None:
         about = {
             "field": self.config.field,
-            # Those of the field in use: another one may be about to replace it.
+            # Options of the field in use: another field may be about to replace it.
             "options": self._options_of[self.updater.field],
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,

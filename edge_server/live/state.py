@@ -25,17 +25,23 @@ from freshfield.frame import Frame
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.scheduler.learned.decision import Decision
 
-SHOWN_OF = 30  # instants and updates that the present is the mean of
+SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 
 
 @dataclass(frozen=True)
 class Publication:
     """One update of the field: a line of series.jsonl and of the report's fidelity series.
 
-    t_s, published_ns: instant of publication (the present), in seconds since the run began and on the clock.
-    selected: cameras whose frames were used; ages_ms: their ages then; aaoi_ms: mean of these (6.35).
-    update_ms: from decision to publication. network_ms: mean time of the selected frames from capture to
-    arrival. What is left of aaoi_ms is the time that they waited in the buffer.
+    number: counts updates from 0; a resumed run goes on counting.
+    t_s, published_ns: instant of publication (the present), in seconds since the run began and on the edge's
+    clock.
+    omega_ms: the policy's omega; None for policies without one.
+    selected: cameras whose frames were used. ages_ms: their ages at publication. aaoi_ms: mean of these ages
+    (6.35).
+    update_ms: time from decision to publication.
+    network_ms: mean time of the selected frames from capture to arrival; what aaoi_ms has beyond update_ms
+    and network_ms is the time that they waited in the buffer.
+    steps, loss: of the fit, see ``fields.FitReport``.
     refused: selected cameras whose view the field left out, because it contradicts all others.
     psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
     is nothing to score. truth_gap_ms: time from the present to that truth.
@@ -96,7 +102,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A held-out truth and its rendering, both uint8 RGB (H, W, 3). number: of the publication."""
+    """A held-out truth and its rendering, both uint8 RGB (H, W, 3). number: that of the publication."""
 
     camera: str
     truth: NDArray[np.uint8]
@@ -106,7 +112,7 @@ class Comparison:
 
 @dataclass
 class Controls:
-    """What an operator may change during a run. The loop reads it at each decision epoch."""
+    """What an operator may change during a run; the server passes it on to the update loop."""
 
     policy: str
     value: float | None
@@ -125,9 +131,10 @@ class EdgeState:
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
-    frontier: what accuracy costs in time, as measured. efforts: levels that ``set_effort`` takes; none where
-    the field has none. set_deadline: milliseconds from decision to publication, or None for no deadline; it
-    is None itself where nobody can set one.
+    frontier: what accuracy costs in time, as measured.
+    efforts: levels that ``set_effort`` takes; none where the field has none.
+    set_deadline: sets the milliseconds from decision to publication, None for no deadline. The attribute
+    itself is None where no deadline can be set.
     learning: one line on a policy that learns while it is used; empty where none does.
     bounds: world box (2, 3) in metres of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
@@ -189,8 +196,9 @@ class EdgeState:
             self._shown.append(score)
 
     def present(self) -> tuple[float, float, float | None] | None:
-        """The present point of the frontier, over the last instants and updates: milliseconds from one update
-        to the next, PSNR shown of the whole image and where it moves. None before there is one."""
+        """The run's own point on the frontier, averaged over the latest scored instants and updates:
+        milliseconds from one update to the next, PSNR shown of the whole image and, where known, of moving
+        pixels. None until there are a score and two updates."""
         with self._lock:
             scores, last = list(self._shown), list(self._publications)[-SHOWN_OF:]
         moving = [s.psnr_moving_db for s in scores if s.psnr_moving_db is not None]

@@ -39,8 +39,10 @@ _USUAL_SPEED_M_PER_S = 1.0
 class UpdateBudget:
     """Sets the fitting time of each update.
 
-    fit_ms: longest fit that is worth it; without a deadline, of every fit, however long the rest takes.
-    deadline_ms: from decision to publication; ValueError if it leaves no time to fit.
+    fit_ms: without a deadline, the time of every fit, however long the rest of the update takes; with one,
+    the longest fit that is worth its time.
+    deadline_ms: longest time from decision to publication; None: no deadline. ValueError if it leaves no time
+    to fit.
     """
 
     fit_ms: float = math.inf
@@ -62,7 +64,7 @@ class UpdateBudget:
         return Budget(seconds=max(_LEAST_MS, min(self.deadline_ms - reserve, self.fit_ms)) / 1e3)
 
     def record(self, budget: Budget, update_ms: float) -> None:
-        """An update of ``budget`` took ``update_ms`` from its decision to its publication."""
+        """Record that an update with ``budget`` took ``update_ms`` from its decision to its publication."""
         assert budget.seconds is not None
         self._overhead_ms.append(update_ms - budget.seconds * 1e3)
 
@@ -72,11 +74,11 @@ class FrontierPoint:
     """A measured setting of updates, and the fidelity with it.
 
     effort, options: name and field options of the setting.
-    speed_m_per_s: of the scene it was measured on.
-    update_ms: from decision to publication; of a field in layers from one update to the next.
-    psnr_db: of the whole image; psnr_moving_db: where the scene moves.
+    speed_m_per_s: speed of what moves in the scene it was measured on.
+    update_ms: time from decision to publication; for a field in layers, from one update to the next.
+    psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
     error_db: upper bound of the standard error of their mean; 0 with one seed.
-    measured: whether these are of what was "shown", or of what was "published" (earlier versions).
+    measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
     """
 
     effort: str
@@ -98,8 +100,8 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
     """The points of one representation, measured on moving scenes.
 
     path: a frontier.json of ``edge-server frontier``; None: the shipped one.
-    layers: those in layers, which are another field, or those without.
-    Points of an earlier version that are not known by what was shown are known by what was published.
+    layers: whether to read the points of that representation in layers, or those without layers.
+    Where an earlier version did not measure what was shown, a point has the PSNR of what was published.
     Raises ValueError for another kind of file, or one without such points.
     """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
@@ -134,10 +136,10 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
 
 
 def best_point(points: Sequence[FrontierPoint], deadline_ms: float, speed_m_per_s: float) -> FrontierPoint:
-    """The best point within the deadline, among those measured at the speed nearest to the scene's.
+    """The best point within the deadline, among those measured at the speed nearest to ``speed_m_per_s``.
 
-    More time is not always better: what moves ages meanwhile. Of points that their seeds cannot distinguish
-    from the best, the fastest is taken; the fastest of all where none meets the deadline.
+    More time is not always better: what moves ages meanwhile. Of the points that are within the standard
+    error of the best, the fastest is taken. If none meets the deadline, it is the fastest of all.
     """
     candidates = _at_nearest_speed(points, speed_m_per_s)
     fitting = [p for p in candidates if p.update_ms <= deadline_ms]
@@ -161,8 +163,8 @@ def _at_nearest_speed(points: Sequence[FrontierPoint], speed_m_per_s: float) -> 
 class Frontier:
     """What accuracy costs in time, as measured for the field of a run.
 
-    points: at the measured speed nearest to ``speed_m_per_s``, the scene's.
-    about: of which file they are, or, where there are none, how to measure them.
+    points: points at the measured speed nearest to ``speed_m_per_s``, the speed of the run's scene.
+    about: which file they come from, or why there are none.
     """
 
     points: tuple[FrontierPoint, ...]
@@ -176,8 +178,8 @@ class Frontier:
 
 
 def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
-    """The frontier that a scenario names, else the shipped one. ValueError where it cannot be read. That the
-    shipped one knows nothing of the scenario's field is an error only where a deadline asks for it."""
+    """The frontier that a scenario names, else the shipped one. Raises ValueError if it cannot be read or has
+    no points for the scenario's field; for the shipped one only if the scenario sets a deadline."""
     path = None if config.frontier is None else scenario.path.parent / config.frontier
     speed = float(scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S))
     try:
@@ -206,7 +208,7 @@ def open_budget(
 
 
 def options_for(frontier: Frontier, config: EdgeConfig) -> dict[str, Any]:
-    """The field's options: the scenario's own, over those of the frontier point that a deadline leads to."""
+    """The field's options: those of the best point within a deadline, overridden by the scenario's own."""
     point = None if config.deadline_ms is None else frontier.best(config.deadline_ms)
     if config.deadline_ms is None or point is None:
         return config.field_options

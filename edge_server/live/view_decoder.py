@@ -23,8 +23,8 @@ class ViewDecoder:
     """Decodes buffered frames.
 
     foreground: cuts the background out of every image; None leaves images whole.
-    most_pixels: of an image; a larger one is decoded at half its size, or a quarter, or an eighth. None: as
-    they are.
+    most_pixels: largest number of pixels of an image; larger ones are decoded at 1/2, 1/4 or 1/8 of their
+    width and height. None: images keep their size.
     undecodable: number of damaged payloads. A failure is remembered, so that a frame counts once.
     """
 
@@ -47,7 +47,7 @@ class ViewDecoder:
         return [view for item in selected if (view := self.view(item)) is not None]
 
     def view(self, item: BufferedFrame) -> View | None:
-        """View of one frame, from then on the camera's last; None where it cannot be decoded."""
+        """View of one frame, kept as its camera's last; None where it cannot be decoded."""
         frame = item.frame
         cached = self._views.get(frame.camera)
         if cached is not None and cached[0] is frame:

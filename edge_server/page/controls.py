@@ -1,4 +1,4 @@
-"""What an operator may change: policy and its value, effort and deadline, pause, reset, snapshot.
+"""The operator's controls: policy and its value, effort and deadline, pause, reset, snapshot.
 
 A refused change becomes a notification for its sender. Everybody sees the values in force.
 """

@@ -1,5 +1,5 @@
-"""What stands between the page and the network: TLS and login, Host and Origin, what a visitor may send, how
-many there may be and how long one may take nothing.
+"""The page's protection against the network: TLS and login, checks of Host and Origin, of what visitors send,
+of their number, and of how long one may go without reading.
 
 viser listens with the websockets package and has no parameter for any of this: while it starts, its call of
 ``websockets.asyncio.server.serve`` is given the hooks of a ``Door``.
@@ -43,6 +43,8 @@ Process = Callable[[ServerConnection, Request], Response | None]
 
 
 class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    """viser's message about a visitor's camera."""
+
     wxyz: tuple[float, float, float, float]
     position: Vector
     fov: float
@@ -54,6 +56,7 @@ class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields
     up_direction: Vector
 
     def sound(self) -> bool:
+        """Whether the camera can be rendered: finite, with a rotation, a field of view and a size."""
         numbers = (*self.wxyz, *self.position, *self.look_at, *self.up_direction)
         sides = (self.image_height, self.image_width)
         return (
@@ -65,6 +68,8 @@ class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields
 
 
 class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=True):
+    """viser's message about a click on a scene node."""
+
     name: str
     instance_index: int | None
     ray_origin: Vector
@@ -75,6 +80,8 @@ class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=T
 
 
 class Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    """viser's message about new values of a control."""
+
     uuid: str
     updates: dict[str, bool | int | float | str]
 
@@ -95,10 +102,13 @@ _DECODER = msgspec.msgpack.Decoder(Viewpoint | Click | Update)
 
 
 class Door:
-    """access: what requests are asked. tls: for the port, or None.
+    """Guards the page's connections.
 
-    controls: by their id, those whose values may be set. on_refused: called with the connection of a viewer
-    who tried to. Both are set once the page has been made.
+    access: checks the login and the origin of requests.
+    tls: for the port; None: no TLS.
+    controls: the controls whose values may be set, by id.
+    on_refused: called with the connection of a viewer who tried to change something.
+    The last two are set once the page has been made.
     """
 
     def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
@@ -115,13 +125,13 @@ class Door:
 
     @contextlib.contextmanager
     def before_viser(self) -> Iterator[None]:
-        """What viser serves within the context is served through this door."""
+        """Within the context, whatever viser serves goes through this door."""
         serve = websockets.asyncio.server.serve
 
         def through_the_door(handler: Any, host: Any, port: Any, **options: Any) -> Any:
             self.used = True
             process = options.pop("process_request")
-            # One of its own that passes on what it does not count.
+            # A logger of its own, which passes on only what ``_worth_a_line`` lets through.
             logger = logging.Logger("websockets.server")
             logger.parent = logging.getLogger(logger.name)
             logger.addFilter(self._worth_a_line)
@@ -146,7 +156,7 @@ class Door:
 
     def _accepted(self, *words: Any, **more: Any) -> VisitorConnection:
         """Called in the task that accepts a connection, which over TLS lasts until the end of the handshake.
-        Of too many of them the oldest ends."""
+        If there are too many such tasks, the oldest is cancelled."""
         if self._tls is not None and (task := asyncio.current_task()) is not None:
             self._handshakes[task] = None
             task.add_done_callback(lambda done: self._handshakes.pop(done, None))
@@ -157,7 +167,7 @@ class Door:
         return VisitorConnection(self, *words, **more)
 
     def opened(self, connection: VisitorConnection) -> None:
-        """Of too many connections the oldest ends that is no visitor's."""
+        """Count a connection; if there are too many, the oldest one that is not a visitor's ends."""
         self._connections[connection] = None
         if len(self._connections) > MAX_PAGE_CONNECTIONS:
             oldest = next(c for c in self._connections if c not in self.visitors)
@@ -192,19 +202,19 @@ class Door:
         return False
 
     def _worth_a_line(self, record: logging.LogRecord) -> bool:
-        """Whether websockets may log it: a request that it cannot read, which anybody may send, is counted;
-        a connection that closes without one is nothing."""
+        """Whether websockets may log a record. Unreadable requests, which anybody may send, are only counted;
+        connections that close without a request are ignored."""
         error = record.exc_info[1] if record.exc_info else None
         if error is None:
             return True
-        if not isinstance(error, InvalidMessage):  # a fault of our own, of which viser would keep silent
+        if not isinstance(error, InvalidMessage):  # a fault of our own, which viser would not report
             log.error("page: %s", record.getMessage(), exc_info=record.exc_info)
         elif not isinstance(error.__cause__, EOFError):
             self._refuse("a request that is no GET of HTTP/1.1")
         return False
 
     def _answer(self, connection: VisitorConnection, request: Request, process: Process) -> Response | None:
-        """What to answer a request with; None lets a visitor in."""
+        """The response to a request; None lets a visitor in."""
         host, origin = _one(request, "Host"), _one(request, "Origin")
         authorization = _one(request, "Authorization")
         cookie = f"freshfield-{connection.local_address[1]}"
@@ -254,7 +264,7 @@ class VisitorConnection(ServerConnection):
         super().__init__(*words, **more)
         self.caller = ANYBODY
         self._door = door
-        self._clicks = 0.0  # that may come at once
+        self._clicks = 0.0  # how many may come at once
         self._clicked_s = -math.inf
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -281,7 +291,7 @@ class VisitorConnection(ServerConnection):
         return data
 
     async def send(self, message: Any, text: bool | None = None) -> None:
-        """Whoever takes nothing for long is gone, and so is what was held for them."""
+        """Send; a visitor who reads nothing for too long is disconnected, and what waits for them dropped."""
         try:
             async with asyncio.timeout(VISITOR_TIMEOUT_S):
                 await super().send(message, text)
@@ -291,6 +301,6 @@ class VisitorConnection(ServerConnection):
 
 
 def _one(request: Request, name: str) -> str | None:
-    """A header's value. One that is given twice is joined, and so is nobody's."""
+    """A header's value. One that is given twice is joined, so that it matches nothing."""
     values = request.headers.get_all(name)
     return ", ".join(values) if values else None

@@ -61,7 +61,7 @@ class Summary:
     cameras: int
     t_s: float
     age_parts_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """What the age of what is shown consists of, by name; empty before there is anything to show."""
+    """The parts of the age of what is shown, by name; empty before there is anything to show."""
 
 
 def status(s: Summary) -> str:
@@ -109,8 +109,8 @@ def _age_parts(parts_ms: Mapping[str, float]) -> str:
 
 
 def frontier(found: Frontier, effort: str, present: tuple[float, float, float | None] | None) -> str:
-    """What accuracy costs in time: PSNR against the time of an update, the curves of ``effort`` bold,
-    and the present point (``EdgeState.present``); how to measure it where it is not known."""
+    """What accuracy costs in time: PSNR against the time of an update, the curves of ``effort`` bold, and the
+    run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure them."""
     if not found.points:
         return note(f"What accuracy costs in time is not measured for this field. {found.about}")
     now = [(present[0], db) for db in present[1:] if db is not None] if present is not None else []

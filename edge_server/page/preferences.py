@@ -41,8 +41,9 @@ class _Refused(Exception):
 class PreferencePage:
     """Asks the questions of ``session``.
 
-    sprites: of each reconstruction, a JPEG of its pictures along the path. frames, columns: of each of them.
-    keep: writes a session; what it cannot write (OSError) is not taken.
+    sprites: for each reconstruction, a JPEG with its pictures along the path.
+    frames, columns: number of pictures, and of columns, in each JPEG.
+    keep: writes a session; an answer that it cannot write (OSError) is not taken.
     """
 
     def __init__(
@@ -61,8 +62,8 @@ class PreferencePage:
     def serve(
         self, host: str, port: int, transport: Transport | None = None
     ) -> tuple[str, Callable[[], None]]:
-        """Serve on a thread; returns the address and what closes it. Raises PageError if the port is not
-        available, TransportError if the page would be open to others."""
+        """Serve on a thread; returns the address and a function that closes the page. Raises PageError if the
+        port is not available, TransportError if the page would be open to others."""
         try:
             port, close = serve_guarded(self, "preference page", host, port, transport)
         except (OSError, OverflowError) as error:
@@ -127,8 +128,8 @@ class PreferencePage:
             self._plan = lines, png
 
     def _change(self, path: str, body: bytes) -> None:
-        """An answer, an undo, an import or the end. What a tab sends about an earlier turn is refused: two
-        tabs, or two fingers, answer nothing twice."""
+        """Apply an answer, an undo, an import or the end. What a tab sends about an earlier turn is refused:
+        two tabs, or two fingers, answer nothing twice."""
         with self._lock:
             session = self.session
             if self.finished.is_set():

@@ -27,8 +27,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """A level of detail. budget_s: time for one image. max_share: largest share of all time for such images.
-    min_rows, max_rows: bounds of the image rows, which adapt to the speed of the renderer."""
+    """A level of detail.
+
+    budget_s: time for one image. max_share: largest share of all time for such images.
+    min_rows, max_rows: bounds of the image rows, which adapt to the speed of the renderer.
+    """
 
     budget_s: float
     max_share: float
@@ -62,9 +65,13 @@ BACKDROP = np.array([18, 20, 24], np.float32) / 255
 
 @dataclass
 class ClientState:
-    """A connected browser. viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size.
-    serial: number of viewpoints so far. level: the finest of LEVELS sent for this viewpoint and ``renderer``,
-    -1 for none. sent: number of images since the last blank background."""
+    """A connected browser.
+
+    viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size; moved_at: when it changed.
+    serial: number of viewpoints so far.
+    level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
+    sent: number of images since the last blank background.
+    """
 
     client: Any
     viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None

@@ -17,7 +17,7 @@ from edge_server.page.markup import chart_caption
 
 WINDOW_S = 120.0
 LINE_PX = 1.6
-# A line without a value in this many last rows, such as omega of a policy that has none, is left out.
+# A line without a value in the last so many rows, such as omega under a policy without one, is left out.
 RECENT = 10
 # More points than the chart has pixels would be sent but not seen.
 MAX_POINTS = 300
@@ -25,7 +25,8 @@ HEIGHT = 104
 
 
 class History:
-    """Ages and the channel's state, sampled by the page with or without visitors. Bounded."""
+    """Ages and the channel's state, sampled by the page with or without visitors: at most the last
+    ``window_s`` seconds and ``most`` samples."""
 
     def __init__(self, window_s: float = WINDOW_S, most: int = 1200) -> None:
         self._window_s = window_s

@@ -72,9 +72,9 @@ def _camera(asked: str | None, found: RecordedDecision, explanation: Explanation
 
 
 def _regions(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.float64] | None:
-    """Shares of the regions of the camera's image. Where frames cannot be embedded again (the model's file is
-    gone, the extra is not installed) this prints why and returns None, unless the user asked for the
-    camera."""
+    """Shares of the regions of the camera's image. If frames cannot be embedded again (the model's file is
+    gone, the extra is not installed), this prints why and returns None; it raises ValueError if the user
+    asked for the camera."""
     decision, image = found.decision, found.images[camera]
     try:
         number = decision.state.cameras.index(camera)
@@ -101,7 +101,7 @@ def _embedder(found: RecordedDecision) -> EmbedImages:
 def as_text(
     found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None
 ) -> str:
-    """The e as lines of text."""
+    """The explanation as lines of text."""
     p = np.exp(found.decision.logp)
     lines = [
         f"decision {found.decision.number}: {e.action} (probability {p:.2g}, "

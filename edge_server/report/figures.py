@@ -199,8 +199,8 @@ def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
 
 
 def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
-    """What accuracy costs in time, as measured (OUT/frontier.json), and where the run stands: what it showed
-    in its last fifth, at the time from one update to the next."""
+    """What accuracy costs in time, as measured (OUT/frontier.json), and the run's own point: PSNR of what it
+    showed in its last fifth, against the time from one update to the next."""
     try:
         points = [
             (str(p["effort"]), float(p["update_ms"]), float(p["psnr_db"]), float(p["psnr_moving_db"]))

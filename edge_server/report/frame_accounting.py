@@ -1,7 +1,7 @@
 """Joins the ledgers of all processes into an accounting of every frame; every term is counted by itself.
 
-A frame is (camera, session, sequence). What became of it is what processes wrote. Both sums must come out by
-what was written; nothing is computed as what is left over:
+A frame is (camera, session, sequence). What became of it is what processes wrote. Both sums must hold for
+what was written; no term is computed as a remainder:
 
     captured = replaced + waiting + sent
     sent + duplicated = skipped + dropped_busy + superseded + lost + broken + delivered + rejected
@@ -15,9 +15,9 @@ copy counts as ``sent``, every other one as ``duplicated``. Ends of copies:
    (inside the link when the emulator ended) each end one copy.
 3. Second-hand statements count only for copies that the above have not ended, because a process further down
    the path held the frame later: an ``answered`` of the node that refuses, then ``broken``.
-4. ``cut_off``: nobody wrote the end, and a line about the frame is within ``CUT_OFF_NS`` of the end of a
-   ledger that ends without ``closed``, of a process that may have held the copy: it was killed, or still
-   runs. A frame that such a node captured last and did not send counts as ``waiting``.
+4. ``cut_off``: no process wrote the end, and a process that may have held the copy was killed or still runs:
+   its ledger ends without ``closed``, and a line about the frame is within ``CUT_OFF_NS`` of that end. A
+   frame that such a node captured last and did not send counts as ``waiting``.
 
 A copy with no end at all is in no term, so the second sum then fails. ``doubts`` says in words why an account
 does not close: a sum that does not come out, statements that cannot all be true (``contradictions``, such as
@@ -45,8 +45,8 @@ from freshfield.ledger import LedgerReader
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
 LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
 ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "cut_off")
-# A process that is killed takes with it what it wrote about in its last moments. The thesis's links hold a
-# frame for a second or two; a frame without a line so near to the end was lost by something else.
+# A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
+# frame for a second or two; a frame without a line this near to the end was lost by something else.
 CUT_OFF_NS = 10 * 10**9
 _EVENTS = {
     "node": {"captured", "replaced", "waiting", "sent", "broken", "answered"},
@@ -117,10 +117,13 @@ class FrameCounts:
 class FrameAccounting:
     """What became of every frame of a run.
 
+    total, by_camera: counts of frames and copies.
+    contradictions: the first of the statements that cannot all be true; contradiction_count: how many.
     unknown_origin: refused frames that no camera of the run can have sent, by reason; in no other count.
-    lines_lost: ledger lines that were not written or cannot be read. unreadable: names of ledgers that cannot
-    be read to their end. notes: one line for people on whatever was missing, torn or assumed. ledgers: how
-    many were read.
+    lines_lost: ledger lines that were not written or cannot be read.
+    unreadable: names of ledgers that cannot be read to their end.
+    notes: lines for people on whatever was missing, torn or assumed.
+    ledgers: number of ledgers read.
     """
 
     total: FrameCounts = field(default_factory=FrameCounts)
@@ -323,7 +326,7 @@ def account_frames(out: Path) -> FrameAccounting:
 
 
 def _without_a_line(path: Path) -> bool:
-    """Whether a process was killed before its first line was complete: it wrote about no frame either."""
+    """Whether the first line is incomplete: its process was killed before it wrote about any frame."""
     try:
         with path.open("rb") as file:
             return not file.readline(1 << 16).endswith(b"\n")
@@ -351,7 +354,7 @@ def _read_ledger(
     ends: Sequence[tuple[int, int, int]],
     accounting: FrameAccounting,
 ) -> None:
-    """Read ledger ``number`` into ``contents``, what is missing into ``accounting``. ends: of
+    """Read ledger ``number`` into ``contents``, and what is missing into ``accounting``. ends: from
     ``_cut_off_ends``."""
     role, name, notes = ledger.role, ledger.path.name, accounting.notes
     known = _EVENTS.get(role, set())

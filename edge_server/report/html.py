@@ -64,7 +64,7 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
 
 
 def _views(report: Report) -> str:
-    """The views that every fidelity of the report is on."""
+    """The views on which all fidelities of the report were measured."""
     return NOTHING_HELD_OUT if SELECTED in report["fidelity"]["scored_on"] else "a held-out view"
 
 

@@ -98,12 +98,12 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     """Number and duration of updates.
 
-    series: rows of updates, for what the edge has not counted: not all have one.
-    edge: what it has counted. Returns {count, ms_p50,
-    ms_p95, first_ms: from the start of the edge to the first publication, undecodable, shed: frames left out
-    for lack of time, without_step: updates without time for an optimizer step, refused: {camera: how often
-    the field left its image out}}. Where the scenario sets a deadline, also deadline_ms and met_share: the
-    share of updates within it.
+    series: rows of updates, used where the edge has no count; not every update has a row.
+    edge: the edge's own counts.
+    Returns {count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
+    undecodable, shed: frames left out for lack of time, without_step: updates without time for an optimizer
+    step, refused: {camera: how often the field left its image out}}. Where the scenario sets a deadline, also
+    deadline_ms and met_share: the share of updates within it.
     """
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
@@ -150,8 +150,8 @@ def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]
 
 def shown(rows: Sequence[Row], seconds: float) -> dict[str, Any]:
     """What was shown at random instants of the last fifth of the run's ``seconds``: mean of each score, count
-    of the instants, and age_ms {network, waiting, computing, display}: what the mean age of the views that
-    were shown consists of."""
+    of the instants, and age_ms {network, waiting, computing, display}: the parts of the mean age of the views
+    behind what was shown."""
     late = [row for row in rows if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
     return {
         **_means(late, SHOWN),

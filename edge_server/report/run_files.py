@@ -12,7 +12,7 @@ from msgspec import Meta
 
 Row = dict[str, Any]
 
-# Beyond it nothing that a run measures or counts.
+# No number that a run measures or counts is larger.
 Number = Annotated[int, Meta(ge=-(10**15), le=10**15)] | Annotated[float, Meta(ge=-1e15, le=1e15)]
 Numbers = dict[str, Number | None]
 
@@ -113,7 +113,7 @@ class _Ages(TypedDict, total=False):
     age_ms: Numbers | None
 
 
-# What a report takes from the files, and of which type: of JSON files key by key, of JSON lines row by row.
+# What a report takes from the files, and its types: of JSON files key by key, of JSON lines row by row.
 _EDGE: dict[str, Any] = {
     "kind": str, "scenario": str | None, "seed": int | None, "field": str | None, "policy": str | None,
     "value": Number | None, "seconds": Number, "uptime_s": Number, "lines_lost": Number,
@@ -134,12 +134,13 @@ _ROWS: dict[str, Any] = {
 class RunFiles:
     """Contents of a run's folder.
 
-    edge, channel: status files of the edge and the emulator. series: rows as in state.Publication.
-    shown: rows as ``Journal.shown`` writes them.
-    ages: rows {t_s, age_ms: {camera: ms or None}}. processes: rows {t_s, name: {rss_mb, cpu, pid}}.
-    frontier: what accuracy costs, as the edge had it. mesh: as ``edge-server export --json`` writes it.
+    edge, channel: status files of the edge and the emulator.
+    series: rows as in state.Publication. shown: rows as ``Journal.shown`` writes them.
+    ages: rows {t_s, age_ms: {camera: ms or None}}.
+    processes: rows {t_s, name: {rss_mb, cpu, pid}}.
+    frontier: the frontier that the edge used. mesh: as ``edge-server export --json`` writes it.
     images: those that exist, by name.
-    notes: one line for people on whatever was missing or torn.
+    notes: lines for people on whatever was missing or torn.
     """
 
     out: Path
@@ -179,7 +180,8 @@ def read_run_files(out: Path) -> RunFiles:
 
 
 def _read_json(path: Path, model: Any, notes: list[str]) -> Row:
-    """What ``model`` names of an object in a JSON file: key by key, or with a TypedDict all or nothing."""
+    """The part of an object in a JSON file that ``model`` names: key by key, or with a TypedDict all or
+    nothing."""
     kept: Row = {}
     try:
         data = msgspec.convert(_parse(path.read_bytes()), dict[str, Any])

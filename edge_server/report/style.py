@@ -23,7 +23,7 @@ ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#222222", "#777777", "#E4E4E4"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
 WIDTH_INCH = 8.4
-_COLORS = 64  # of a file: a quarter of the bytes, and no difference that one sees in a curve
+_COLORS = 64  # in a file: a quarter of the bytes, without a visible difference in curves
 
 _RC: Any = {
     "font.family": "sans-serif",
@@ -60,7 +60,7 @@ def figure(
 ) -> Iterator[tuple]:
     """``with figure(path, rows) as (fig, axes):`` draws in the common style and writes ``path`` (PNG).
 
-    axes: array (rows, columns). kwargs go to ``plt.subplots``.
+    axes: array (rows, columns). height_inch: height of a row. kwargs go to ``plt.subplots``.
     """
     with plt.rc_context(_RC):
         fig, axes = plt.subplots(

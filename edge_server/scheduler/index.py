@@ -1,5 +1,5 @@
-"""Index policies: the k cameras of the largest index, which compares what the field knows of each with its
-newest frame. Cameras of which nothing was used yet come first."""
+"""Index policies: they select the k cameras with the largest index, which compares the frame of a camera that
+was used last with its newest one. Cameras without a used frame come first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Embedding = NDArray[np.float32]
 
 
 class IndexPolicy(Policy):
-    """A subclass says what the index of a camera is."""
+    """Base of index policies; a subclass defines the index of a camera."""
 
     parameter = "k"
     value: int = 6
@@ -39,21 +39,21 @@ class IndexPolicy(Policy):
         return tuple(c for c in epoch.generated_ns if c in chosen)
 
     def _index(self, camera: str, known_ms: float, age_ms: float) -> float:
-        """known_ms: age of the camera's frame used last. age_ms: of its newest."""
+        """known_ms: age of the camera's frame that was used last. age_ms: age of its newest frame."""
         raise NotImplementedError
 
     def _look(self, epoch: Epoch) -> None:
-        """Before the indices are computed."""
+        """Called before the indices are computed."""
 
     def _use(self, cameras: set[str]) -> None:
-        """Their newest frames are used."""
+        """Called with the selected cameras, whose newest frames are now used."""
 
 
 class Whittle(IndexPolicy):
-    """Whittle-type index: the k views that take most from the squared ages of what the field knows.
+    """Whittle-type index: selects the k views that most reduce the squared ages of the frames used last.
 
-    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D that of its frame used last:
-    where a new frame is always at hand (a = 0) that is the Whittle index of the age of information over a
+    A camera's index is (D^2 - a^2) / 2, with a the age of its newest frame and D the age of its frame used
+    last. If a new frame is always at hand (a = 0), this is the Whittle index of the age of information over a
     reliable channel (Kadota et al., IEEE/ACM ToN 2018, with p = 1 and up to half a slot).
     """
 
@@ -64,7 +64,8 @@ class Whittle(IndexPolicy):
 
 
 class _SeeingPolicy(IndexPolicy):
-    """Its index needs embeddings (6.31), of any width. A camera without one is taken for an average one."""
+    """Base of policies whose index needs embeddings (6.31), of any width. A camera without an embedding
+    counts as an average one."""
 
     embedding = None, ""
 
@@ -81,12 +82,12 @@ class _SeeingPolicy(IndexPolicy):
 
 
 class IncorrectAge(_SeeingPolicy):
-    """Age of incorrect information: the k views of whose change the field has not known for longest.
+    """Age of incorrect information: selects the k views whose change the field has missed for longest.
 
     A camera's index is D |z - z'|, with D the age of its frame used last, z' the embedding of that frame and
-    z that of its newest: the age of incorrect information with linear time and distance as penalty (Maatouk
-    et al., IEEE/ACM ToN 2020). The edge cannot see the source itself: its newest frame stands for it, and
-    what the field knows was correct when the frame used last was taken.
+    z the embedding of its newest: the age of incorrect information with linear time and distance as penalty
+    (Maatouk et al., IEEE/ACM ToN 2020). The edge cannot see the source itself: the newest frame stands for
+    it, and what the field knows was correct when the frame used last was taken.
     """
 
     name = "aoii"
@@ -115,12 +116,12 @@ class IncorrectAge(_SeeingPolicy):
 
 
 class PredictedCovariance(_SeeingPolicy):
-    """Largest predicted covariance: the k views that take most from the variance of what the field knows.
+    """Largest predicted covariance: selects the k views that most reduce the predicted variance.
 
-    What a camera sees is taken for a random walk: between its frame used last, of age D, and now the variance
-    of its embedding grows by q D, and its newest frame, of age a, leaves q a of that. The index is q (D - a),
-    the reduction of the predicted covariance (value of information in Ayan et al., ICCPS 2019). q, per
-    camera, is the squared change of embeddings between successive newest frames, over their time.
+    The embedding of a camera's view is modelled as a random walk: its variance grows by q D from the frame
+    used last, of age D, until now, and using the newest frame, of age a, leaves q a of that. The index is
+    q (D - a), the reduction of the predicted covariance (value of information in Ayan et al., ICCPS 2019).
+    q, per camera, is the squared change of embeddings between successive newest frames, over their time.
     """
 
     name = "covariance"

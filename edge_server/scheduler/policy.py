@@ -31,10 +31,12 @@ class Observer(Protocol):
 class Epoch:
     """What a policy may look at.
 
-    now_ns: time of the decision on the edge's clock. number: counts the epochs. generated_ns, received_ns:
-    when the newest frame of every camera that has reported was generated, and arrived; others are missing.
-    state: of all cameras, with poses and embeddings, for policies that look at more than ages; None where it
-    is not available.
+    now_ns: time of the decision on the edge's clock.
+    number: counts the epochs; at the edge it is the number of the update to decide on.
+    generated_ns, received_ns: when the newest frame of each camera was generated, and when it arrived;
+    cameras that have not reported are missing.
+    state: computes the state of all cameras, with poses and embeddings, for policies that look at more than
+    ages; None where it is not available.
     """
 
     now_ns: int
@@ -51,9 +53,11 @@ class Epoch:
 class SelectionWindow:
     """The first half of a decision: when to select, and which frames qualify.
 
-    omega_ms: shown to people; None for policies without one. wait_until_ns: earliest instant of selection.
+    omega_ms: shown to people; None for policies without one.
+    wait_until_ns: earliest instant of selection.
     generated_after_ns, received_after_ns: only frames generated, or arrived, later qualify (omega-wait); None
-    admits all. flush: abort what is in transit at the decision.
+    admits all.
+    flush: abort what is in transit at the decision (virtual time only).
     """
 
     omega_ms: float | None = None
@@ -67,9 +71,11 @@ class Policy:
     """Base of all policies. A subclass sets ``name`` and implements ``select``; the rest are defaults.
 
     parameter: name and unit of the one value a user may set, such as ``omega_ms`` or the count ``k``; None if
-    there is none. value: that value. treatment: applied to the selected views before they supervise the
-    field. embedding: width of the embeddings it decides by (0: it needs none; None: any) and the name of
-    their embedder (empty: not said).
+    there is none.
+    value: that value.
+    treatment: applied to the selected views before they supervise the field; None: no treatment.
+    embedding: width of the embeddings it decides by (0: it needs none; None: any) and the name of their
+    embedder (empty: any).
     """
 
     name: str
@@ -79,7 +85,8 @@ class Policy:
     embedding: tuple[int | None, str] = (0, "")
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        """value: of ``parameter``; None keeps the default. rng: for policies that draw. Raises ValueError."""
+        """value: value of ``parameter``; None keeps the default. rng: for policies that draw. Raises
+        ValueError for a value out of range."""
         self._rng = rng
         if self.parameter is None or value is None:
             return

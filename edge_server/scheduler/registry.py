@@ -1,8 +1,8 @@
 """Policies by name, as people write them: ``threshold:120``, ``wait+freshen``, ``bandit:FILE``.
 
-Adding a policy takes a class and a line in ``POLICIES``. A name may go on with a treatment of
-the selected views: ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a
-treatment's name alone treats all views. ``bandit:FILE`` is a learned policy
+Adding a policy takes a class and a line in ``POLICIES``. A policy's name may be followed by a treatment of
+the selected views, as in ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a
+treatment's name alone stands for ``all`` with that treatment. ``bandit:FILE`` is a learned policy
 (``edge_server.scheduler.learned``).
 """
 
@@ -56,9 +56,11 @@ OFFERED: tuple[str, ...] = (
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
     """The named policy; modules of treatments and of learned policies are imported only now.
 
-    name: as in ``POLICIES``, or POLICY+TREATMENT, TREATMENT, bandit:FILE. value: of its parameter; None takes
-    the default. rng: for policies that draw. ValueError for an unknown name or a value out of range, with the
-    choices.
+    name: as in ``POLICIES``, or POLICY+TREATMENT, TREATMENT, bandit:FILE.
+    value: value of its parameter; None takes the default.
+    rng: for policies that draw.
+    Raises ValueError for an unknown name (the message lists the known ones), a value out of range, or a file
+    that is not a learner's checkpoint.
     """
     if name.startswith(BANDIT):
         if value is not None:
@@ -117,7 +119,7 @@ def policy_label(policy: Policy) -> str:
 
 
 def short_name(name: str) -> str:
-    """A policy's name for people to read: of a checkpoint only the file's name, not its folder."""
+    """A policy's name for people to read: of ``bandit:FILE`` without the file's folder."""
     return BANDIT + Path(name.removeprefix(BANDIT)).name if name.startswith(BANDIT) else name
 
 

@@ -18,6 +18,8 @@ from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
 
 class Wait(Policy):
+    """Wait omega, then use the newest frames that were generated meanwhile (6.5)."""
+
     name = "wait"
     parameter = "omega_ms"
     value: float = 120.0
@@ -30,6 +32,8 @@ class Wait(Policy):
 
 
 class WaitArrived(Wait):
+    """Wait omega, then use the newest frames that arrived meanwhile, however old (6.16)."""
+
     name = "wait-arrived"
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
@@ -37,6 +41,8 @@ class WaitArrived(Wait):
 
 
 class WaitFlush(Wait):
+    """``Wait``, after aborting what is in transit at the decision (6.5); virtual time only."""
+
     name = "wait-flush"
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
@@ -45,8 +51,8 @@ class WaitFlush(Wait):
 
 
 def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> SelectionWindow:
-    """The horizon (now, now + omega]; omega = 0 admits the buffer as it is, at once. arrived: admits frames
-    that arrive in it, else those generated in it."""
+    """The horizon (now, now + omega]; omega = 0 admits the buffer as it is, at once. arrived: whether frames
+    that arrive in it are admitted, rather than those generated in it."""
     if omega_ms == 0.0:
         return SelectionWindow(omega_ms=0.0)
     until_ns = now_ns + round(omega_ms * 1e6)

@@ -27,9 +27,14 @@ Camera = tuple[NDArray[np.float64], Pinhole]
 
 @dataclass(frozen=True)
 class DepthMap:
-    """depth: float32 (H, W), meters along the ray; 0: unknown, inf: the ray hits nothing. trust: float32
-    (H, W), weight (w_new of 3.9); 0: unknown. cosine: float32 (H, W), of the angle between ray and normal.
-    color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters."""
+    """What one camera sees of a surface.
+
+    depth: float32 (H, W), meters along the ray; 0: unknown, inf: the ray hits nothing.
+    trust: float32 (H, W), weight (w_new of 3.9); 0: unknown.
+    cosine: float32 (H, W), of the angle between ray and normal.
+    color: uint8 (H, W, 3).
+    camera_to_world: (4, 4), OpenCV axes, meters.
+    """
 
     depth: NDArray[np.float32]
     trust: NDArray[np.float32]
@@ -60,11 +65,15 @@ def depth_map(
     sure: NDArray[np.float32] | None = None,
     steepest_deg: float = STEEPEST_DEG,
 ) -> DepthMap:
-    """A depth map from depth along rays (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond
-    ``MAX_DEPTH_M``: unknown. sure: float32 (H, W), factor of the trust of pixels that see a surface.
-    SurfaceError: shapes do not match.
+    """A depth map from depth along rays. Trust is the cosine between ray and normal: uncertainty grows as the
+    surface turns away.
 
-    Trust is the cosine between ray and normal: uncertainty grows as the surface turns away.
+    depth: float32 (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond ``MAX_DEPTH_M``:
+        unknown.
+    color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters.
+    sure: float32 (H, W), factor of the trust of pixels that see a surface; None: 1.
+    steepest_deg: largest angle between ray and normal; beyond it depth is unknown.
+    Raises SurfaceError if shapes do not match or the pose is not finite.
     """
     shape = (intrinsics.height, intrinsics.width)
     if depth.shape != shape or color.shape != (*shape, 3):
@@ -123,8 +132,11 @@ def render_depth_maps(
     solid: float = SOLID,
     on_map: Callable[[int], None] | None = None,
 ) -> Iterator[DepthMap]:
-    """Render depth maps for ``cameras``, one at a time. on_map: called with the count done. For a ``planar``
-    renderer, ``render_surface`` gives unbiased depth."""
+    """Render depth maps for ``cameras``, one at a time. For a ``planar`` renderer, ``render_surface`` gives
+    unbiased depth.
+
+    solid: least opacity of a ray that hits a surface. on_map: called with the count done.
+    """
     show = renderer.render_surface if getattr(renderer, "planar", False) else renderer.render  # type: ignore[attr-defined]
     for k, (pose, lens) in enumerate(cameras):
         found = show(pose, lens)

@@ -36,9 +36,14 @@ class Truth:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Distances in millimeters. accuracy: from the mesh to the surface; completeness: from the surface that
-    two cameras see to the mesh; chamfer: the mean of the two means. complete: share of that surface within
-    ``WITHIN_M`` of the mesh; precise: share of the mesh within ``WITHIN_M`` of the surface."""
+    """Distances in millimeters.
+
+    accuracy: from the mesh to the surface (mean, median, 95th percentile).
+    completeness: mean from the surface that two cameras see to the mesh.
+    chamfer: the mean of the two means.
+    complete: share of that surface within ``WITHIN_M`` of the mesh.
+    precise: share of the mesh within ``WITHIN_M`` of the surface.
+    """
 
     chamfer_mm: float
     accuracy_mm: float
@@ -50,7 +55,8 @@ class Comparison:
 
 
 def thin_points(points: Points, spacing_m: float) -> NDArray[np.int64]:
-    """Indices of the first of points (N, 3) in every grid cell."""
+    """Indices of the first of points (N, 3) in every grid cell of side ``spacing_m``. Raises SurfaceError if
+    the points span too many cells."""
     cells = np.floor(points / spacing_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     x, y, z = (int(n) + 1 for n in cells.max(axis=0, initial=0))

@@ -24,10 +24,17 @@ Say = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None: the size of a pixel at the surface.
-    bounds: lower and upper corner, meters; None: from the depth maps. watertight: close the surface in
-    unobserved space. min_weight: known voxels have more weight than this (a camera at normal incidence counts
-    1). memory_mb: of the volume. sharpen: refine depth by photo-consistency (``refine_depth``)."""
+    """How a mesh is made.
+
+    method: tsdf (3.8-3.10) or sdf (3.12-3.15).
+    sharpen: refine depth by photo-consistency (``refine_depth``).
+    voxel_m: None: the size of a pixel at the surface.
+    bounds: lower and upper corner, meters; None: from the depth maps.
+    watertight: close the surface in unobserved space.
+    min_weight: known voxels have more weight than this (a camera at normal incidence counts 1).
+    memory_mb: largest size of the volume.
+    Raises SurfaceError for an unknown method or a weight out of range.
+    """
 
     method: str = "tsdf"
     sharpen: bool = True
@@ -57,8 +64,10 @@ def make_depth_maps(
 ) -> list[DepthMap]:
     """Make the depth maps that ``mesh_from_depth_maps`` fuses.
 
-    renderer: of the field. views: the cameras, with their images. say: called with each stage and its
-    completed share. SurfaceError: there are no views.
+    renderer: renders the field. views: the cameras, with their images.
+    say: called with each stage and its completed share.
+    pool: threads; None: the shared ones.
+    Raises SurfaceError if there are no views.
     """
     if not views:
         raise SurfaceError("the field knows no cameras yet: fit it first")

@@ -33,24 +33,27 @@ from edge_server.surface.kernels.patch_match import (
     offer,
 )
 
-REACH = 0.18  # of the initial depth to each side that is searched
-GAIN_POINTS, LEAST_SHARED = 500, 50  # of an image; in two, to compare their brightness
+REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
+GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
 GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
 SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
 SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
 CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
 OFFERED = 0.6  # largest cost of a plane that is tried in other maps
 CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
-UNSURE = 0.05  # factor of the trust of a pixel about which the images tell nothing
-PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they tell next to nothing
-NOTHING = 1e-5  # ... below which they tell nothing, and the field's depth stays
+UNSURE = 0.05  # factor of the trust of a pixel whose depth the images do not determine
+PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they hardly determine it
+NOTHING = 1e-5  # ... below which they do not, and the field's depth stays
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One pass over every map. choose: whether the images to compare with are chosen anew, from the current
-    planes. offer: of the points of other maps that fall on a pixel, the plane of the "cheapest" or the
-    "nearest" is tried; "": none."""
+    """One pass over every map.
+
+    choose: whether the images to compare with are chosen anew, from the current planes.
+    offer: which of the other maps' points that fall on a pixel offers its plane: the "cheapest" or the
+    "nearest"; "": none.
+    """
 
     search: Search
     choose: bool = False

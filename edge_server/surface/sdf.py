@@ -27,9 +27,13 @@ MAX_NODES = 1 << 24
 
 @dataclass(frozen=True)
 class SdfSettings:
-    """levels: number of grids, each twice as fine as the last. steps: Adam steps per level. points: samples
-    of each kind per step. eikonal: lambda of (3.15). sides: weight of the third term. rate: Adam's learning
-    rate, in voxels of the level."""
+    """How a distance function is fitted.
+
+    levels: number of grids, each twice as fine as the last. steps: Adam steps per level.
+    points: samples of each kind per step.
+    eikonal: lambda of (3.15). sides: weight of the third term.
+    rate: Adam's learning rate, in voxels of the level.
+    """
 
     levels: int = 3
     steps: int = 60
@@ -48,8 +52,12 @@ def fit_sdf(
     pool: Pool | None = None,
     settings: SdfSettings | None = None,
 ) -> Volume:
-    """Fit a function to ``maps`` and return its distances as a volume. SurfaceError: torch is missing, the
-    grid is too fine, or there is nothing to fit."""
+    """Fit a function to ``maps`` and return its distances as a volume.
+
+    memory_mb, pool: as in ``fuse_maps``.
+    say: called with the stage and its completed share.
+    Raises SurfaceError if torch is missing, the grid is too fine, or there is nothing to fit.
+    """
     settings = settings or SdfSettings()
     volume = fuse_maps(grid, maps, memory_mb, pool)
     samples = _Samples.of(maps, grid)

@@ -27,7 +27,8 @@ OUTLIERS = 0.002  # share of points at each end of each axis
 
 @dataclass(frozen=True)
 class Grid:
-    """The voxel grid. lower, upper: (3,) meters, corners of the box. band_m: truncation, d_max of (3.8)."""
+    """The voxel grid. lower, upper: (3,) meters, corners of the box. voxel_m: side of a voxel. band_m:
+    truncation, d_max of (3.8). Raises SurfaceError for an impossible or too fine grid."""
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
@@ -98,7 +99,8 @@ def fuse_maps(
     pool: Pool | None = None,
     on_map: Callable[[int], None] | None = None,
 ) -> Volume:
-    """Fuse ``maps`` in order. on_map: called with the count done. SurfaceError: more than ``memory_mb``."""
+    """Fuse ``maps`` in order. on_map: called with the count done. Raises SurfaceError if the volume needs
+    more than ``memory_mb`` megabytes."""
     maps = list(maps)
     pool = pool or shared_pool()
     table = np.full(tuple(grid.blocks), -1, np.int32)

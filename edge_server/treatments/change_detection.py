@@ -77,7 +77,8 @@ class AgedView:
 def with_ages(
     views: Sequence[View], earlier: Mapping[str, View], now_ns: int, young: float
 ) -> list[AgedView]:
-    """The views in their order. young: share of them, youngest first, that count as young."""
+    """The views in their order, with their ages at ``now_ns``. young: share of them, youngest first, that
+    count as young."""
     ages_ms = [(now_ns - view.generated_ns) / 1e6 for view in views]
     young_ms = young_age_ms(ages_ms, young)
     return [AgedView(view, earlier.get(view.camera), age, young_ms) for view, age in zip(views, ages_ms)]

@@ -28,8 +28,8 @@ from edge_server.treatments.optical_flow import Motion, estimate_motion, grid, s
 
 _SPEED_EXPONENT = 4.0  # the fastest pixel outweighs a still one by e^4
 _COVERED = 0.4  # share of a pixel from which on it shows what was warped there
-_RELATIVE_ERROR = 0.5  # of a displacement: it may be wrong by so much in length or direction,
-_LEAST_ERROR_PX = 1.0  # and by this much at least
+_RELATIVE_ERROR = 0.5  # a displacement may be wrong by this share of its length, in length or direction,
+_LEAST_ERROR_PX = 1.0  # and by at least this much
 
 
 @dataclass(frozen=True)

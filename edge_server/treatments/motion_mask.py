@@ -27,7 +27,7 @@ from edge_server.treatments.change_detection import (
     with_ages,
 )
 
-_LEAST_GRADIENT = 0.02  # of the blurred image a pixel: flatter pixels say nothing about speed
+_LEAST_GRADIENT = 0.02  # of the blurred image, per pixel: flatter pixels say nothing about speed
 _MAX_REACH = 0.25  # largest dilation, as a share of the image's longer side
 
 

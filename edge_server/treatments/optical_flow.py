@@ -41,7 +41,7 @@ class Motion:
 
 
 def estimate_motion(before: View, now: View, changes: Changes) -> Motion:
-    """Motion of the pixels of ``now``. changes: of the two views, by ``compare``."""
+    """Motion of the pixels of ``now``. changes: what ``compare`` found between the two views."""
     shape = now.image.shape[:2]
     speed, moving = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool)
     if not changes.changed.any():
@@ -127,8 +127,8 @@ def _smoothed(
 ) -> NDArray[np.float32]:
     """Flow of the moving pixels averaged over their neighborhood by confidence; 0 elsewhere.
 
-    Pixels that were hidden in the frame before have no flow of their own and take that of their body. Small
-    errors must not tear a body apart that is warped several times as far as it was seen to move.
+    Pixels that were hidden in the frame before have no flow of their own and take that of their body. A body
+    is warped several times as far as it was seen to move: small errors must not tear it apart.
     """
     share = (np.maximum(confidence, _LEAST_CONFIDENCE) * moving).astype(np.float32)
     total = np.maximum(cv2.GaussianBlur(share, (0, 0), _SMOOTHING_PX), np.float32(1e-9))

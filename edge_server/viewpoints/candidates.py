@@ -25,7 +25,7 @@ class Candidates:
     """Viewpoints to choose from.
 
     poses: (N, 4, 4) camera-to-world, metres.
-    lens: of the camera that is carried from one to the next.
+    lens: intrinsics of the camera that is carried from one to the next.
     target: (3,) the point that is looked at; paths go round it.
     reachable: (N,) whether the robot gets there; all of them unless ``within`` says otherwise.
     bounds: (2, 3) lower and upper corner of the object; None: not known.
@@ -68,10 +68,11 @@ def half_hemisphere(
 ) -> Candidates:  # fmt: skip
     """``count`` viewpoints that cover a sector of a sphere evenly and look at its centre.
 
+    target: (3,) centre of the sphere, metres. lens: intrinsics of the camera.
     elevations_deg, azimuths_deg: of the sector; azimuth 0 is on the target's -y side, 90 on its +x side.
     offset: shifts the azimuths, in parts of the sector: two sets of different offsets share no viewpoint.
 
-    Raises ViewpointError.
+    Raises ViewpointError unless ``count`` is 1 to MOST_CANDIDATES and ``radius_m`` is positive.
     """
     if not 1 <= count <= MOST_CANDIDATES or not radius_m > 0.0:
         raise ViewpointError(
@@ -95,8 +96,13 @@ def from_poses(
     target: ArrayLike | None = None,
     bounds: ArrayLike | None = None,
 ) -> Candidates:
-    """Candidates at any poses (4, 4), all reachable. target: None takes the point nearest to all lines of
-    sight. Raises ViewpointError for none, or for poses that are not finite."""
+    """Candidates at any poses (4, 4), all reachable.
+
+    lens: intrinsics of the camera.
+    target: (3,); None takes the point nearest to all lines of sight.
+    bounds: (2, 3), lower and upper corner of the object; None: not known.
+    Raises ViewpointError for no poses, or for poses that are not finite.
+    """
     array = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     if not len(array):
         raise ViewpointError("no candidate viewpoints: give at least one pose")

@@ -1,4 +1,4 @@
-"""Plans a capture: again and again the candidate that is worth most for its way, until the budget is used."""
+"""Plans a capture: takes the candidate with the best value for its way, again until the budget is used."""
 
 from __future__ import annotations
 
@@ -39,8 +39,10 @@ class Budget:
 class Stop:
     """A view of the plan.
 
-    candidate: its number. value: of the selector. travel_m: from the stop before. seconds: of choosing.
-    why: one line for people. values: of all candidates when this one was chosen, NaN where closed.
+    candidate: its number.
+    value: the selector's value of it. travel_m: length of the way from the stop before.
+    seconds: time to choose it. why: one line for people.
+    values: values of all candidates when this one was chosen, NaN where closed.
     """
 
     candidate: int
@@ -92,9 +94,10 @@ def plan_capture(
 
     take: takes the picture at a candidate; None: it was refused (the arm does not get there after all, the
         picture is spoilt). The camera then stays where it was, and refused views do not count.
-    travel_weight: how much the longest way to a candidate weighs against the largest difference between two
-        values, 0 to any number; 0 chooses by value alone.
-    fit: for selectors that need a field.
+    seed: determines the first view and what the selector draws.
+    travel_weight: weight of the longest way to a candidate against the largest difference between two values,
+        0 to any number; 0 chooses by value alone.
+    fit: fits a field to views, for selectors that need one.
 
     Raises ViewpointError where no candidate is reachable, or every one is refused.
     """

@@ -1,6 +1,6 @@
 """Simulated experts: they compare reconstructions by their pictures, so that studies run without people.
 
-What they say is never mixed with what people said: every record of an answer carries ``label``.
+Their answers are never mixed with those of people: every record of an answer carries ``label``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _BLUR_PX = 2.0
 
 
 def edges(rendering: Picture, truth: Picture) -> float:
-    """How well outlines are where they are in truth: the gradients' mean difference, negated."""
+    """How well outlines agree with those of the truth: the gradients' mean difference, negated."""
     return -float(np.abs(_gradient(rendering) - _gradient(truth)).mean())
 
 
@@ -36,7 +36,7 @@ def whole_object(rendering: Picture, truth: Picture) -> float:
 
 
 def texture(rendering: Picture, truth: Picture) -> float:
-    """How well fine detail is kept: the mean difference of what a blur takes away, negated."""
+    """How well fine detail is kept: the mean difference of what a blur removes, negated."""
     return -float(np.abs(_detail(rendering) - _detail(truth)).mean())
 
 
@@ -46,12 +46,13 @@ TASTES: dict[str, Taste] = {"edges": edges, "object": whole_object, "texture": t
 
 @dataclass
 class SimulatedExpert:
-    """Answers as its taste and its habits have it.
+    """Answers by its taste and its habits.
 
-    taste: of ``TASTES``. scores: (N,) of the reconstructions, by ``judge``.
+    taste: one of ``TASTES``. scores: (N,), scores of the reconstructions, by ``judge``.
+    rng: draws mistakes and laziness.
     wrong: share of answers that are the opposite of what the taste says.
-    lazy: share of pairs at which it does not look and takes the first one.
-    contradicts: it answers by a coin.
+    lazy: share of pairs that it does not look at: it takes the first one.
+    contradicts: whether it answers at random.
     """
 
     taste: str

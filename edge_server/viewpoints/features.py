@@ -1,4 +1,4 @@
-"""What a step of a trajectory is described by, (s_t, a_t) of 4.5.2: for the reward model and the policy."""
+"""Features of a step of a trajectory, (s_t, a_t) of 4.5.2, for the reward model and the policy."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class StepFeatures:
             object.__setattr__(self, name, value)
 
     def actions(self, order: Sequence[int]) -> Array:
-        """(N, F) features of each candidate as the next view after those of ``order``, GEOMETRY: how much
-        better all reachable directions are seen by their nearest and by their second nearest view; the way in
-        metres; the place, in mean distances to the target."""
+        """(N, F) features, named by GEOMETRY, of each candidate as the next view after those of ``order``:
+        how much better all reachable directions would be seen by their nearest and by their second nearest
+        view; the way there in metres; the position, in mean distances to the target."""
         seen = list(order)
         columns = []
         for alike in self._alike:

@@ -1,4 +1,4 @@
-"""FisherRF (Jiang et al. 2024): the view that says most about Gaussians that earlier views left unsure."""
+"""FisherRF (Jiang et al. 2024): prefers the view with most information about Gaussians still uncertain."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from edge_server.viewpoints.kernels.fisher_information import MOMENTS, fisher_in
 from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import Pinhole
 
-_CAMERAS_A_RUN = 8  # as many tile lists are kept at a time
-# What is known of a parameter without any view, as a share of what the views say of that parameter on
-# average over all Gaussians: it has the parameter's unit, and bounds what an unseen Gaussian is worth. With
-# .01 the views go to the edge of the dome: on four captures of tile, 8 views gave 19.8 dB, with 1 22.2 dB.
+_CAMERAS_A_RUN = 8  # number of cameras whose tile lists are in memory at a time
+# Prior information about a parameter, as a share of what the views give on average over all Gaussians: that
+# has the parameter's unit, and bounds the value of an unseen Gaussian. With a share of .01 the views go to
+# the edge of the dome: on four captures of tile, 8 views gave 19.8 dB, and with 1, 22.2 dB.
 PRIOR = 1.0
 
 
@@ -51,7 +51,7 @@ class FisherRF:
     """Expected gain of information, 1/2 log det(H_train + H_view + prior) - 1/2 log det(H_train + prior).
 
     On the diagonal this is a sum of 1/2 log(1 + H_view / (H_train + prior)). The paper takes the trace of the
-    ratio instead, an upper bound, for which the Gaussians that were never seen count beyond all measure.
+    ratio instead, an upper bound that Gaussians never seen before dominate.
     """
 
     name = "fisher"

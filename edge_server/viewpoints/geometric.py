@@ -11,18 +11,18 @@ from edge_server.viewpoints.registry import CaptureState
 Array = NDArray[np.float64]
 
 _LLOYD_ROUNDS = 20
-_STAND_IN = 1e-2
-_SAMPLES_A_SIDE = 8  # of each face of the object's box
-# A view from this much aside is unlike: exp(-1), for small angles.
+_STAND_IN = 1e-2  # factor on the value of a candidate that replaces a refused one
+_SAMPLES_A_SIDE = 8  # points along each side of a face of the object's box
+# The likeness of two views this far apart is exp(-1), for small angles.
 _ALIKE_RAD = 0.5
-_MOST_WANTED = 128  # directions that are to be covered: of more candidates, every second, third, ...
-# Where the object's size is not known, it is taken to reach this far from the target, in distances of the
+_MOST_WANTED = 128  # directions to cover; with more candidates, only every second, third, ... counts
+# An object of unknown size is assumed to reach this far from the target, as a share of the distance to the
 # nearest camera.
 _UNKNOWN_SIZE = 0.3
 
 
 class RandomOrder:
-    """Every open candidate is as likely."""
+    """Every open candidate is equally likely."""
 
     name = "random"
 
@@ -43,8 +43,8 @@ class FarthestPoint:
 
 
 class UniformSpacing:
-    """Members of one evenly spaced set of ``views_wanted`` candidates are worth 1. Others stand in for
-    members that are refused: they are worth little, and the more the nearer they are to one."""
+    """Members of one evenly spaced set of ``views_wanted`` candidates have value 1. Other candidates replace
+    refused members: their value is small, and larger the nearer they are to an open member."""
 
     name = "uniform"
 
@@ -81,10 +81,10 @@ def _spread(directions: Array, usable: NDArray[np.int64], fixed: list[int], coun
 
 
 class Coverage:
-    """How much of the object's box is covered anew. Covered is what was seen from nearby: for each point of
-    a face, and each direction from which some candidate sees it (weighed by how squarely and closely), the
-    likeness of the nearest direction from which a view saw it. Views therefore go amid what is open (facility
-    location), not to its edges."""
+    """How much of the object's box a view would newly cover. The coverage of a point of a face, for each
+    direction from which some candidate sees it, is the likeness of the nearest direction from which a view
+    saw the point; it is weighted by how squarely and closely that candidate sees it. Views therefore go into
+    the middle of what is open (facility location), not to its edges."""
 
     name = "coverage"
 

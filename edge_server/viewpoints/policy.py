@@ -1,9 +1,9 @@
-"""The thesis's policy over candidate viewpoints: PPO (4.9, 4.14) on a learned reward, with the way as a cost.
+"""The thesis's policy over candidate viewpoints: PPO (4.9, 4.14) on a learned reward, with travel as a cost.
 
-The network is the schedulers' pooled one (``scheduler.learned.networks``): each candidate is a row, with the
-features of the step it would be, the embedding of its picture once it is captured (4.8), its age and its
-pose; the mean and the maximum over all rows are context. A logit a candidate makes a categorical over those
-that are open.
+The network is the schedulers' pooled one (``scheduler.learned.networks``). Each candidate is a row: the
+features of moving there next, the embedding of its picture once it is captured (4.8), its age and its pose.
+The mean and the maximum over all rows are context. One logit per candidate makes a categorical distribution
+over the open ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _CLOSED = -1e9
 class PolicyConfig:
     """How a policy is trained.
 
-    views: of an episode. updates, episodes: of training, and of each update.
+    views: number of views of an episode.
+    updates: number of updates. episodes: number of episodes for each update.
     way: cost of a way as long as the candidates' mean distance from the target, in standard deviations of
         the reward of a step: the same plan for a large scene as for a small one.
     gamma: discount of (4.14). Others as in ``learner_spec.Spec``.
@@ -59,7 +60,8 @@ class PolicyConfig:
 class Rows:
     """Turns a capture under way into the rows of a network.
 
-    embeddings: (N, d) of the candidates' pictures, shown only once captured; None: geometry only.
+    embeddings: (N, d), embeddings of the candidates' pictures; a row has its own only once it is captured.
+        None: geometry only.
     """
 
     def __init__(self, candidates: Candidates, embeddings: Array | None, layout: StateLayout) -> None:
@@ -88,8 +90,8 @@ class Rows:
 def layout_of(
     steps: StepFeatures, embeddings: Array | None, views: int, rng: np.random.Generator
 ) -> StateLayout:
-    """The layout whose step features are standardized over random captures, and embeddings (N, d) over all
-    candidates; None: without them."""
+    """The layout with step features standardized over random captures of up to ``views`` views, and with
+    ``embeddings`` (N, d) standardized over all candidates; None: without embeddings."""
     reachable = np.flatnonzero(steps.candidates.reachable)
     some = [
         steps.actions(rng.choice(reachable, min(t, len(reachable)), replace=False).tolist())[reachable]
@@ -107,7 +109,8 @@ def layout_of(
 class CandidatePolicy:
     """A trained policy as a selector: its values are logits.
 
-    weights: of the actor. embed: pictures to embeddings, as in training; needed where there were some.
+    weights: weights of the actor.
+    embed: pictures to embeddings, as in training; needed if the policy was trained with embeddings.
     """
 
     spec: Spec
@@ -147,11 +150,11 @@ def train_policy(
     candidates: Candidates, reward: Callable[[Array], Array], config: PolicyConfig, seed: int = 0,
     embeddings: Array | None = None, embed: Embed | None = None,
 ) -> tuple[CandidatePolicy, list[float]]:  # fmt: skip
-    """Train a policy on ``reward``, of step features (..., GEOMETRY), such as ``RewardModel.reward``. Returns
-    it with the mean return of each update (figure 4.6).
+    """Train a policy. Returns it with the mean return of each update (figure 4.6).
 
-    embeddings: (N, d) of the candidates' pictures, which the policy sees once they are captured; embed: makes
-        them, for its later use.
+    reward: maps step features (..., GEOMETRY) to rewards (...), such as ``RewardModel.reward``.
+    embeddings: (N, d), embeddings of the candidates' pictures; the policy sees one once it is captured.
+    embed: computes them when the policy is used.
 
     Raises ViewpointError for fewer reachable candidates than views, and for fewer than two views: the first
     is drawn.

@@ -17,11 +17,11 @@ from edge_server.viewpoints.candidates import ViewpointError
 
 Array = NDArray[np.float64]
 
-# Standard deviations of the prior, of the reward of a pair of usual difference, that the evidence chooses
-# from.
+# Widths of the prior (standard deviations of the weights) that the evidence chooses from. By the scale of the
+# features, a width is also the standard deviation of the reward difference of a usual pair.
 WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
-# Odds against the coin above which answers count as saying something.
-# A coin's answers reach them at most once in so many times (Markov's inequality, for exact evidence).
+# Odds against a coin from which on answers count as informative. Answers by a coin reach them at most once in
+# this many times (Markov's inequality, for exact evidence).
 LEAST_ODDS = 10.0
 _NEWTON_STEPS = 50
 _UNBIASED = 3
@@ -43,8 +43,10 @@ class Answer:
 class RewardModel:
     """The posterior after some answers.
 
-    scale: (d,) by which features are divided. mean: (d,) and covariance: (d, d) of the weights of scaled
-    features. odds: how much likelier the answers are under the model than by a coin. answers: their number.
+    scale: (d,) by which features are divided.
+    mean, covariance: (d,) and (d, d), of the weights of scaled features.
+    odds: how much likelier the answers are under the model than by a coin.
+    answers: number of answers.
     """
 
     scale: Array
@@ -55,7 +57,7 @@ class RewardModel:
 
     @property
     def knows(self) -> bool:
-        """Whether the answers say what is preferred."""
+        """Whether the answers are informative: ``odds`` reaches LEAST_ODDS."""
         return self.odds >= LEAST_ODDS
 
     def says(self) -> str:
@@ -83,7 +85,7 @@ class RewardModel:
 
     def information(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
         """(M,) nats that the answer to each pair is expected to give about the weights: the entropy of the
-        answer less what would remain if the weights were known."""
+        answer less what would remain if the weights were known. Arguments as in ``probability``."""
         mean, entropy = _expected(*self._difference(features, first, second))
         return _entropy(mean) - entropy
 
@@ -96,8 +98,8 @@ class RewardModel:
 
 
 def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
-    """The posterior of the weights. features: (N, d) of the trajectories, of which any were compared. Raises
-    ViewpointError for features that are not finite or answers about unknown trajectories."""
+    """The posterior of the weights. features: (N, d), one row per trajectory, by the numbers in ``answers``.
+    Raises ViewpointError for features that are not finite or answers about unknown trajectories."""
     features = np.asarray(features, np.float64)
     if features.ndim != 2 or len(features) < 2 or not np.isfinite(features).all():
         raise ViewpointError("a reward model needs finite features of at least two trajectories")
@@ -126,8 +128,8 @@ def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
 def next_pair(
     model: RewardModel, features: Array, rng: np.random.Generator, pairs: int = 500
 ) -> tuple[int, int]:
-    """The pair, of ``pairs`` drawn ones, whose answer tells most. Every ``_UNBIASED``-th question is the
-    first drawn: by the doubtful pairs alone, honest answers could not be told from contradictions."""
+    """The most informative of ``pairs`` random pairs of trajectories. Every ``_UNBIASED``-th question takes a
+    random pair instead: on doubtful pairs alone, honest answers look like contradictions."""
     first = rng.integers(len(features), size=1 if model.answers % _UNBIASED == 0 else pairs)
     second = (first + 1 + rng.integers(len(features) - 1, size=len(first))) % len(features)
     best = int(np.argmax(model.information(features, first, second)))

@@ -1,7 +1,8 @@
 """A session of comparisons: which pair of reconstructions is asked next, what was answered, and its file.
 
-Without input or output: each answer gives a new session, which the caller keeps once it is written. Every
-question follows from the seed and the answers before it, so that a session goes on where its file ends.
+This module does no input or output: each answer gives a new session, which the caller keeps once it is
+written. Every question follows from the seed and the answers before it, so that a session goes on where its
+file ends.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_rew
 
 KIND: Literal["freshfield preference answers"] = "freshfield preference answers"
 PERSON = "person"
-# Every so many questions an earlier pair comes again with its sides swapped: whoever answers by the side, or
-# by chance, is seen.
+# After this many questions an earlier pair is repeated with its sides swapped: that reveals who answers by
+# the side, or by chance.
 REPEAT_EVERY = 6
 # ... but none of the last ones, which people remember.
 _REMEMBERED = 2
@@ -29,9 +30,13 @@ _SWAPPED = {"left": "right", "right": "left", "neither": "neither"}
 
 
 class Given(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An answer. left, right: reconstructions that were shown. choice: "neither" where no difference was
-    seen. by: "person", or a simulated expert's label. repeats: number of the answer to the same pair with its
-    sides swapped; None: a new pair."""
+    """An answer.
+
+    left, right: numbers of the reconstructions that were shown.
+    choice: "neither" where no difference was seen.
+    by: "person", or a simulated expert's label.
+    repeats: number of the answer to the same pair with its sides swapped; None: a new pair.
+    """
 
     left: int
     right: int
@@ -41,8 +46,8 @@ class Given(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AnswersFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is exported. made_of: digest of all that decides the reconstructions. reconstructions: of each
-    one, the candidates whose views it was made of, in order."""
+    """The exported file. made_of: digest of all that determines the reconstructions. reconstructions: for
+    each, the candidates whose views it was made of, in order."""
 
     kind: Literal["freshfield preference answers"]
     version: Literal[1]
@@ -55,6 +60,8 @@ class AnswersFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Question:
+    """The reconstructions to show on either side. repeats: as in ``Given``."""
+
     left: int
     right: int
     repeats: int | None = None
@@ -62,9 +69,15 @@ class Question:
 
 @dataclass(frozen=True)
 class PreferenceSession:
-    """scenario: of the reconstructions. orders: the views of each, as in ``AnswersFile``. features: (N, d) of
-    them as trajectories. wanted: number of questions. seed: of the questions. by: who answers, a person or
-    the label of a simulated expert. made_of: as in ``AnswersFile``.
+    """The state of one session.
+
+    scenario: name of the reconstructions' scenario.
+    orders: the views of each reconstruction, as in ``AnswersFile``.
+    features: (N, d), features of the reconstructions as trajectories.
+    wanted: number of questions.
+    seed: determines the questions, with the answers.
+    by: who answers, PERSON or the label of a simulated expert.
+    made_of: as in ``AnswersFile``.
 
     Raises ViewpointError where there is no pair to ask about.
     """
@@ -87,7 +100,7 @@ class PreferenceSession:
 
     @cached_property
     def model(self) -> RewardModel:
-        """What the answers say. "neither" is half a vote for each side: y = 1/2 in (4.13)."""
+        """The reward model of the answers. "neither" is half a vote for each side: y = 1/2 in (4.13)."""
         prefers_first = {"left": True, "right": False, "neither": None}
         return fit_reward(
             self.features, [Answer(a.left, a.right, prefers_first[a.choice]) for a in self.answers]
@@ -95,7 +108,7 @@ class PreferenceSession:
 
     @cached_property
     def question(self) -> Question | None:
-        """The next one, None after the last."""
+        """The next question; None after the last."""
         n = len(self.answers)
         if n >= self.wanted:
             return None
@@ -106,7 +119,7 @@ class PreferenceSession:
             k = int(rng.choice(new[: max(len(new) - _REMEMBERED, 1)]))
             return Question(self.answers[k].right, self.answers[k].left, k)
         pair = next_pair(self.model, self.features, rng)
-        # Both orders of a pair tell as much but for rounding, which would put the better one on the left.
+        # Both orders of a pair are equally informative up to rounding, which would put the better one left.
         left, right = rng.permutation(pair).tolist()
         return Question(left, right)
 

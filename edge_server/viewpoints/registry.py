@@ -1,4 +1,4 @@
-"""What a selector is: it looks at a capture under way and says what each candidate would be worth."""
+"""Selectors by name. A selector looks at a capture under way and values each candidate viewpoint."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ SELECTORS: dict[str, tuple[str, str, str]] = {
 class CaptureState:
     """A capture under way, the state s_t of 4.5.2.
 
-    candidates: all of them. views_wanted: the budget, as far as it counts views.
-    order: candidates captured so far, in this order. views: what was captured, likewise.
+    candidates: all of them.
+    views_wanted: number of views to capture, the budget's or that of all reachable candidates.
+    order: numbers of the candidates captured so far, in this order. views: what was captured, likewise.
     open: (N,) candidates that may be chosen now: reachable, not captured, not refused, within the budget.
     rng: for selectors that draw.
     fit: fits a field to ``views``; called by ``field`` where a selector needs one.
@@ -62,7 +63,7 @@ class Selector(Protocol):
     name: str
 
     def values(self, state: CaptureState) -> NDArray[np.float64]:
-        """What each candidate is worth, (N,), in any unit, higher is better. Read where ``state.open``."""
+        """The value of each candidate, (N,), in any unit, higher is better. Read where ``state.open``."""
         ...
 
 

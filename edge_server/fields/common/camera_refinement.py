@@ -30,7 +30,7 @@ EVERY = 2  # steps between corrections of a pose, of one camera after the other
 PIXELS = 384  # compared for one correction
 _STEP_SHARE = 0.8  # of a Gauss-Newton step that is taken
 _LONGEST = 1.0  # pixels, of one step in one parameter
-_PRIOR = 1e-2  # of the squared error, at the bound: a picture without detail leaves the pose as given
+_PRIOR = 1e-2  # squared error that a correction at its bound costs: without detail, poses stay as given
 _OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
 
 
@@ -92,6 +92,8 @@ class PoseCorrections:
     A correction rotates a camera about its own center by exp(rotation) and shifts it. Gauss-Newton with
     finite differences of the rendered colors by small motions of the camera, so any representation will do.
     The mean correction of all cameras is kept at 0: the scene stays where it is.
+
+    most_m, most_deg: largest shift in metres and largest rotation in degrees.
     """
 
     def __init__(self, most_m: float, most_deg: float) -> None:
@@ -119,7 +121,7 @@ class PoseCorrections:
     ) -> None:  # fmt: skip
         """One Gauss-Newton step for one camera.
 
-        view: of that camera. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
+        view: the camera's view. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
         pixel_m: width of a pixel at the scene, the scale of all parameters.
         rng: chooses the pixels. background: float32 (3,), behind transparent pixels.
         """
@@ -166,7 +168,10 @@ class PoseCorrections:
 
 
 class CameraRefinement:
-    """Exposures and pose corrections of one field's cameras, each None unless enabled."""
+    """Exposures and pose corrections of one field's cameras, each None unless enabled.
+
+    exposure: whether exposures are learned. most_m, most_deg: as in ``PoseCorrections``; both 0: no poses.
+    """
 
     def __init__(self, exposure: bool, most_m: float, most_deg: float) -> None:
         self.exposures = Exposures() if exposure else None
@@ -195,7 +200,7 @@ class CameraRefinement:
     ) -> Views:  # fmt: skip
         """Learn from a step; returns the corrected data.
 
-        step: number of steps made. seed: of the field.
+        step: number of steps made. seed: the field's.
         sums: float64 (chunks, V, 3, 5), see ``Exposures.learn``; cleared.
         make_renderer: returns a renderer of the field as it is.
         """

@@ -47,7 +47,7 @@ def camera_rows(
     """Cameras in scene units as the kernels read them, float32 (B, CAMERA).
 
     poses, lenses: camera-to-world (4, 4) in meters, and intrinsics, of each camera.
-    times_s: when each image was taken, from the instant of the Gaussians' parameters; None: at that instant.
+    times_s: capture time of each image, seconds after the instant of the Gaussians' parameters; None: 0.
     """
     rows = np.zeros((len(poses), CAMERA), np.float32)
     for row, pose, lens in zip(rows, poses, lenses):

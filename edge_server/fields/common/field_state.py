@@ -18,7 +18,10 @@ VERSION = 1  # of what ``pack_state`` writes
 def pack_state(
     name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays
 ) -> Arrays:
-    """All of it in one dictionary of copies. counters: facts for JSON. arrays: what was learned."""
+    """The whole state of a field in one dictionary of copies.
+
+    name: of the representation. counters: facts, ready for JSON. arrays: what was learned.
+    """
     meta = {"version": VERSION, "field": name, "settings": asdict(settings), **counters, **view_store.meta()}
     both = {"meta": np.array(json.dumps(meta)), **arrays, **view_store.arrays()}
     return {name: np.array(array) for name, array in both.items()}
@@ -27,9 +30,12 @@ def pack_state(
 def unpack_meta(
     settings: Any, state: Arrays, name: str, shape: tuple[str, ...], version: int = VERSION
 ) -> dict[str, Any]:
-    """The facts in ``state``. ValueError unless it is the state of a field called ``name``, of this
-    ``version`` and all finite, whose settings agree with these in the options ``shape``; all other options
-    may differ."""
+    """The facts in ``state``.
+
+    shape: options in which the settings in ``state`` must agree with ``settings``; all others may differ.
+    Raises ValueError unless this holds, all numbers are finite, and the state is that of a field called
+    ``name``, of this ``version``.
+    """
     try:
         meta = json.loads(str(state["meta"]))
         theirs = meta["settings"]

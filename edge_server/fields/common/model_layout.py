@@ -1,4 +1,4 @@
-"""Sizes and initial values of a hash grid's levels (Mueller et al. 2022) and of the small network behind."""
+"""Sizes and initial values of a hash grid's levels (Mueller et al. 2022) and of the network behind it."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from edge_server.fields.common.view_store import ViewStore
 
 EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been sampled
-FADE = 0.75  # of a cell's density per sample
+FADE = 0.75  # share of a cell's density that is left at each sample
 EMPTY = 0.5  # density per scene unit that counts as empty: a step of it dims by a hundredth or two
 
 

@@ -1,5 +1,5 @@
-"""Where surfaces are likely before anything is learned, from whole pictures (``kernels.plane_sweep``): for
-the first Gaussians of a splat, and to guide fields that would have to find depth by themselves."""
+"""Plane sweep: finds where surfaces are likely from whole pictures, before anything is learned
+(``kernels.plane_sweep``). It places the first Gaussians of a splat and guides the depth of other fields."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
 
-TOLERANCE = 0.08  # of a color, summed over channels: with more, walls are found where there are none
+TOLERANCE = 0.08  # between colors, summed over channels: with more, walls are found where there are none
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube
 GUIDE_RAYS = 1 << 16  # swept at most; the pixels between two rays share their depth
 AGREED = 0.3  # least score of ``score_cells``: half of the cameras that see a cell, and at least three
-LEAST_VIEWS = 3  # that see a cell: two agree on a color too often
+LEAST_VIEWS = 3  # fewest views that must see a cell: two agree on a color too often
 _PLAIN, _CLEAR = 0.06, 16  # distance of a color, summed over channels, and alpha below which a pixel is empty
 
 
@@ -43,8 +43,8 @@ class SweepSettings(Protocol):
 
 
 def empty_color(settings: SweepSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The pictures' plain background color (3,), if they have one and it is rendered where nothing is: with a
-    background of the user's choice, a plain sky has to be learned like everything else."""
+    """The pictures' plain background color (3,), if they have one and the field renders it where nothing is.
+    With another background, which the user chose, a plain sky has to be learned like everything else."""
     return plain_background(views) if settings.background == "auto" and views else None
 
 
@@ -110,7 +110,8 @@ def sweep_depths(
 ) -> NDArray[np.float32]:  # fmt: skip
     """The distance in scene units of the best cell on each ray, float32 (N,); 0: none scores above ``least``.
 
-    view_of, pixels: int64 (N,), each ray's view and its pixel there. scores: of ``score_grid``.
+    view_of, pixels: int64 (N,), each ray's view and its pixel there.
+    scores: float32 (cells^3,), from ``score_grid``.
     """
     distance = np.zeros(pixels.size, np.float32)
     near, middle = np.float32(max(0.01, box.near_m / box.radius_m)), np.float32(box.distance_m / box.radius_m)

@@ -27,7 +27,7 @@ Pixels = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 class PixelSnapshot(ABC):
-    """An immutable copy of a field of which nothing is known to move, rendered pixel by pixel."""
+    """An immutable copy of a field that knows no motion, rendered pixel by pixel."""
 
     cameras: tuple[View, ...]
 

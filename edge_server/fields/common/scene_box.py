@@ -16,14 +16,14 @@ from edge_server.fields import View
 
 Array = NDArray[np.float64]
 
-NEAR_SHARE = 0.4  # of the cameras' distance to the scene: no density nearer to a lens, in contracted scenes
+NEAR_SHARE = 0.4  # of the cameras' distance to the scene: no density is nearer to them in contracted scenes
 # Sines of the angle between a camera's axis and the direction to a point.
 ASTRAY = 0.3  # a camera further off than this may be an outlier
 AGREED = 0.15  # half of the cameras are within this of a true meeting point
-ASIDE = 0.7  # half of them are further than this from a point that is none
+ASIDE = 0.7  # half of them are further than this from a point where they do not meet
 MOST_TRIED = 32  # cameras whose pairs are tried if no meeting point was found
 FAR = 10.0  # times the usual distance between cameras: nearer ones belong together
-PLAIN = 8  # of 255, by which a plain background may vary
+PLAIN = 8  # of 255: a plain background varies by no more than this
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def scene_box(
     near_m: float | None = None,
     contracted: bool | None = None,
 ) -> SceneBox:
-    """The box for these views; arguments other than None are kept, the rest is found from the cameras.
+    """The box for these views; arguments that are not None are kept, the others are found from the cameras.
 
     Pictures with transparency or before one plain color show an object: the box is what nearly all
     cameras see around the point they look at. Otherwise the surroundings belong to the scene: the box

@@ -1,4 +1,4 @@
-"""What all fields do that learn step by step: fits within a budget, snapshots, state, compiling ahead."""
+"""Base class of fields that learn step by step: fits within a budget, snapshots, state, compiling ahead."""
 
 from __future__ import annotations
 

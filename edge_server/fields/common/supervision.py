@@ -119,7 +119,7 @@ def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bo
         moved = None
         if known is not None:
             # The same frame decoded once more is no news; an equal but newer one says that nothing moved.
-            # Otherwise what one wrong picture seemed to move would count as moving while the scene stands.
+            # Otherwise pixels that one wrong picture changed would count as moving while the scene stands.
             again = known.view.shows_ns == view.shows_ns
             same = again and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
@@ -153,7 +153,7 @@ def pack_views(
 ) -> Views:
     """Everything one fit reads. Opaque and transparent pictures may be mixed.
 
-    memory: by camera; says which pixels moved.
+    memory: camera -> its newest view, and which of its pixels moved.
     weights: float32 (H, W) of each view (``view_outliers.pixel_weights``); None: all 1.
     """
     packed = pack_cameras(views, box)

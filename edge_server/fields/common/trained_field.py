@@ -51,7 +51,7 @@ from edge_server.fields.common.view_store import Arrays, same_views
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must agree on the size of a chunk"
-GUIDE_WEIGHT = 0.1  # of a depth guide, where the settings leave it open
+GUIDE_WEIGHT = 0.1  # weight of a depth guide where the settings leave it open
 FEW_VIEWS = 6  # with up to so many views, a depth guide is used in any scene
 SWEEP_SHARE = 0.5  # of a budget in seconds that a plane sweep may take
 DIRTY = 32  # parameters for one dirty flag: a segment of ``adam``, times its width
@@ -176,7 +176,7 @@ class TrainedField(SteppedField[RaySnapshot]):
     def _gather(self, levels: int, scale: float) -> None:
         """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``.
 
-        scale: by which Adam will multiply it.
+        scale: factor that Adam will multiply the gradient by.
         """
 
     def _add_depth_guide(
@@ -257,7 +257,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._dropped_by_task = np.zeros(1 + -(-self._dirty.size // PART), np.int64)
 
     def _one_step(self, data: Views, progress: float) -> float:
-        """One optimizer step; returns its mean squared error. progress: of the fit, in [0, 1]."""
+        """One optimizer step; returns its mean squared error. progress: progress of the fit, in [0, 1]."""
         s, levels, box = self.settings, self._levels(), self.view_store.box
         assert box is not None
         key = step_key(s.seed, self.step)

@@ -18,7 +18,7 @@ BETA1, BETA2 = 0.9, 0.99
 BETA1_FIELD = 0.65
 # The smoothness prior visits whole levels: applied now and then, and stronger for it, it does as well.
 SMOOTH_EVERY = 4
-LATE = 1.1  # of a budget in seconds: a fit may end so late rather than make no step
+LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
 
@@ -68,11 +68,12 @@ class StepTimer:
 
 
 class StepBudget:
-    """Divides a budget into steps. Seconds count from the making of this object. A step begins only if a
-    usual one still fits, the first one if it ends a tenth late at most. Of fits too short for any step, some
-    make one all the same and end later.
+    """Divides a budget into steps; seconds count from the making of this object.
 
-    now: seconds of a clock.
+    A step begins only if a usual one still fits; the first one may end a tenth late. If not even that fits,
+    the estimate of a step is lowered, so that some later fit makes a step and ends late.
+
+    now: returns the seconds of a clock.
     """
 
     def __init__(self, budget: Budget, now: Callable[[], float] = time.perf_counter) -> None:
@@ -99,10 +100,10 @@ class StepBudget:
         return whole is None or self.elapsed_s() < share * whole
 
     def begin_step(self, timer: StepTimer, then_s: float = 0.0) -> float | None:
-        """Progress, in [0, 1], of this kind of step through what the budget had left when the first was made;
-        None when the budget is spent.
+        """Begin a step, unless the budget is spent: then None. Returns the progress in [0, 1] through the
+        part of the budget that was left when the first step of this kind began.
 
-        timer: of this kind of step; ``end_step`` adds to it.
+        timer: that of this kind of step; ``end_step`` adds to it.
         then_s: seconds of what has to follow within the budget.
         """
         self._step_start, self._timer = self._now(), timer

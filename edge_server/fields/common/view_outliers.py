@@ -22,7 +22,7 @@ LEAST_VIEWS = 4  # views a set needs before the others can outvote one
 GRID = 8  # pixels a side of the grid that a view is judged by
 LEAST_ERROR = 0.1  # no view is refused for less, in [0, 1]: a well-learned scene has small usual errors
 AGREEMENT = 1.5  # times the usual error up to which a view agrees with the field
-MOST_REFUSALS = 20  # in a row
+MOST_REFUSALS = 20  # views of a camera refused in a row
 
 # (views, image points (N, 2) of each) -> the colors (N, 3) that a field renders there, of each.
 RenderPoints = Callable[[Sequence[View], Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float32]]]
@@ -67,11 +67,11 @@ def find_outliers(
 ) -> NDArray[np.bool_]:
     """Which views contradict the field so much that this fit leaves them out (``refuse``): bool (V,).
 
-    views: of this fit; each has an entry in ``memory``.
-    memory: ``refusals_left`` of its entries is updated.
-    beyond: times the usual error; 0: no view is refused.
-    settled: whether the field has learned enough to be agreed with.
-    render_points: what the field renders.
+    views: the views of this fit; each has an entry in ``memory``.
+    memory: camera -> its newest view; ``refusals_left`` of the entries is updated.
+    beyond: multiple of the usual error above which a view contradicts; 0: no view is refused.
+    settled: whether the field has learned enough to be compared with.
+    render_points: renders the field at image points.
     """
     if beyond <= 0.0 or not settled or len(views) < LEAST_VIEWS:
         return np.zeros(len(views), np.bool_)

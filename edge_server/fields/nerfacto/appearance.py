@@ -73,8 +73,8 @@ class AppearanceEmbeddings:
 class CameraAppearance(CameraRefinement):
     """A field's camera corrections (``CameraRefinement``) and, if enabled, appearance embeddings.
 
-    embeddings: float32 (V, A), of the views in training. gradient: float32 (chunks, V, A), of the last step.
-    rays: of that step.
+    embeddings: float32 (V, A), of the views in training.
+    gradient: float32 (chunks, V, A), of the last step. rays: number of rays of that step.
     """
 
     def __init__(self, exposure: bool, most_m: float, most_deg: float, size: int, seed: int) -> None:

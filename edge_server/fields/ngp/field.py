@@ -59,8 +59,8 @@ class NgpField(TrainedField):
 
 
 def make(settings: NgpSettings) -> Field:
-    """A field. Only ``device: cuda`` takes a GPU. ValueError for ``cuda`` where torch finds no such device or
-    where another option exists in the kernels alone."""
+    """A field on the CPU, or with ``device: cuda`` on the GPU. Raises ValueError for ``cuda`` if torch finds
+    no such device, or for an option that only the CPU kernels implement."""
     if settings.device == "cuda":
         from edge_server.fields.ngp.torch_field import NgpTorchField  # torch is imported only here
 

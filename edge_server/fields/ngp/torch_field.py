@@ -54,7 +54,7 @@ from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
 POINTS = 1 << 17  # encoded at a time where no gradient is wanted
-UNCHECKED_STEPS = 32  # between two looks whether any ray goes on: a look waits for the device
+UNCHECKED_STEPS = 32  # between two checks whether any ray goes on: a check waits for the device
 KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "depth_guide")  # not implemented here
 
 

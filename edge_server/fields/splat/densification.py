@@ -41,6 +41,7 @@ class GaussianCloud:
 
     @classmethod
     def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
+        """Static Gaussians that have made no step, with parameters float32 (N, P)."""
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
         age, guest, velocity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.float32)
@@ -55,7 +56,7 @@ class GaussianCloud:
         return len(self.params)
 
     def gaussians(self, which: slice | NDArray[np.int64] = slice(None)) -> Gaussians:
-        """The arrays that are projected: of all Gaussians and not copied, or copies for some."""
+        """The arrays that are projected: without a copy for all Gaussians, copied for some of them."""
         harmonics = (self.params.shape[1] - BASE) // 3 + 1
         return Gaussians(self.params[which], harmonics, self.velocity[which])
 
@@ -91,8 +92,8 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
 def color_sensitivity(cloud: GaussianCloud) -> NDArray[np.float32]:
     """How much the loss depends on each Gaussian, float32 (N,), on an arbitrary scale: Adam's mean square of
     the gradient by color. That gradient sums, over the pixels a Gaussian covers, its weight in the pixel
-    times the error there. It is small for small, hidden and faint Gaussians, and where the error is small:
-    there are enough Gaussians there, and once there are not, error and gradient return. Infinite for
+    times the error there. It is small for small, hidden and faint Gaussians, and where the error is small,
+    because enough Gaussians are there; if too many are pruned, error and gradient return. Infinite for
     Gaussians that have made no step."""
     square = cloud.v[:, COLOR:BASE].sum(axis=1) / (1.0 - BETA2 ** np.maximum(cloud.age, 1))
     return np.where(cloud.age > 0, square, np.inf).astype(np.float32)

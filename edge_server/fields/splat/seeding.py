@@ -27,8 +27,8 @@ def seed_gaussians(
 ) -> NDArray[np.float32]:  # fmt: skip
     """Parameters of up to ``count`` new Gaussians, float32 (N, P).
 
-    masks: for each view bool (H, W), the pixels from which Gaussians may start, or None for no pixels; None
-        instead of the list: all pixels of all views.
+    masks: for each view bool (H, W), the pixels from which Gaussians may start (None: no pixel); None instead
+        of the list: all pixels of all views.
     weight: ``Views.weight``; pixels of weight 0 are ignored.
     rng: draws the pixels.
     moved: for each view bool (H, W), or None; if given, only places where most cameras see motion count.

@@ -44,7 +44,7 @@ from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_ray_scratch
 OCCUPANCY_PHASES = 4  # refreshes until every cell has been refreshed
 EVERY = 5  # steps between refreshes of the occupancy
 DIFFUSE_PHASES = 4  # steps in which all layers diffuse once, so that each step costs the same
-FADE = 0.75  # of a cell's density at each refresh
+FADE = 0.75  # share of a cell's density that is left at each refresh
 BETA2 = 0.95  # Adam's memory in steps that touch a vertex: a fit has a hundred of them, not thousands
 WARM_START_SHARE = 1.5  # of the steps until the last grid size: later fits are warm starts
 

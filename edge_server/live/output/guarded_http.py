@@ -1,4 +1,4 @@
-"""A small HTTP server for those who may: a WSGI application behind the access rules, with few connections."""
+"""A small HTTP server: a WSGI application behind the access rules, with a bounded number of connections."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class _Handler(WSGIRequestHandler):
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """A thread for each connection, of which there are at most MAX_SCRAPES: a new one ends the oldest."""
+    """One thread per connection. If there are more than MAX_SCRAPES, a new connection ends the oldest."""
 
     daemon_threads = True
-    request_queue_size = 128  # with five, whoever comes beside a flood waits for seconds to be accepted
+    request_queue_size = 128  # with the usual five, a client waits seconds to be accepted during a flood
 
     def __init__(self, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -59,7 +59,7 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, *_: Any) -> None:
-        """A connection that broke is the client's matter."""
+        """Ignore broken connections: they concern only the client."""
 
 
 def _read_to_its_end(connection: socket.socket) -> None:
@@ -77,7 +77,7 @@ def _read_to_its_end(connection: socket.socket) -> None:
 
 
 def _guarded(inner: Any, door: HttpDoor) -> Any:
-    """The WSGI application for those who may look; it finds them at ``CALLER``."""
+    """``inner`` behind the access rules of ``door``; it finds the admitted caller at ``CALLER``."""
 
     def application(environ: dict[str, Any], start_response: Any) -> Any:
         try:
@@ -95,10 +95,13 @@ def _guarded(inner: Any, door: HttpDoor) -> Any:
 def serve_guarded(
     application: Any, what: str, host: str, port: int, transport: Transport | None = None
 ) -> tuple[int, Callable[[], None]]:
-    """Serve a WSGI application on a thread; returns its port and what closes it.
+    """Serve a WSGI application on a thread; returns its port and a function that closes it.
 
-    what: the application's name for messages. port: 0 takes a free one. Raises TransportError if it would be
-    open to others (see ``Transport.guard``), OSError if the port is not available.
+    what: the application's name for messages.
+    port: 0 takes a free one.
+    transport: security; None: ``Transport()``.
+    Raises TransportError if ``port`` is no port or would be open to others (see ``Transport.guard``), OSError
+    if it is not available.
     """
     if not 0 <= port <= 65535:
         raise TransportError(f"{what}: {port} is not a port; give one from 1 to 65535, or 0 for a free one")

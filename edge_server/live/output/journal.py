@@ -1,10 +1,10 @@
 """The files of a run, written as it goes: edge.json, series.jsonl, shown.jsonl, ages.jsonl, poses.jsonl.
 
 edge.json is replaced about twice a second (live tables read it). series.jsonl gets a line for each
-publication, once its scores are final; of those without scores, one for LINE_EVERY_S at most. shown.jsonl
-gets a line for each instant at which what was shown is scored. ages.jsonl samples every camera's age at a
-fixed rate, so that its mean is a time average. poses.jsonl gets a line for each view that the field was
-trained on and whose pose differs from its camera's last one: cameras that stand still leave one line each.
+publication once its scores are final; publications without scores get at most one line per LINE_EVERY_S.
+shown.jsonl gets a line for each instant at which what was shown is scored. ages.jsonl samples every camera's
+age at a fixed rate, so that its mean is a time average. poses.jsonl gets a line for each training view whose
+pose differs from its camera's last one: cameras that stand still leave one line each.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 # After this many newer publications, one without scores will not get any.
 _FINAL_AFTER = 8
 LINE_EVERY_S = 0.08  # on average: there may be fifty publications a second
-_INTERVAL_SHARE = 0.01  # of the newest interval in the usual one
+_INTERVAL_SHARE = 0.01  # weight of the newest interval in the running mean
 # Some 100 MB: days of an arm that never rests.
 _MOST_POSES = 500_000
 
@@ -49,8 +49,8 @@ class Journal:
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
         self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages", "poses")}
-        self._last_s: float | None = None  # of the last publication
-        self._usual_s: float | None = None  # from one publication to the next
+        self._last_s: float | None = None  # instant of the last publication
+        self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
         self._last_pose: dict[str, Pose] = {}
         self._poses_left = _MOST_POSES
@@ -68,7 +68,7 @@ class Journal:
                 self._write_oldest()
 
     def scored(self, publication: Publication, final: bool) -> None:
-        """``publication`` has scores. final: those of all held-out cameras."""
+        """Take a publication that now has scores. final: the scores of all held-out cameras are in."""
         with self._lock:
             if publication.number not in self._open:
                 return
@@ -78,8 +78,8 @@ class Journal:
                 self._write_oldest()
 
     def shown(self, t_s: float, score: Score, publication: Publication) -> None:
-        """What was shown at ``t_s``, the newest ``publication`` carried on to then, has a score. The age of
-        its views then is the sum of network, waiting, computing and display."""
+        """Write a line with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated
+        to ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
         waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
         line = {
             "t_s": round(t_s, 4),
@@ -132,8 +132,9 @@ class Journal:
         self.write_status()
 
     def _write_oldest(self) -> None:
-        """A line for the oldest publication, unless it has no scores and is one of many. They are counted: by
-        the time since the last line, those that end a long gap would have one more often than others."""
+        """Write a line for the oldest publication, unless it has no scores and lines would be too frequent.
+        That is judged by the number of publications since the last line: by the time, publications at the end
+        of a long gap would get a line more often than others."""
         _, publication = self._open.popitem(last=False)
         many = False
         if self._last_s is not None:

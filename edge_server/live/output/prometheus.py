@@ -61,7 +61,7 @@ def serve_metrics(
     state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None
 ) -> None:
     """Serve /metrics on a thread until the process ends. Raises TransportError if the port is not available,
-    or if they would be open to others (see ``Transport.guard``)."""
+    or if the metrics would be open to others (see ``Transport.guard``)."""
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
     try:

@@ -18,7 +18,7 @@ from edge_server.scheduler.learned.state import State
 
 KIND = "scheduler"
 """Kind of file that a learner's checkpoint declares."""
-# Of an unpacked checkpoint: both networks and Adam's moments at their largest.
+# Largest unpacked checkpoint: both networks and Adam's moments at their largest.
 MAX_BYTES = 2**29
 
 

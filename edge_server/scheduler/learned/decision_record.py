@@ -36,7 +36,8 @@ class DecisionWriter:
     """Writes decisions under ``out``. A full disk costs decisions, counted in ``lost``, never the edge. Not
     thread-safe.
 
-    embedding: settings of the embedder, to embed the frames again. max_decisions, max_bytes: to keep on disk.
+    embedding: settings of the embedder, to embed the frames again; None: nothing was embedded.
+    max_decisions, max_bytes: how much to keep on disk.
     """
 
     def __init__(
@@ -109,8 +110,9 @@ class RecordedDecision:
 
 
 def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
-    """Read the decision of the run in folder ``run`` that update ``number`` was made by: its own, or the one
-    that its policy held until then; None: the newest. ValueError: it is not kept, or its file is damaged."""
+    """Read the decision behind update ``number`` of the run in folder ``run``: its own, or the earlier one
+    that its policy still held (``Spec.hold_ms``). number: None takes the newest. Raises ValueError if the
+    decision is not kept, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(

@@ -40,9 +40,12 @@ _PAINT = (114, 114, 114, 255)
 class Explanation:
     """Shares of a decision's logit.
 
-    action: in words. logit: of the action taken. baseline_logit: the same for average cameras.
-    parts: share of each part of the state. cameras: (N,) share of each camera. cameras_error: (N,) their
-    standard errors. names: of the cameras. Parts sum to logit - baseline_logit, and so do cameras.
+    action: the action in words.
+    logit: logit of the action taken. baseline_logit: the same for average cameras.
+    parts: share of each part of the state.
+    cameras, cameras_error: (N,), share of each camera, and its standard error.
+    names: names of the cameras.
+    Parts sum to logit - baseline_logit, and so do cameras.
     """
 
     action: str
@@ -55,8 +58,8 @@ class Explanation:
 
 
 def explain(actor: Actor, state: State, action: Any, pairs: int | None = None) -> Explanation:
-    """Explain why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs: of
-    permutations; None: as many as take some ten milliseconds."""
+    """Explain why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs:
+    number of pairs of permutations; None: as many as take some ten milliseconds."""
     if pairs is None:
         pairs = min(PAIRS, max(2, round(PAIRS * (_CAMERAS / max(len(state), 1)) ** 2)))
     features = actor.spec.layout.features(state)

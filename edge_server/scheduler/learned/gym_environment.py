@@ -84,6 +84,7 @@ class BanditEnvironment(gymnasium.Env):
         return self._spec.layout.features(self._round.state), {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Carry out the decision, which ends the episode. Raises RuntimeError without ``reset`` before it."""
         if self._round is None:
             raise RuntimeError("reset the environment first: an episode is one decision")
         current, self._round = self._round, None

@@ -27,12 +27,12 @@ class Spec:
     action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait``, ``wait-arrived`` and
     ``threshold`` choose one of ``omegas_ms`` (6.34, 6.39).
     layout: the features of a state.
-    network: ``pooled`` shares one encoder among any number of cameras; ``flat`` is the thesis's, one layer
-    over ``cameras`` cameras in their order.
+    network: ``pooled`` shares one encoder among any number of cameras; ``flat`` is the thesis's, whose first
+    layer spans ``cameras`` cameras in their order.
     hidden: width of all layers.
     start: every camera's probability before learning.
     hold_ms: a decision holds until the next multiple of it; 0: every update has one of its own.
-    learning_rate, minibatch, max_gradient: of Adam's steps; max_gradient clips the gradient's norm.
+    learning_rate, minibatch: of Adam's steps. max_gradient: bound of the gradient's norm (clipping).
     clip: epsilon of (5.23).
     passes: over a batch; they end early once the policy has moved by ``target_kl`` (nats).
     entropy, value: weights of these terms of the loss.

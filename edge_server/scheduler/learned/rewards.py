@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
-# Weights of (6.37) as 6.5 prints them: PSNR a dB, SSIM, LPIPS, age a millisecond.
+# Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
 W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
@@ -58,10 +58,10 @@ class RewardTerms:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights of the metrics, positive where more is better. A weight of zero is no term.
+    """Weights of the metrics, positive where more is better. A weight of zero leaves the term out.
 
-    psnr: a dB. ssim, distance: a unit. age: a millisecond of aAoI (6.35). views: a used view, for the cost of
-    sending, decoding and fitting it; the thesis has no such term.
+    psnr: per dB. ssim, distance: per unit. age: per millisecond of aAoI (6.35).
+    views: per used view, for the cost of sending, decoding and fitting it; the thesis has no such term.
     fidelity: PSNR of the ``whole`` image or of its ``moving`` pixels; in a mostly static scene the whole
     image hides the cost of age. SSIM and the distance are always of the whole image.
     distance_is: ``lpips``, or ``perceptual``, the stand-in without LPIPS weights; the term carries its name.
@@ -85,8 +85,8 @@ class Reward:
             raise ValueError(f"reward {self.name}: distance_is lpips or perceptual, not {self.distance_is!r}")
 
     def of(self, score: Scored) -> RewardTerms:
-        """The reward of a score; the mean age of the used views, their number and the stand-in distance count
-        where it has them (a publication does). A metric that is None or not finite is missing."""
+        """The reward of a score. ``aaoi_ms``, ``views`` and ``perceptual`` are read where it has them, as a
+        publication does. A metric that the score lacks, or that is None or not finite, is missing."""
         psnr_db = score.psnr_db if self.fidelity == "whole" else score.psnr_moving_db
         found = {
             "psnr" if self.fidelity == "whole" else "psnr_moving": (self.psnr, psnr_db),

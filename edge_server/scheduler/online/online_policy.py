@@ -49,8 +49,8 @@ _MAX_HALVINGS = 6
 class OnlineSettings:
     """Limits of learning while deciding.
 
-    share: of the decisions for the policy that is not in charge; half while there is a suspicion.
-    batch: decisions of one update.
+    share: share of the decisions that go to the policy not in charge; half while there is a suspicion.
+    batch: number of decisions of one update.
     max_kl: mean KL divergence in nats that learning may not exceed, from the loaded policy or, after a
     fallback, from the softened one.
     explore: uniform share of every action, however sure the policy is.
@@ -86,8 +86,8 @@ class ExploringActor(Actor):
 
 @dataclass(frozen=True)
 class _Pending:
-    """A decision whose reward may still come. decision: None where the fixed policy took it. probability:
-    with which it would have gone to the learned one."""
+    """A decision whose reward may still come. decision: None if the fixed policy took it. probability:
+    probability with which the learned policy would be drawn to take it."""
 
     decision: Decision | None
     probability: float
@@ -96,8 +96,13 @@ class _Pending:
 class OnlinePolicy(Policy):
     """A policy made of two: ``learner``'s, which explores and learns, and ``fixed``.
 
-    learner: owned by this policy from now on. rng: of who decides, and of exploration. Threads: ``plan`` and
-    ``select`` belong to the loop's, ``learn`` to one other, ``add_reward`` and ``status`` to any.
+    learner: owned by this policy from now on.
+    fixed: the policy beside it.
+    name: name of this policy, as people write it.
+    rng: draws which of the two decides, and the actions that explore.
+    settings: None takes the defaults.
+    Threads: the update loop's calls ``plan`` and ``select``, one other ``learn``, any ``add_reward`` and
+    ``status``.
     """
 
     def __init__(

@@ -25,8 +25,10 @@ _DEFAULT_FALLBACK = "threshold:120"
 class OnlineTrainer:
     """The learning thread, so that neither the loop nor scoring waits.
 
-    out: gets learning.jsonl, a line for each update and each switch of who decides, and at the end
-    learnt.npz.
+    policy: the policy that learns.
+    reward: reward of a final score.
+    out: folder for learning.jsonl, with a line for each update and each switch of who decides, and at the end
+    for learnt.npz.
     """
 
     def __init__(self, policy: OnlinePolicy, reward: Reward, out: Path) -> None:
@@ -93,9 +95,13 @@ def open_online_trainer(
     lpips_missing: str | None,
     out: Path,
 ) -> OnlineTrainer:
-    """Trainer of the learner in ``path``. reward, fallback: as in ``config.LearnConfig``. ValueError for an
-    unknown reward or policy, a file that holds no learner, or a learner whose decisions hold for several
-    updates."""
+    """Trainer of the learner in ``path``.
+
+    reward, fallback: as in ``config.LearnConfig``.
+    rng: as in ``OnlinePolicy``. lpips_missing: as in ``choose_reward``. out: as in ``OnlineTrainer``.
+    Raises ValueError for an unknown reward or policy, a file that holds no learner, or a learner whose
+    decisions hold for several updates.
+    """
     learner = Learner.load(path)
     if learner.spec.hold_ms:
         raise ValueError(
@@ -114,8 +120,8 @@ def open_online_trainer(
 
 
 def training_summary(path: Path) -> dict[str, Any]:
-    """What ``edge-server train-scheduler`` wrote beside checkpoint ``path``: those of ``reward_name``, ``on``
-    and ``best_fixed`` that are known."""
+    """What ``edge-server train-scheduler`` wrote beside checkpoint ``path``: ``reward_name``, ``on`` and
+    ``best_fixed``, as far as they are known."""
     try:
         found = json.loads((path.parent / "summary.json").read_text())
     except (OSError, ValueError):
@@ -130,11 +136,14 @@ def choose_reward(
     lpips_missing: str | None,
     reward_fields: dict[str, Any] | None = None,
 ) -> Reward:
-    """The reward to learn by: ``given``, else that of the training, else the default of ``action``.
+    """The reward to learn by: ``given``, else the training's reward, else the default of ``action``.
 
-    given: NAME or NAME:moving. path: of the checkpoint. lpips_missing: why there is no LPIPS, None where
-    there is; without it the reward drops its term. reward_fields: as the checkpoint has them. ValueError for
-    an unknown name or damaged fields.
+    action: the learner's, as in ``Spec``.
+    given: NAME or NAME:moving; None or empty: not given.
+    path: the checkpoint.
+    lpips_missing: why there is no LPIPS (the reward then drops its LPIPS term); None where there is.
+    reward_fields: fields of the training's reward, if the checkpoint has them.
+    Raises ValueError for an unknown name or damaged fields.
     """
     if reward_fields is not None and not given:
         try:

@@ -1,10 +1,10 @@
 """Sequential test of which of two policies earns more, valid after every reward.
 
-Two means with 95 % intervals that are compared a thousand times are sooner or later apart by chance. This
-test assumes nothing about the rewards, not even independence in time; it uses only that the policy of each
+Two means whose 95 % intervals are compared a thousand times will differ sooner or later by chance. This test
+assumes nothing about the rewards, not even independence in time; it uses only that the policy of each
 decision was drawn at random. With A = 1 where the learned policy decided, p the probability of that, and c
 how far the reward was above its usual value, (A - p) c has mean zero while neither policy is better, whatever
-c did before. A gambler who bets on it cannot expect to win:
+c was before. A gambler who bets on it cannot expect to win:
 
     M_n = max(1, M_(n-1)) (1 + b (A_n - p_n) c_n)
 
@@ -24,9 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-# Latest rewards that the estimates and the usual reward are of: earlier ones came over another channel.
+# Number of latest rewards that estimates and the usual reward are computed from: the channel changes.
 WINDOW = 120
-# Fewer rewards give no interval and no usual reward, so that nothing is bet.
+# With fewer rewards there is no interval and no usual reward, and nothing is bet.
 MIN_REWARDS = 10
 # Rewards are clipped at this many quartile distances from the median: three standard deviations of a normal
 # one.
@@ -73,8 +73,11 @@ class SequentialTest:
         self._rewards: deque[tuple[bool, float]] = deque(maxlen=WINDOW)
 
     def update(self, learned: bool, probability: float, reward: float) -> bool:
-        """Take the reward of a decision. learned: whether the learned policy took it. probability: with which
-        it was to take it. Returns whether the difference is now detected."""
+        """Take the reward of a decision; returns whether the difference is now detected.
+
+        learned: whether the learned policy took the decision.
+        probability: the probability with which the learned policy would be drawn to take it.
+        """
         above = self._above_usual(reward)  # judged by earlier rewards, or it would depend on who decided
         self._rewards.append((learned, reward))
         bet = self._sign * (learned - probability) * above / max(probability, 1.0 - probability)

@@ -39,9 +39,13 @@ HIDDEN = 0.02  # a surface nearer by this share of the distance hides a point
 
 
 class Images(NamedTuple):
-    """N images. lens: float64 (N, 8), fx fy cx cy k1 k2 p1 p2. rotation: (N, 3, 3), camera-to-world; origin:
-    (N, 3), meters. first: int64 (N + 1,) into grey and depth: float32 (P,), row by row, gray levels and
-    meters along the ray (0: unknown); size: int64 (N, 2), width and height."""
+    """N images with P pixels together.
+
+    lens: float64 (N, 8), fx fy cx cy k1 k2 p1 p2.
+    rotation, origin: float64 (N, 3, 3), camera-to-world, and (N, 3), meters.
+    first: int64 (N + 1,), each image's first pixel. size: int64 (N, 2), width and height.
+    grey, depth: float32 (P,), row by row: gray levels, and meters along the ray (0: unknown).
+    """
 
     lens: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -53,8 +57,11 @@ class Images(NamedTuple):
 
 
 class View(NamedTuple):
-    """The image whose planes are sought. index: of ``Images``. rays: float64 (H, W, 3), world, unit. grey:
-    float32 (H, W). chosen: int16 (H, W, SOURCES), images to compare each pixel with, best first; -1: none."""
+    """The image whose planes are sought.
+
+    index: its number in ``Images``. rays: float64 (H, W, 3), world, unit. grey: float32 (H, W).
+    chosen: int16 (H, W, SOURCES), images to compare each pixel with, best first; -1: none.
+    """
 
     index: int
     rays: NDArray[np.float64]
@@ -72,9 +79,12 @@ class Planes(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What one pass tries. wide: number of planes with random normal, depth within ``reach`` (share) of
-    ``guess``. share, turn: largest changes of depth (share) and normal. geometric: weight, per pixel, of the
-    distance to where the other image's depth leads back to."""
+    """What one pass tries.
+
+    wide: number of planes with random normal. reach: how far their depth is from ``guess``, as a share of it.
+    share, turn: largest random changes of depth (as a share of it) and of the normal.
+    geometric: weight of the distance, pixels, to where the other image's depth leads back to.
+    """
 
     wide: int
     reach: float
@@ -310,7 +320,7 @@ def _neighbor(planes, row, column, way):
 
 @kernel
 def offer(counter, worker, images, points, normals, costs, owners, nearest, winner, least):
-    """For every pixel of every image, which point of another map falls on it. Tasks are images.
+    """Find for every pixel of every image the point of another map that falls on it. Tasks are images.
 
     points, normals: float32 (M, 3), world. costs: float32 (M,). owners: int32 (M,), image that a point is of.
     nearest: whether the nearest point wins, else the cheapest. winner: int32 (P,), index of the point, -1:
@@ -340,9 +350,13 @@ def offer(counter, worker, images, points, normals, costs, owners, nearest, winn
 
 @kernel
 def match(counter, worker, images, view, guess, offered, planes, parity, key, search):
-    """One pass over the pixels of one color. Tasks are rows. parity: row + column is odd if 1. key: of the
-    pass's random numbers, which depend on the pixel alone. guess: float32 (H, W); no depth leaves ``reach``
-    around it. offered: planes (``offer``) to try, depth 0: none; their cost is not read."""
+    """One pass over the pixels of one color of the chessboard. Tasks are rows.
+
+    guess: float32 (H, W), initial depth; no depth leaves ``reach`` around it.
+    offered: planes (``offer``) to try, depth 0: none; their cost is not read.
+    planes: updated. parity: 1 for the pixels whose row + column is odd, else 0.
+    key: uint64, stream of the pass's random numbers, which depend on the pixel alone.
+    """
     height, width = planes.depth.shape
     across, down, fade = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     patch, weight = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
@@ -442,11 +456,13 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
 
 @kernel
 def confirm(counter, worker, images, view, planes, share, agree, against, rise):
-    """How far to trust each plane. Tasks are rows. share: tolerance, of the distance, plus one pixel.
+    """Collect the evidence for each plane. Tasks are rows.
 
-    agree, against: int16 (H, W), written: chosen images whose depth agrees with the point, and that look
-    through it. rise: float32 (H, W), written: mean rise of the cost (photometric) at depths one pixel's width
-    nearer and farther; 0 where images tell nothing.
+    share: tolerance, as a share of the distance; one pixel is added.
+    agree, against: int16 (H, W), written: number of chosen images whose depth agrees with the point, and of
+        those that look through it.
+    rise: float32 (H, W), written: mean rise of the (photometric) cost at depths one pixel's width nearer and
+        farther; 0 where images tell nothing.
     """
     height, width = planes.depth.shape
     k = view.index

@@ -3,8 +3,8 @@
 With noise of variance 1 on every color of every pixel, the information about a parameter is the sum, over
 pixels and colors, of the squared derivative of the color by the parameter. A Gaussian's position, scale,
 rotation and opacity change a pixel's color only by its power, -1/2 (a dx^2 + 2 b dx dy + c dy^2) + log alpha,
-so that derivative is h (m . phi): h by the power, phi = (1, dx, dy, dx^2, dx dy, dy^2) of the pixel, and m
-the same six numbers of the Gaussian, whatever the pixel. The sum of squares is therefore m^T S m, where S
+so that derivative is h (m . phi): h is the derivative by the power, phi = (1, dx, dy, dx^2, dx dy, dy^2) of
+the pixel, and m has the Gaussian's six factors of these. The sum of squares is therefore m^T S m, where S
 holds the sums of h^2 dx^p dy^q up to p + q = 4: fifteen numbers a Gaussian, exact, in one pass over the
 pixels. ``project_backward`` gives m. The colors' own derivatives are the weights.
 """
@@ -151,7 +151,7 @@ def fisher_information(
 ):  # fmt: skip
     """Write the information that each camera's picture has about each Gaussian. Tasks are cameras.
 
-    cams: float32 (B, CAMERA), which ``projected`` and ``lists`` are of.
+    cams: float32 (B, CAMERA), the cameras of ``projected`` and ``lists``.
     gaussians: ``Gaussians`` without view dependence.
     pair_sums, memory, saved: see ``RasterBuffers``; pair_sums is read but not used.
     background: float32 (3,).

@@ -18,8 +18,8 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 class Rule(NamedTuple):
-    """One step's hyperparameters, float32. scale: what gradients are multiplied by. decay: of the parameter.
-    correct1, correct2: the bias corrections 1 / (1 - beta^t)."""
+    """One step's hyperparameters, float32. scale: factor on gradients. decay: pull of parameters towards 0,
+    times the rate. correct1, correct2: the bias corrections 1 / (1 - beta^t)."""
 
     rate: np.float32
     beta1: np.float32

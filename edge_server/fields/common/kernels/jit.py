@@ -26,7 +26,7 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 def _digest(fields: Path) -> str:
-    """Of the kernel sources of all representations. Kernels elsewhere (``surface.kernels``) call
+    """Digest of the kernel sources of all representations. Kernels elsewhere (``surface.kernels``) call
     parts of these only, and numba's own stamp covers the file that they stand in."""
     total = hashlib.sha256()
     for path in sorted([*fields.glob("*/kernels/*.py"), *fields.glob("*/threads/*.py")]):

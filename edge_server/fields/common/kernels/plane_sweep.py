@@ -10,13 +10,13 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
 
-MOST_VIEWS = 32  # that vote
+MOST_VIEWS = 32  # largest number of views that vote
 NOT_SEEN = -2.0
 # Flags of a pixel. Added up over all views, the first stays below the second.
 SEES, UNMARKED = 1, 256
-_NO_COLOR = 1e3  # times a number of its own: far from every color and from each other
+_NO_COLOR = 1e3  # times the number of the view: far from every color, and from one another
 _BYTE = np.float32(1.0 / 255.0)
-_EMPTY_VIEWS = 2  # so many views that see plain background at a cell empty it
+_EMPTY_VIEWS = 2  # a cell is empty if this many views see plain background there
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -31,7 +31,8 @@ def _spread(u):
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
     """Which pixel shows each cell of a row: pixels, int32 (cells,), receives its number, or ``nowhere``.
 
-    cam: of ``load_camera``. first: the picture's first pixel. row: float32 (3, cells), the cells' centers.
+    cam: as ``load_camera`` returns it. first: the picture's first pixel. row: float32 (3, cells), the cells'
+        centers.
     """
     for k in range(pixels.size):
         x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
@@ -48,13 +49,14 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
 
 @part
 def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden):
-    """Which pixels show each cell of a row, and which cells are hidden: most cameras that see them see them
-    unmarked. Returns whether all are; then the rest of ``pixels`` is not filled.
+    """Find the pixels that show each cell of a row, and the cells that are hidden: those that most of the
+    cameras seeing them see unmarked. Returns whether all are hidden; ``pixels`` is then filled only in part.
 
-    flags: int32 (P + 1,), of each pixel: ``SEES``, ``SEES + UNMARKED``, or 0, as of number P, which is
-        ``nowhere``; or (0,): no cell is hidden. row: float32 (3, cells). tally: int32 (cells,), scratch.
-    pixels: int32 (MOST_VIEWS, cells) and hidden: bool (cells,), receive the results. Cells are looked at side
-    by side, since nearly all are hidden: few of hundred thousands need a closer look.
+    flags: int32 (P + 1,), one for each pixel: ``SEES``, ``SEES + UNMARKED``, or 0; number P is ``nowhere``,
+        with 0. Shape (0,): no cell is hidden.
+    row: float32 (3, cells). tally: int32 (cells,), scratch.
+    pixels: int32 (MOST_VIEWS, cells) and hidden: bool (cells,), receive the results.
+    Cells are looked at side by side, since nearly all are hidden: few of many thousands need a closer look.
     """
     total, cells = cams.shape[0], hidden.size
     for k in range(cells):
@@ -154,7 +156,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
 
     view_of: int64 (N,), each ray's view; pixels: int64 (N,), its pixel within that.
     near, middle: float32, scene units: the nearest distance, and the one preferred between equal scores.
-    scores: of ``score_cells``.
+    scores: float32 (cells^3,), from ``score_cells``.
     distance: float32 (N,), receives scene units; 0 where no cell scores above ``least``, float32.
     """
     half = np.float32(2.0) if contracted else _F1

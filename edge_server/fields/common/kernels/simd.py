@@ -250,7 +250,7 @@ _L6, _L7, _L8 = _F(2.0000714765e-1), _F(-2.4999993993e-1), _F(3.3333331174e-1)
 @part
 def log32(x):
     """The natural logarithm of a normal positive float32, relative error below 2e-7 but for arguments within
-    .001 of 1 (absolute error below 1e-8 there); of anything else some number or none.
+    .001 of 1 (absolute error below 1e-8 there). For other arguments the result is undefined, maybe NaN.
 
     The Cephes polynomial, for the same reason as ``exp32``.
     """

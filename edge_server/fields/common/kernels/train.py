@@ -24,14 +24,14 @@ CHUNK = 2048  # samples a chunk has room for; its activations stay in the second
 CHUNK_RAYS = 512
 
 DRAWN = 32  # rays drawn at a time
-# Rounds of a chunk begin new rays up to FRESH samples, with no more than an eighth of the room left of those:
-# a begun ray needs more room in later rounds, several times as much where the grid's densities are too high,
-# and a ray that is not finished is lost. Next to none are where densities are eight times too high; with a
-# quarter, one in six.
+# A chunk begins new rays until it holds FRESH samples, and a round fills at most an eighth of what is left of
+# these: a begun ray needs more room in later rounds, several times as much where the grid's densities are too
+# high, and an unfinished ray is lost. Where densities are eight times too high, that loses next to no rays;
+# rounds of a quarter would lose one in six.
 FRESH, LEAST = CHUNK - CHUNK // 8, 32
 
 # A ray is followed until the grid's densities make this optical depth, then the field is asked whether it is
-# opaque. Less than that takes, so that few samples behind a surface are evaluated; but each query costs a
+# opaque. Less than OPAQUE_DEPTH, so that few samples behind a surface are evaluated; but each query costs a
 # round.
 ASKED = 5.0
 
@@ -88,9 +88,13 @@ class Scratch(NamedTuple):
 
 
 class RaySampling(NamedTuple):
-    """How a step samples rays. key: uint64, its random stream. chunk_rays: at most, in a chunk.
-    levels: switched on. harmonics: 1, 4 or 9. changed_share: of rays, drawn from ``Views.changed``.
-    background: float32 (3,); random_background: a new one for every ray instead."""
+    """How a step samples rays.
+
+    key: uint64, its random stream. chunk_rays: largest number of rays of a chunk.
+    levels: number of levels that are switched on. harmonics: 1, 4 or 9.
+    changed_share: share of the rays that are drawn from ``Views.changed``.
+    background: float32 (3,). random_background: a new one for every ray instead.
+    """
 
     key: np.uint64
     chunk_rays: int

@@ -18,7 +18,7 @@ from edge_server.fields.common.kernels.simd import exp32, is_finite
 RAW_LOW, RAW_HIGH = -12.0, 9.0
 OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
-# Distance of weight from a guide, as a share of the guide's, at which it costs half of the most.
+# Distance of weight from a guide, as a share of the guide's own distance, at which it costs half of the most.
 GUIDE_REACH = 0.04
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
@@ -32,8 +32,8 @@ class Weights(NamedTuple):
     """Strengths of the regularizers, float32.
 
     distortion: mip-NeRF 360's loss, gathers a ray's weight in one place.
-    guide: on weight away from a ray's guide, or nowhere (Geman and McClure's robust estimator, so that a
-        wrong guide pulls no harder than a doubtful one).
+    guide: penalty on weight away from a ray's guide and on light that passes through (Geman and McClure's
+        robust estimator, so that a wrong guide pulls no harder than a doubtful one).
     """
 
     distortion: np.float32

@@ -58,7 +58,7 @@ def cores() -> int:
 
 
 def default_threads() -> int:
-    """Workers of a pool that is not told: ``cores``, but of the machine's own at most ``MOST_USEFUL``."""
+    """Number of workers by default: ``cores``, at most ``MOST_USEFUL`` unless the environment names it."""
     return cores() if os.environ.get(THREADS_VARIABLE) else min(_own_cores(), MOST_USEFUL)
 
 

@@ -120,8 +120,8 @@ def poll_for_job(queue, states, worker, last, others, polls):
 
 @kernel
 def await_workers(queue, others, polls):
-    """Of a caller that is done: poll ``polls`` times whether all others are. Returns 1 if they are; else 0,
-    and ``poll_for_job`` returns WAKE_CALLER to the last of them."""
+    """For a caller that has done its share: poll ``polls`` times whether all other workers are done. Returns
+    1 if they are; else 0, and ``poll_for_job`` returns WAKE_CALLER to the last of them."""
     _swap(queue, WAITS, 1)
     for _ in range(polls):
         if _load(queue, DONE) == others:

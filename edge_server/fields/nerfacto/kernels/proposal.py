@@ -27,7 +27,7 @@ from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 RAW_GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
 RAW_START = -1.2  # raw density where the table is 0: the thin fog that the network starts with too
 CUTOFF_DEPTH = 10.0  # optical depth behind which bins are dropped
-SCATTER_TASKS = 8  # of the kernel that adds up the gradient of the grid
+SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid
 DARK_SHARE = 0.1  # weight of a bin without light in uniform allocation; one in full light: 1 more
 WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
 
@@ -50,7 +50,8 @@ class ProposalGrid(NamedTuple):
 class ProposalSampling(NamedTuple):
     """How a ray is sampled and the proposal trained.
 
-    bins: along the whole ray. samples: allocated to them. uniform_share: of the samples, allocated uniformly.
+    bins: number of bins along the whole ray. samples: number of samples allocated to them.
+    uniform_share: share of the samples that is allocated uniformly.
     interlevel: weight of the proposal's loss. decay: weight of the pull of raw densities to RAW_START.
     """
 

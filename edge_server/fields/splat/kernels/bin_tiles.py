@@ -108,7 +108,7 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
     number of bands.
 
     columns, rows: int64 (B,), tiles across and down.
-    bands: tasks a camera.
+    bands: number of bands of each camera.
     count: number of Gaussians.
     tiles: int32 (B, N, FOOTPRINT), see ``project``.
     lists: ``TileLists``, written.

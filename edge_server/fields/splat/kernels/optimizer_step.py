@@ -121,6 +121,7 @@ def clamp_gaussian(params, i, largest, thinnest):
 
 @kernel
 def clamp_gaussians(params, largest, thinnest):
+    """``clamp_gaussian`` for all: params, float32 (N, P). largest, thinnest: see ``AdamParameters``."""
     for i in range(params.shape[0]):
         clamp_gaussian(params, i, largest, thinnest)
 

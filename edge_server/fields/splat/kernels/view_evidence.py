@@ -1,4 +1,4 @@
-"""What the views say of each Gaussian: which see it, which see a change there, which contradict its color."""
+"""The views' evidence on each Gaussian: how many see it, see a change there, and contradict its color."""
 
 from __future__ import annotations
 

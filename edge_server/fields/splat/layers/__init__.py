@@ -1,1 +1,1 @@
-"""What moves before fixed cameras, apart from what stands still."""
+"""The Gaussian field in layers, for fixed cameras: what moves, apart from what stands still."""

@@ -44,18 +44,18 @@ log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
 
-LEAST_CAMERAS = 2  # one alone tells of no depth: the first field is shown
-PLATE_FRAMES, PLATE_S = 8, 3.2  # of each camera, and since the first frame, before plates are learned
-EVIDENCE_S = 0.8  # age up to which frames tell of motion
+LEAST_CAMERAS = 2  # one alone gives no depth: the first field is shown
+PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are learned
+EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
-RENDERINGS_A_FIT = 2  # of the static field that plates take over
+RENDERINGS_A_FIT = 2  # number of the static field's renderings that plates take over in a fit
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
-FINE_FRAMES = 6  # of each camera, before the static field learns from fine plates
+FINE_FRAMES = 6  # frames of each camera before the static field learns from fine plates
 EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # fits in which cameras agree on an exposure, and steps of each
 EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
-EXPOSURE_RATE = 1.6  # of correction: so few steps show some six tenths of a difference
-MOST_PIXELS = 400_000  # of one image of every camera, with a frame of each taken in 15 times a second
+EXPOSURE_RATE = 1.6  # factor on a correction: after so few steps some six tenths of a difference show
+MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 
 
 class LayeredField:
@@ -95,7 +95,7 @@ class LayeredField:
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
         self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
         self.fine = False  # whether the static field learns from fine plates
-        self.exposure_rounds = 0  # in which cameras have agreed on an exposure
+        self.exposure_rounds = 0  # number of rounds of ``_exposures_agree`` so far
         self._published: LayeredSnapshot | None = None
         self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
@@ -106,7 +106,7 @@ class LayeredField:
 
     @property
     def most_pixels(self) -> int | None:
-        """Of one image of every camera; None where layers were given up."""
+        """Largest number of pixels of one image of every camera; None where layers were given up."""
         return MOST_PIXELS if self.layered else None
 
     @property
@@ -369,9 +369,10 @@ class LayeredField:
         self.part_s.add("static field", begun)
 
     def _exposures_agree(self) -> bool:
-        """Correct the cameras' exposures by how their plates differ from what a field learns of all of them
-        in its first steps. Later it shows nothing: Gaussians that one camera alone sees have its exposure.
-        Their geometric mean stays, and a camera of too few well exposed pixels is left as it is.
+        """Correct the cameras' exposures by how their plates differ from what a field learns of all plates in
+        its first steps. A field trained for longer hides the difference: Gaussians that one camera alone sees
+        take over its exposure. The geometric mean of the exposures stays, and a camera with too few well
+        exposed pixels is left as it is.
 
         One round a call. Returns whether it was the last."""
         if self.exposure_rounds >= EXPOSURE_ROUNDS:

@@ -80,7 +80,7 @@ class Motion:
         self.forget()
 
     def forget(self) -> None:
-        """Be without anchors, as at first."""
+        """Remove the anchors, as at the beginning."""
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
@@ -202,7 +202,7 @@ class Motion:
 
     def solve(self, rows: Sequence[ViewRow]) -> int:
         """Estimate the free knots from views, beginning at the last solution. Returns how many views were
-        left out: of instants that do not bear on free knots, and with numbers that are not finite."""
+        left out, because their instant does not bear on free knots or their numbers are not finite."""
         assert self.anchors is not None
         count = len(self.anchors)
         spans = self._sums(rows)

@@ -1,4 +1,4 @@
-"""The moving set: Gaussians that hang on anchors, learned over the plates of the cameras that see them."""
+"""The moving set: Gaussians attached to anchors, learned over the plates of the cameras that see them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ GAUSSIANS_AN_ANCHOR = 8  # at least
 GROW_EVERY = 80  # steps
 
 # Seeding, at an instant that most cameras have seen.
-CAMERA_SHARES = (0.58, 0.42)  # of the cameras, the first that is reached
+CAMERA_SHARES = (0.58, 0.42)  # share of the cameras that must have seen it; the second if none has the first
 BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
 LEAST_FOREGROUND = 0.001  # share of all pixels
 KEEP_INSIDE, KEEP_MARGIN_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
@@ -92,7 +92,7 @@ class MovingSet:
         return Gaussians(params, self.settings.harmonics, np.zeros((len(params), 3), np.float32))
 
     def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
-        """From a camera to the middle of the Gaussians."""
+        """Distance from a camera to the middle of the Gaussians, metres."""
         middle = np.median(self.places(instant_s), axis=0)
         apart = middle - self.box.normalise(camera.view.camera_to_world[:3, 3])
         return float(np.linalg.norm(apart)) * self.box.radius_m
@@ -190,8 +190,8 @@ class MovingSet:
         return []
 
     def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
-        """Remove the Gaussians that lie outside the foregrounds that should hold them; all, and their motion,
-        where that is most of them. They are then seeded at rest."""
+        """Remove the Gaussians that lie outside the foregrounds that should hold them. If that is most of
+        them, remove all, with their motion: new ones are then seeded at rest."""
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
             keep = self._inside(places, frames, cameras, KEEP_MARGIN_PX) >= KEEP_INSIDE
@@ -201,8 +201,8 @@ class MovingSet:
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
-        """Seed Gaussians in foreground that is not rendered as it is. Frames that show the moving set
-        (``Observation.shown``) tell where that is."""
+        """Seed Gaussians in foreground that is rendered wrongly. Where that is follows from the moving set
+        as rendered for each frame (``Observation.shown``)."""
         missing = [o.foreground & _is_wrong(o) if len(self.cloud) > FEW else o.foreground for o in frames]
         pixels = sum(int(mask.sum()) for mask in missing)
         count = min(int(SEEDS_A_PIXEL * pixels), self.capacity - len(self.cloud))
@@ -246,9 +246,10 @@ class MovingSet:
         self, places: Sequence[NDArray[np.float32]], frames: Sequence[Observation],
         cameras: dict[str, FixedCamera], margin_px: int,
     ) -> NDArray[np.float64]:  # fmt: skip
-        """Share (N,) of the frames that see a point in whose foreground, grown, it lies.
+        """For each point, (N,): of the frames that see it, the share in whose grown foreground it lies.
 
-        places: for each frame (N, 3), the points at its instant."""
+        places: for each frame (N, 3), the points at its instant.
+        margin_px: side of the square by which foregrounds are dilated."""
         seen, inside = (np.zeros(len(places[0]), np.int32) for _ in range(2))
         square = np.ones((margin_px, margin_px), np.uint8)
         for points, o in zip(places, frames, strict=True):

@@ -17,7 +17,7 @@ from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_field import PlateImage
 
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
-BACKGROUND_WEIGHT = 0.5  # of other pixels
+BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
 OCCLUDED_M = 0.15  # pixels do not count where the static field is nearer than the moving set by this
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
 
@@ -60,7 +60,7 @@ class FixedCamera:
         self.plate.fill_unknown(rendering.color)
 
     def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
-        """Take its exposure as ``ratio`` times what it was thought to be."""
+        """Multiply the assumed exposure by ``ratio``, float32 (3,), one factor a channel."""
         self.plate.correct_exposure(ratio)
         if self.fine is not None:
             self.fine.color /= ratio
@@ -71,7 +71,7 @@ class Observation:
     """A frame, and its linearization in the anchors' displacements.
 
     instant_s: what it shows, seconds from the field's origin.
-    foreground: bool (H, W). share: of the pixels, of the foreground.
+    foreground: bool (H, W). share: the foreground's share of the pixels.
     weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
@@ -121,7 +121,7 @@ class Observations:
 
     @property
     def newest_knot(self) -> int:
-        """The knot at or before that."""
+        """The knot at or before ``newest_s``."""
         return self._sorted[-1].knot
 
     def add(self, observation: Observation) -> None:
@@ -145,8 +145,8 @@ def pixel_weights(
     """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
     field hides what moves.
 
-    foreground: bool (H, W). depth_m: float32 (H, W), of the static field, or None.
-    distance_m: of the moving set. given: float32 (H, W), ``View.weight``, or None.
+    foreground: bool (H, W). depth_m: float32 (H, W), depth of the static field; None: unknown.
+    distance_m: distance of the moving set. given: float32 (H, W), ``View.weight``, or None.
     """
     square = np.ones((NEAR_FOREGROUND_PX, NEAR_FOREGROUND_PX), np.uint8)
     near = cv2.dilate(foreground.astype(np.uint8), square)

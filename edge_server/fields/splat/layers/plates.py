@@ -33,9 +33,9 @@ Arrays = dict[str, NDArray]
 
 LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
 GAIN_MOST = 3.0  # largest change of exposure between two frames
-GAIN_SHARE = 0.03  # share of the pixels that must tell the exposure
+GAIN_SHARE = 0.03  # share of the pixels that must be usable to estimate a change of exposure
 COMMON_SHARE = (
-    0.25  # and that over other cameras: of what is cut off at white, edges are left, which tell wrong
+    0.25  # the same over other cameras: of overexposed areas only edges are usable, and these mislead
 )
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
@@ -48,8 +48,8 @@ class Plate:
 
     arrays: ``PlateArrays``.
     picture: float32 (H, W, 3), the plate; where it is unknown, the static field's rendering.
-    gain: float32 (3,), exposure of the newest frame over the one that all cameras have in common, by channel:
-        that of this camera's first frame, until ``correct_exposure``.
+    gain: float32 (3,), ratio of the newest frame's exposure to the one that all cameras have in common, by
+        channel. Until ``correct_exposure``, the common exposure is that of this camera's first frame.
     count: number of frames taken in.
     """
 
@@ -84,7 +84,7 @@ class Plate:
 
     def exposure_over(self, color: NDArray[np.float32]) -> NDArray[np.float32] | None:
         """Median ratio by channel of the plate at the common exposure to the static field's rendering at it,
-        float32 (H, W, 3) in [0, 1]; None where too few pixels tell."""
+        float32 (H, W, 3) in [0, 1]; None if too few pixels are usable."""
         theirs = color[::2, ::2] * np.float32(255.0)
         use = self.known[::2, ::2]
         for picture in (self.picture[::2, ::2], theirs):
@@ -96,7 +96,7 @@ class Plate:
         return ratio
 
     def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
-        """Take this camera's exposure as ``ratio`` times what it was thought to be."""
+        """Multiply this camera's assumed exposure by ``ratio``, float32 (3,), one factor a channel."""
         self.gain = self.gain * ratio
 
     def take(self, image: NDArray[np.uint8], may_refuse: bool = False) -> NDArray[np.bool_] | None:

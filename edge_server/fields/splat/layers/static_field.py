@@ -1,4 +1,4 @@
-"""The static field: Gaussians that learn from plates alone, in one schedule, again where plates change."""
+"""The static field: Gaussians trained on plates alone, in one schedule, and again where plates change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCHEDULE = 1600  # steps of the first schedule, in which the field grows
 ROUND = 10  # steps of a round, over which rates fall; its parameters enter the mean
 ROUNDS_FIRST, RATE_FIRST = 60, 0.05  # after the schedule; least weight of a round in the mean
 ROUNDS_AGAIN, RATE_AGAIN = 20, 0.1  # where plates have changed
-CHANGED = 8.0  # of 255, after blurring, by which a plate must differ from what was learned
+CHANGED = 8.0  # of 255, after blurring: a plate that differs more from what was learned has changed
 CHANGED_PIXELS = 40  # a camera, above which the field is trained again
 
 

@@ -23,14 +23,15 @@ from edge_server.fields.splat.layers.observations import (
     pixel_weights,
 )
 
-PASSES, AGAIN_M = 3, 0.02  # of Gauss-Newton a fit, at most; movement of an anchor that calls for another one
-ALIGNING_SHARE = 0.5  # of a budget in seconds
-STRIDE_S = 0.08  # of motion that is followed at once: more leads too far from where alignment begins
-LEAST_ALIGNED = 4  # frames a pass, however short the budget is
-MOST_ALIGNED = 24  # frames a pass, newest first
-STEPS = 10  # of appearance a stride, at most
+# Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.
+PASSES, AGAIN_M = 3, 0.02
+ALIGNING_SHARE = 0.5  # largest share of a budget in seconds
+STRIDE_S = 0.08  # longest motion followed at once: more leads too far from where alignment begins
+LEAST_ALIGNED = 4  # frames in a pass, however short the budget is
+MOST_ALIGNED = 24  # frames in a pass, newest first
+STEPS = 10  # most steps of appearance for each stride
 SEED_EVERY_S = 0.2
-SEED_AT_LEAST_EVERY_S = 0.6  # where budgets have no room for it
+SEED_AT_LEAST_EVERY_S = 0.6  # even if budgets have no room for it
 ANCHORS_EVERY_S = 1.0
 
 
@@ -52,7 +53,7 @@ class MotionTracker:
     """Keeps a ``MovingSet`` at what the frames show.
 
     anchors_s, seeded_s: instants of the frames at which anchors were last chosen, and Gaussians seeded.
-    fits: how many there were. left_out: frames that were not aligned for lack of time.
+    fits: number of fits. left_out: number of frames that were not aligned for lack of time.
     """
 
     def __init__(
@@ -70,9 +71,10 @@ class MotionTracker:
     def follow(
         self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters
     ) -> tuple[int, int, int]:
-        """Motion, then what calls for new Gaussians, then appearance. Returns steps, pixels and pairs.
+        """Estimate motion, seed Gaussians where they are missing, train appearance. Returns steps, pixels and
+        pairs.
 
-        publish: called when motion is known. parameters: of an optimizer step.
+        publish: called when motion is known. parameters: for optimizer steps.
         """
         moving, newest_s = self.moving, self.observations.newest_s
         self.fits += 1

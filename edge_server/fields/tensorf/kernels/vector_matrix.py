@@ -22,7 +22,7 @@ from edge_server.fields.common.kernels.radiance_model import is_a, query_backwar
 from edge_server.fields.common.kernels.simd import fetch_add
 
 CHANNELS = 8  # components of a group; one 256-bit register
-ROWS = 4  # of a table in a segment, for which a dirty flag stands
+ROWS = 4  # rows of a table in a segment; a dirty flag stands for one segment
 MODES = 3  # orientations: plane xy and line z, plane xz and line y, plane yz and line x
 TILE = 16  # samples side by side: a cache line of each row of ``acts`` is written as a whole
 
@@ -32,10 +32,13 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 class Planes(NamedTuple):
     """The factors of one field.
 
-    size: vertices a side. density_groups, groups: multiples of 3; the first density_groups make up density,
-    the others feed the network. rows: of ``table`` a group, a multiple of ROWS. bias: float32, raw density
-    where all factors are 0. table: float32 (groups * rows, 8); per group the plane's size^2 vertices, the
-    first axis fastest, then the line's.
+    size: vertices a side.
+    density_groups, groups: multiples of 3; the first density_groups make up density, the others feed the
+        network.
+    rows: rows of ``table`` for each group, a multiple of ROWS.
+    bias: float32, raw density where all factors are 0.
+    table: float32 (groups * rows, 8); per group the plane's size^2 vertices, the first axis fastest, then the
+        line's.
     """
 
     size: int

@@ -19,7 +19,7 @@ from edge_server.fields.common.kernels.train import take_pixel
 from edge_server.fields.voxel.kernels.cell_quads import add_to_cell, cell_value
 
 SEGMENT = 8  # vertices a dirty flag stands for
-MAX_SAMPLES = 2048  # of a ray
+MAX_SAMPLES = 2048  # most samples of a ray
 MIN_TRANSMITTANCE = 1e-3  # at which a ray ends
 TASK_RAYS = 256  # rays a rendering task
 

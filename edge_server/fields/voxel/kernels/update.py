@@ -94,8 +94,12 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
 
 
 class DiffusionRule(NamedTuple):
-    """edge: float32 (4,), bound of the difference to a neighbor, by channel: larger differences are edges and
-    diffuse no faster. share: of the sum of the six differences that a vertex moves; stable up to 1/6."""
+    """Constants of one diffusion step.
+
+    edge: float32 (4,), bound of the difference to a neighbor, by channel: larger differences are edges and
+    diffuse no faster.
+    share: how far a vertex moves, as a share of the sum of its six differences; stable up to 1/6.
+    """
 
     edge: NDArray[np.float32]
     share: np.float32

@@ -1,4 +1,4 @@
-"""The passes over a frame that keep a camera's plate: compare the frame with it, then let its pixels vote.
+"""The passes over a frame that update a camera's plate: compare it with the plate, then let its pixels vote.
 
 Frames, means and blurred frames are in steps of 255. Blurred means a mean of 3 x 3 pixels.
 """
@@ -15,21 +15,21 @@ from edge_server.fields.common.kernels.simd import fetch_add
 
 MODES = 3  # colors a pixel remembers
 THRESHOLD = 10.0  # colors this near are the same mode
-THRESHOLD_UNKNOWN = 20.0  # where no plate is known: foreground is farther from the static field's rendering
-DEVIATIONS = 3.5  # foreground is also so many of the pixel's own deviations from the plate
+THRESHOLD_UNKNOWN = 20.0  # where no plate is known, foreground differs by more from the static field
+DEVIATIONS = 3.5  # foreground also differs from the plate by this many of the pixel's own mean deviations
 DEVIATION_RATE = 0.05
 MEMORY = 60  # arrivals over which votes decay
-SLOWEST_RATE = 1.0 / 24.0  # of a mode's running mean
+SLOWEST_RATE = 1.0 / 24.0  # least weight of a new frame in a mode's running mean
 RUN = 12  # arrivals in a row that join another mode: it becomes the plate
 KNOWN_VOTES, KNOWN_SHARE, EARLY_SHARE = 8.0, 0.3, 0.9  # see ``_is_known``
 LEAST_WEIGHT = 0.05  # a mode of less is forgotten
 GAIN_STEP = 0.01  # smaller changes of exposure are left to the running mean
-DARK, BRIGHT = 20.0, 235.0  # plates between these tell the exposure
+DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exposure
 
 # Bits that ``compare_with_plate`` writes.
 FOREGROUND, CHANGING, LIKE_STATIC = 1, 2, 4
 
-_ROWS = 16  # of pixels a task
+_ROWS = 16  # rows of pixels a task
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
@@ -206,7 +206,8 @@ def vote(
 
 @kernel
 def count_exposure(counter, worker, image, plate, counts):
-    """Count, over every fourth pixel of a known and well exposed plate, frames that are brighter or darker.
+    """Count the pixels where a frame is brighter or darker than the plate, among every fourth pixel of the
+    known and well exposed plate.
 
     counts: int64 (3, 3), written, for each channel: pixels, those brighter and those darker than the plate by
         more than GAIN_STEP.

@@ -14,8 +14,8 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw
 
 BAND = 4  # knots that one view bears on
-PAIRS = 10  # of these knots, i <= j
-MOST = 1e30  # numbers of a view, so that sums fit float32
+PAIRS = 10  # pairs i <= j of these knots
+MOST = 1e30  # bound of a view's numbers: their sums fit float32
 MOST_ITERATIONS = 60
 # The solution is found when the estimated distance to it, over all unknowns together, is this many of its
 # standard deviations.
