@@ -36,9 +36,9 @@ GROW_EVERY = 80  # steps
 CAMERA_SHARES = (0.58, 0.42)  # share of the cameras that must have seen it; the second if none has the first
 BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
 LEAST_FOREGROUND = 0.001  # share of all pixels
-KEEP_INSIDE, KEEP_MARGIN_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
+KEEP_INSIDE, KEEP_DILATION_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
 LOST_BELOW = 0.5  # share that lies inside, below which motion is lost
-SEED_INSIDE, SEED_MARGIN_PX = 0.7, 3  # the same for a new one
+SEED_INSIDE, SEED_DILATION_PX = 0.7, 3  # the same for a new one
 MISSING_ERROR = 0.12  # color error, in the worst channel, above which foreground needs new Gaussians
 SEEDS_A_PIXEL = 0.1
 FEW = 32  # Gaussians: all foreground needs new ones below this
@@ -194,7 +194,7 @@ class MovingSet:
         them, remove all, with their motion: new ones are then seeded at rest."""
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
-            keep = self._inside(places, frames, cameras, KEEP_MARGIN_PX) >= KEEP_INSIDE
+            keep = self._inside(places, frames, cameras, KEEP_DILATION_PX) >= KEEP_INSIDE
             if keep.mean() < LOST_BELOW:
                 keep[:] = False
                 self.motion.forget()
@@ -219,7 +219,7 @@ class MovingSet:
             shift = self.motion.displaced(np.zeros_like(params[:, :3]), anchor, share, instant_s)
             params[:, :3] -= shift
             places = [self.motion.displaced(params[:, :3], anchor, share, o.instant_s) for o in frames]
-        inside = self._inside(places, frames, cameras, SEED_MARGIN_PX) >= SEED_INSIDE
+        inside = self._inside(places, frames, cameras, SEED_DILATION_PX) >= SEED_INSIDE
         if not inside.any():
             return
         self.cloud.add(GaussianCloud.new(params[inside]))
@@ -244,14 +244,14 @@ class MovingSet:
 
     def _inside(
         self, places: Sequence[NDArray[np.float32]], frames: Sequence[Observation],
-        cameras: dict[str, FixedCamera], margin_px: int,
+        cameras: dict[str, FixedCamera], dilation_px: int,
     ) -> NDArray[np.float64]:  # fmt: skip
         """For each point, (N,): of the frames that see it, the share in whose grown foreground it lies.
 
         places: for each frame (N, 3), the points at its instant.
-        margin_px: side of the square by which foregrounds are dilated."""
+        dilation_px: side of the square by which foregrounds are dilated."""
         seen, inside = (np.zeros(len(places[0]), np.int32) for _ in range(2))
-        square = np.ones((margin_px, margin_px), np.uint8)
+        square = np.ones((dilation_px, dilation_px), np.uint8)
         for points, o in zip(places, frames, strict=True):
             mask = cv2.dilate(o.foreground.astype(np.uint8), square)
             self.pool.run(
