@@ -199,7 +199,7 @@ def baselines() -> str:
     for scene in ("tile", "room", "kitchen", "lego", "fox"):
         part = found[scene]
         known = part["baseline"]
-        rows.append([part["scene"], part["angle_deg"], known["mean_colour_db"], known["nearest_view_db"]])
+        rows.append([part["scene"], part["angle_deg"], known["mean_color_db"], known["nearest_view_db"]])
     return table(
         ["scene", "held-out view to nearest other, degrees", "mean color, dB", "nearest view, dB"], rows
     )
@@ -521,7 +521,7 @@ def soak(name: str) -> str:
 
 
 def attacks() -> str:
-    """Refusals, neighbours and memory of a run of tests/chaos/attacks.py."""
+    """Refusals, neighbors and memory of a run of tests/chaos/attacks.py."""
     run = measured("docs/results/attacks.json")
 
     def ms(found: dict[str, float] | None) -> str:
@@ -529,11 +529,11 @@ def attacks() -> str:
 
     rows = [
         [r["sent"], r["at"], r["answer"], ms(r["refused_ms"]),
-         ms(r["neighbours"]["emulator" if r["at"] == "emulator" else "edge"]["ms"]),
+         ms(r["neighbors"]["emulator" if r["at"] == "emulator" else "edge"]["ms"]),
          " / ".join(map(str, r["memory_mb"])), f"`{r['test']}`" if r["test"] else ""]
         for r in run["attacks"]
     ]  # fmt: skip
-    head = ["attack", "on", "answers", "after, ms: p50 / p99", "neighbour's answers, ms: p50 / p99",
+    head = ["attack", "on", "answers", "after, ms: p50 / p99", "neighbor's answers, ms: p50 / p99",
             "MB before / most / after", "test"]  # fmt: skip
     return f"Load average {run['load_average']:.0f}, {run['cores']} cores.\n\n" + table(head, rows)
 

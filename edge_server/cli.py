@@ -95,7 +95,7 @@ _COMMANDS = {
     ),
     "viewpoints": (
         "experiments.viewpoints.command",
-        "choose where a camera goes next around an object, within a budget of views or metres",
+        "choose where a camera goes next around an object, within a budget of views or meters",
     ),
     "study": ("experiments.studies.command", "the thesis's figures as commands, each with a verdict"),
     "bench": (

@@ -70,7 +70,7 @@ A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 per second:
 
   {"t_ns": 1234567890, "p": [x, y, z], "q": [w, x, y, z], "clutch": true}
 
-t_ns: time of the measurement (any clock); p: metres, z up; q: orientation; clutch: follow while true, after
+t_ns: time of the measurement (any clock); p: meters, z up; q: orientation; clutch: follow while true, after
 it was false once. For a 3D Systems Touch: p = [x, -z, y] / 1000 of HD_CURRENT_TRANSFORM, clutch from
 HD_CURRENT_BUTTONS.
 """

@@ -17,7 +17,7 @@ from camera_node.synthetic.placement import MovingBody, PlacedParts
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array
 
-# Of contact shadows: distance (metres) from the body's middle at which they end, and their darkest.
+# Of contact shadows: distance (meters) from the body's middle at which they end, and their darkest.
 _REACH_M, _MOST_DARKENING = 0.8, 0.75
 
 

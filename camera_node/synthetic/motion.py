@@ -112,6 +112,6 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def mean_path_m(points_at: Callable[[float], Array]) -> float:
-    """Metres that the points (M, 3) = points_at(phase) travel in one loop, averaged over the points."""
+    """Meters that the points (M, 3) = points_at(phase) travel in one loop, averaged over the points."""
     p = np.stack([points_at(k / _PATH_SAMPLES) for k in range(_PATH_SAMPLES)])
     return float(np.linalg.norm(np.diff(p, axis=0, append=p[:1]), axis=2).sum(axis=0).mean())

@@ -31,7 +31,7 @@ COURSES = ("loop", "stops", "reverses", "jumps")
 
 @dataclass(frozen=True)
 class Walk:
-    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``. direction: seen from above,
+    """An ellipse of ``radii`` times ``scale`` (meters), walked in ``period_s``. direction: seen from above,
     1.0 is counterclockwise, -1.0 clockwise. start_s: time into the loop at instant 0. course: of ``COURSES``:
     round and round; with a stop of PERIOD_UNIT_S after each PERIOD_UNIT_S; half a loop and backwards again;
     half a loop and at once back to its start."""
@@ -65,7 +65,7 @@ class Walk:
         return t_s % (0.5 * self.period_s) if self.course == "jumps" else t_s
 
     def at(self, phase: float) -> tuple[float, float]:
-        """Position on the floor at a phase, in metres."""
+        """Position on the floor at a phase, in meters."""
         a = 2 * math.pi * phase * self.direction
         rx, ry = self.radii[0] * self.scale, self.radii[1] * self.scale
         return self.center[0] + rx * math.cos(a), self.center[1] + ry * math.sin(a)
@@ -230,7 +230,7 @@ def walking_person(walk: Walk) -> MovingBody:
 # The same walk is asked for by every process that builds a scene, several times: by truth, cameras, episodes.
 @lru_cache(256)
 def loop_length_m(walk: Walk) -> float:
-    """Metres that the middles of the person's parts travel in one loop, averaged over the parts."""
+    """Meters that the middles of the person's parts travel in one loop, averaged over the parts."""
 
     def middles(phase: float) -> Array:
         start, end, _ = bones(walk, phase)

@@ -14,7 +14,7 @@ from freshfield.geometry import Array
 
 
 def at(x: float, y: float, z: float, turn_deg: float = 0.0) -> Array:
-    """Pose (4, 4) at a position in metres, turned about the vertical."""
+    """Pose (4, 4) at a position in meters, turned about the vertical."""
     a = np.deg2rad(turn_deg)
     out = np.eye(4)
     out[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
@@ -45,7 +45,7 @@ class Part:
 @dataclass(frozen=True)
 class MovingBody:
     """Parts that move together. matrices(t_s): their world-from-local matrices (M, 4, 4), which may scale.
-    contact: parts (index, radius in metres) that darken the floor beneath them."""
+    contact: parts (index, radius in meters) that darken the floor beneath them."""
 
     parts: tuple[Part, ...]
     matrices: Callable[[float], Array]

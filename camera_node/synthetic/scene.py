@@ -74,7 +74,7 @@ class Scene:
     """A world seen by posed cameras.
 
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out. target: the point (3,) that cameras
-    look at, or away from. bounds (2, 3): lower and upper corner in metres of everything that can be seen,
+    look at, or away from. bounds (2, 3): lower and upper corner in meters of everything that can be seen,
     except an occluder. period_s: frames repeat after this time, a multiple of 0.6 s. moving: False if every
     instant is the same. object_parts: so many of the world's static parts, from the first, are the object
     that is looked at; None: all of them. static_key: identifies the static parts of scenes with a

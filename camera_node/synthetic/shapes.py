@@ -17,7 +17,7 @@ import numpy as np
 
 from freshfield.geometry import Array
 
-# A hit counts from this distance (metres) on, so that a ray does not meet the surface it starts on.
+# A hit counts from this distance (meters) on, so that a ray does not meet the surface it starts on.
 T_MIN = 1e-6
 # Replaces zero in a denominator; its reciprocal is finite, so 0 * inf cannot make a NaN.
 _TINY = 1e-30
@@ -109,7 +109,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A box around the local origin. Surface coordinates: the two axes of the face, in metres."""
+    """A box around the local origin. Surface coordinates: the two axes of the face, in meters."""
 
     half: tuple[float, float, float]
 
@@ -134,7 +134,7 @@ class Box:
 @dataclass(frozen=True)
 class Quad:
     """A rectangle in the local plane z = 0, visible from +z only: six make a room whose near walls do not
-    hide its inside. Surface coordinates: x and y in metres."""
+    hide its inside. Surface coordinates: x and y in meters."""
 
     half: tuple[float, float]
 
@@ -155,7 +155,7 @@ class Quad:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A capped cylinder about z. Surface coordinates: turns about z and metres along it; on the caps,
+    """A capped cylinder about z. Surface coordinates: turns about z and meters along it; on the caps,
     turns and radius."""
 
     radius: float
@@ -181,7 +181,7 @@ class Cylinder:
 @dataclass(frozen=True)
 class RoundCone:
     """The hull of a ball of radius r0 at the origin and one of radius r1 at (0, 0, length): a capsule
-    where the radii are equal, a limb where they are not. Surface coordinates: turns about z and metres
+    where the radii are equal, a limb where they are not. Surface coordinates: turns about z and meters
     along it. Needs length > |r0 - r1|, or one ball would swallow the other.
 
     The cone between the two tangent circles is quadratic in t; ``_d2`` and ``_along`` place a point

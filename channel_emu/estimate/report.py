@@ -13,7 +13,7 @@ from freshfield.files import picture
 from freshfield.untrusted import YamlWriter
 
 _MIN_FRAMES, _MAX_FRAMES, _CYCLES = 300, 4000, 40
-_COLORS, _GREY = ("#0072B2", "#D55E00"), "#777777"
+_COLORS, _GRAY = ("#0072B2", "#D55E00"), "#777777"
 
 
 def format_fit(fit: Fit) -> str:
@@ -70,7 +70,7 @@ def plot(fit: Fit, path: Path) -> None:
             _draw_states(fit, axes[:, 0], start_s, delay_ms)
         else:
             mean = fit.parameters["mean_ms"].value
-            top.scatter(start_s, delay_ms, s=5, color=_GREY)
+            top.scatter(start_s, delay_ms, s=5, color=_GRAY)
             top.axhline(mean, color=_COLORS[0], lw=0.8, label=f"mean {mean:.3g} ms")
         if top.get_legend_handles_labels()[0]:
             top.legend(loc="upper right")
@@ -103,7 +103,7 @@ def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray)
             drawn = top.scatter(start_s, delay_ms, c=second, s=8, cmap="coolwarm", vmin=0, vmax=1)
             top.figure.colorbar(drawn, ax=top, label=f"P({names[1]})")
     if len(fit.lines) > 1:
-        top.scatter(start_s, delay_ms, s=5, color=_GREY)
+        top.scatter(start_s, delay_ms, s=5, color=_GRAY)
 
 
 def _bic_difference(bic: dict[int, float]) -> str:

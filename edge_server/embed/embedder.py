@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import OUTPUT, Backbone
-from edge_server.embed.letterbox import GREY, blob, checked
+from edge_server.embed.letterbox import GRAY, blob, checked
 from freshfield.limits import MAX_MODEL_BYTES
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Embedder:
         self.step = backbone.batch or _BATCH[self.provider]
         """Images per run."""
         # A model that cannot run fails here, not at the first decision.
-        self.pooled([np.full((8, 8, 3), GREY, np.uint8)])
+        self.pooled([np.full((8, 8, 3), GRAY, np.uint8)])
 
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any size; RGBA is composited over

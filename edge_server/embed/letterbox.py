@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
 
-GREY = 114  # YOLO's padding
+GRAY = 114  # YOLO's padding
 
 
 def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
@@ -26,7 +26,7 @@ def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.u
     fitted = cv2.resize(image, size, interpolation=how)
     if size == (width, height):
         return np.asarray(fitted, dtype=np.uint8)
-    out = np.full((height, width, 3), GREY, dtype=np.uint8)
+    out = np.full((height, width, 3), GRAY, dtype=np.uint8)
     top, left = (height - size[1]) // 2, (width - size[0]) // 2
     out[top : top + size[1], left : left + size[0]] = fitted
     return out
@@ -42,7 +42,7 @@ def checked(image: NDArray, number: int) -> NDArray[np.uint8]:
     if array.shape[2] == 3:
         return array
     alpha = array[..., 3:].astype(np.float32) / 255.0
-    return np.rint(array[..., :3] * alpha + GREY * (1.0 - alpha)).astype(np.uint8)
+    return np.rint(array[..., :3] * alpha + GRAY * (1.0 - alpha)).astype(np.uint8)
 
 
 def blob(

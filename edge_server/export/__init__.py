@@ -1,7 +1,7 @@
 """Exports fields and runs as files for other programs, one module per format.
 
 Files are written atomically (``freshfield.files``). Each module states how its format's conventions differ
-from ours (camera-to-world, OpenCV axes, metres, w-first quaternions).
+from ours (camera-to-world, OpenCV axes, meters, w-first quaternions).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class ExportError(ValueError):
 @dataclass(frozen=True)
 class PosedImage:
     """An image with its pose. name: file name without folder and extension. image: uint8 (H, W, 3 or 4).
-    camera_to_world: (4, 4), OpenCV axes, metres. t_s: capture time, seconds."""
+    camera_to_world: (4, 4), OpenCV axes, meters. t_s: capture time, seconds."""
 
     name: str
     image: NDArray[np.uint8]

@@ -25,7 +25,7 @@ _NAMES = {_PINHOLE: "PINHOLE", _OPENCV: "OPENCV"}
 
 @dataclass(frozen=True)
 class Cloud:
-    """A point cloud. points: float64 (N, 3), metres. color: uint8 (N, 3). seen: bool (N, S), which shots see
+    """A point cloud. points: float64 (N, 3), meters. color: uint8 (N, 3). seen: bool (N, S), which shots see
     each point."""
 
     points: NDArray[np.float64]

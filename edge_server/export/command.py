@@ -23,14 +23,14 @@ Write what a run or a fit has made as files for other programs. RUN is its folde
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf --trajectory out/path.tum
 
---mesh         triangles with colours: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
+--mesh         triangles with colors: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
---points       surface points with colours (.ply)
+--points       surface points with colors (.ply)
 --colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 --trajectory   poses as the TUM benchmark has them; a file for each camera that moved
 
-Several can be asked for at once. Lengths in the files are metres, our z points up (in GLB: y). A mesh comes
+Several can be asked for at once. Lengths in the files are meters, our z points up (in GLB: y). A mesh comes
 from depth as the cameras see it, fused on a grid; what no camera saw stays open, or is closed: --watertight.
 """
 
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     mesh("--voxel", type=float, metavar="MM", help="[what a pixel spans at the surface]")
     mesh(
         "--bounds", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="metres [what the cameras see]",
+        help="meters [what the cameras see]",
     )  # fmt: skip
     mesh("--watertight", action="store_true", help="close it where nobody looked")
     mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function with the eikonal term [tsdf]")

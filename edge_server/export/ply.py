@@ -15,7 +15,7 @@ _TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 def write_mesh(
     path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
 ) -> None:
-    """Write vertices (V, 3) in metres, color (V, 3) and faces (F, 3)."""
+    """Write vertices (V, 3) in meters, color (V, 3) and faces (F, 3)."""
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
     rows["count"], rows["corner"] = 3, faces
     table = _colored(vertices, color)
@@ -24,7 +24,7 @@ def write_mesh(
 
 
 def write_points(path: Path, points: NDArray[np.float32], color: NDArray[np.uint8]) -> None:
-    """Write points (N, 3) in metres with color (N, 3)."""
+    """Write points (N, 3) in meters with color (N, 3)."""
     write_table(path, _colored(points, color))
 
 

@@ -42,7 +42,7 @@ def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
 
 
 def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
-    """The rows (N,) of the file, in world metres."""
+    """The rows (N,) of the file, in world meters."""
     p, extra = gaussians.params.astype(np.float64), gaussians.harmonics - 1
     rest = p[:, BASE:].reshape(len(p), extra, 3) * SIGNS[:extra, None]
     columns = {

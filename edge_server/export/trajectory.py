@@ -1,6 +1,6 @@
 """Trajectories in the format of the TUM RGB-D benchmark, which evo and others read: one pose per line.
 
-``t tx ty tz qx qy qz qw``: camera-to-world, metres, seconds, quaternions w-last.
+``t tx ty tz qx qy qz qw``: camera-to-world, meters, seconds, quaternions w-last.
 """
 
 from __future__ import annotations

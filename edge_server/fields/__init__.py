@@ -22,7 +22,7 @@ class View:
     """One decoded, posed image that supervises a field.
 
     image: uint8 (H, W, 3) RGB, or (H, W, 4) straight-alpha RGBA; matches ``intrinsics``.
-    camera_to_world: float64 (4, 4), OpenCV axes, metres.
+    camera_to_world: float64 (4, 4), OpenCV axes, meters.
     generated_ns: capture time, edge clock.
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
     carried_to_ns: the instant that the image has been carried forward to since its capture
@@ -81,7 +81,7 @@ class FitReport:
 
 @dataclass(frozen=True)
 class Rendering:
-    """color float32 (H, W, 3) in [0, 1]; depth float32 (H, W), metres along the ray (0 where empty);
+    """color float32 (H, W, 3) in [0, 1]; depth float32 (H, W), meters along the ray (0 where empty);
     opacity float32 (H, W) in [0, 1]."""
 
     color: NDArray[np.float32]
@@ -93,11 +93,11 @@ class Renderer(Protocol):
     """Renders one scene; safe to use from any thread while a field trains on."""
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """Render a camera. camera_to_world: (4, 4), OpenCV axes, metres."""
+        """Render a camera. camera_to_world: (4, 4), OpenCV axes, meters."""
         ...
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` surface points (N, 3) in world metres and colors (N, 3) in [0, 1]."""
+        """Up to ``count`` surface points (N, 3) in world meters and colors (N, 3) in [0, 1]."""
         ...
 
 

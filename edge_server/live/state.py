@@ -136,7 +136,7 @@ class EdgeState:
     set_deadline: sets the milliseconds from decision to publication, None for no deadline. The attribute
     itself is None where no deadline can be set.
     learning: one line on a policy that learns while it is used; empty where none does.
-    bounds: world box (2, 3) in metres of what the field represents, once known.
+    bounds: world box (2, 3) in meters of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """

@@ -38,7 +38,7 @@ def age_fraction(age_ms: float) -> float:
 
 
 def age_color(age_ms: float | None) -> RGB:
-    """Color of an age in milliseconds; grey for None."""
+    """Color of an age in milliseconds; gray for None."""
     if age_ms is None:
         return UNKNOWN
     return scale_color(round(age_fraction(age_ms) * STEPS) / STEPS)

@@ -305,7 +305,7 @@ class RenderLoop:
 
 
 def browser_images(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The images for a browser: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
+    """The images for a browser: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, meters.
 
     Pixels that are not finite become empty space.
     """

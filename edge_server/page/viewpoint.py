@@ -31,7 +31,7 @@ _FAN = 0.03
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """position, look_at, up: (3,) each, world metres. radius_m: median distance of the cameras from the point
+    """position, look_at, up: (3,) each, world meters. radius_m: median distance of the cameras from the point
     they look at, the unit of size in the scene."""
 
     position: Array
@@ -100,7 +100,7 @@ def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> View
 
 
 def _outward(offsets: Array, up: Array, radius: float) -> Array:
-    """Unit vector from the center to the visitor, above the mean camera. offsets: (N, 3) metres."""
+    """Unit vector from the center to the visitor, above the mean camera. offsets: (N, 3) meters."""
     flat = offsets - (offsets @ up)[:, None] * up
     behind = flat.mean(axis=0)
     if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: behind the first
@@ -128,7 +128,7 @@ def visitor_camera(
 ) -> tuple[Array, Pinhole]:
     """Camera-to-world (4, 4) and intrinsics of a browser's view with ``rows`` image rows.
 
-    position: (3,) metres. wxyz: rotation quaternion. fov_rad: vertical. width, height: canvas pixels. The
+    position: (3,) meters. wxyz: rotation quaternion. fov_rad: vertical. width, height: canvas pixels. The
     image has exactly the canvas's field of view although its width is rounded.
     """
     pose = np.eye(4)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.report.style import BLUE, GREY, VERMILION, figure
+from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
 from freshfield.files import out_file, write_json
@@ -154,10 +154,10 @@ def draw(
 def _bars(axes: Any, names: list[str], shares: NDArray, errors: NDArray | None, title: str) -> None:
     at = np.arange(len(names))
     colors = [BLUE if share >= 0 else VERMILION for share in shares]
-    axes.barh(at, shares, xerr=errors, color=colors, ecolor=GREY, height=0.7)
+    axes.barh(at, shares, xerr=errors, color=colors, ecolor=GRAY, height=0.7)
     axes.set_yticks(at, names)
     axes.invert_yaxis()
-    axes.axvline(0.0, color=GREY, linewidth=0.8)
+    axes.axvline(0.0, color=GRAY, linewidth=0.8)
     axes.set_title(title)
     axes.set_xlabel("for (+), against (-)")
 

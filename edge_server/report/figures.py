@@ -14,8 +14,8 @@ from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.report.run_files import Row, RunFiles
 from edge_server.report.style import (
     BLUE,
+    GRAY,
     GREEN,
-    GREY,
     INK,
     ORANGE,
     PURPLE,
@@ -53,10 +53,10 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         top, bottom = axes[:, 0]
         _plot(top, series, "psnr_db", BLUE, "whole image")
         _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
-        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
+        flat = {"nearest_view_db": "nearest view", "mean_color_db": "mean color"}
         for (key, label), dash in zip(flat.items(), ("--", ":")):
             if found["baseline"].get(key) is not None:
-                top.axhline(found["baseline"][key], color=GREY, linestyle=dash, linewidth=1.2, label=label)
+                top.axhline(found["baseline"][key], color=GRAY, linestyle=dash, linewidth=1.2, label=label)
         fit = report["kind"] == "fit"
         title = fidelity_title(found["scored_on"])
         if fit and SELECTED not in found["scored_on"]:
@@ -65,7 +65,7 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         _plot(bottom, series, "ssim", GREEN, "SSIM (higher is better)")
         network = found.get("lpips_network") or "network unknown"
         _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
-        _plot(bottom, series, "perceptual", GREY, "perceptual, not LPIPS (lower is better)")
+        _plot(bottom, series, "perceptual", GRAY, "perceptual, not LPIPS (lower is better)")
         bottom.set_ylim(0.0, 1.02)
         label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
     return True
@@ -151,7 +151,7 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
             label_lines(right, "density", "drawn delay (ms)", "Drawn delays")
         else:
             right.set_axis_off()
-            right.text(0.5, 0.5, "no delays were drawn", ha="center", color=GREY)
+            right.text(0.5, 0.5, "no delays were drawn", ha="center", color=GRAY)
     return True
 
 

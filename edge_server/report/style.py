@@ -17,10 +17,10 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from PIL import Image
 
-# Okabe and Ito's palette, ordered so that neighbours differ in lightness too.
+# Okabe and Ito's palette, ordered so that neighbors differ in lightness too.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
-INK, GREY, PALE = "#222222", "#777777", "#E4E4E4"
+INK, GRAY, PALE = "#222222", "#777777", "#E4E4E4"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
 WIDTH_INCH = 8.4
 _COLORS = 64  # in a file: a quarter of the bytes, without a visible difference in curves
@@ -33,7 +33,7 @@ _RC: Any = {
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.labelcolor": INK,
-    "axes.edgecolor": GREY,
+    "axes.edgecolor": GRAY,
     "axes.linewidth": 0.8,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -42,8 +42,8 @@ _RC: Any = {
     "axes.prop_cycle": cycler(color=CYCLE),
     "grid.color": PALE,
     "grid.linewidth": 0.8,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
+    "xtick.color": GRAY,
+    "ytick.color": GRAY,
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
     "lines.linewidth": 1.6,

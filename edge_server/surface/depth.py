@@ -77,7 +77,7 @@ def depth_map(
     """
     shape = (intrinsics.height, intrinsics.width)
     if depth.shape != shape or color.shape != (*shape, 3):
-        raise SurfaceError(f"depth {depth.shape} and colour {color.shape} do not fit a camera of {shape}")
+        raise SurfaceError(f"depth {depth.shape} and color {color.shape} do not fit a camera of {shape}")
     pose = np.asarray(camera_to_world, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SurfaceError("a depth map's camera_to_world must be a finite (4, 4) matrix")

@@ -24,7 +24,7 @@ INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: float32 (V, 3), world metres. faces: int32 (F, 3), counter-clockwise seen from outside.
+    """vertices: float32 (V, 3), world meters. faces: int32 (F, 3), counter-clockwise seen from outside.
     color: uint8 (V, 3)."""
 
     vertices: Floats
@@ -42,7 +42,7 @@ class Mesh:
         return bool((one[1:] != one[:-1]).all() and np.array_equal(one, other))
 
     def areas_m2(self) -> NDArray[np.float64]:
-        """Area of every face (F,), square metres."""
+        """Area of every face (F,), square meters."""
         corners = self.vertices[self.faces].astype(np.float64)
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas: NDArray[np.float64] = 0.5 * np.linalg.norm(cross, axis=1)
@@ -86,8 +86,8 @@ def extract_mesh(
         raise SurfaceError("the depth maps hold no surface within the bounds")
     index = np.concatenate(vertices)
     color = dense.colors(index)
-    metres = dense.metres(index)
-    mesh = Mesh(metres.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
+    meters = dense.meters(index)
+    mesh = Mesh(meters.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
     return remove_degenerate(mesh)
 
 
@@ -188,12 +188,12 @@ class _Dense:
             known = np.pad(known, width, constant_values=True)
         return np.ascontiguousarray(dense), known
 
-    def metres(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
+    def meters(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
         """World coordinates (N, 3), meters, of voxel indices (N, 3)."""
         grid = self.volume.grid
         voxels = index - self.pad + SIDE * self.low
-        metres: NDArray[np.float64] = np.array(grid.lower) + voxels * grid.voxel_m
-        return metres
+        meters: NDArray[np.float64] = np.array(grid.lower) + voxels * grid.voxel_m
+        return meters
 
     def colors(self, index: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Colors (N, 3) at indices (N, 3), interpolated between two voxels; gray where unknown."""

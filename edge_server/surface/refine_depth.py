@@ -81,18 +81,18 @@ def refine_depth(
     if len(maps) != len(pictures):
         raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
-    greys = [_grey(picture, found) for picture, found in zip(pictures, maps)]
-    gains = exposures(maps, greys)
-    greys = [(grey / np.float32(gain)).astype(np.float32) for grey, gain in zip(greys, gains)]
+    grays = [_gray(picture, found) for picture, found in zip(pictures, maps)]
+    gains = exposures(maps, grays)
+    grays = [(gray / np.float32(gain)).astype(np.float32) for gray, gain in zip(grays, gains)]
     guesses = [_fill_unknown(found) for found in maps]
-    views = [_view(k, found, grey) for k, (found, grey) in enumerate(zip(maps, greys))]
+    views = [_view(k, found, gray) for k, (found, gray) in enumerate(zip(maps, grays))]
     planes = [
         Planes(guess.copy(), smooth_normals(guess, view.rays), np.full(guess.shape, WORST, np.float32))
         for guess, view in zip(guesses, views)
     ]
     for number, phase in enumerate(PHASES):
         # Every map is compared with the others as they were before the phase, whatever the order.
-        images = _images(maps, greys, planes)
+        images = _images(maps, grays, planes)
         offers = _offers(images, views, planes, phase.offer, pool)
         for k, (view, guess, found, offered) in enumerate(zip(views, guesses, planes, offers)):
             if phase.choose:
@@ -102,14 +102,14 @@ def refine_depth(
                 pool.run(match, images, view, guess, offered, found, parity, key, phase.search)
             if on_map is not None:
                 on_map((number + (k + 1) / len(maps)) / (len(PHASES) + 1))
-    images = _images(maps, greys, planes)
+    images = _images(maps, grays, planes)
     out = [_with_trust(*each, images, pool) for each in zip(maps, views, planes)]
     if on_map is not None:
         on_map(1.0)
     return out
 
 
-def exposures(maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+def exposures(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
     """Brightness of each image relative to the others (N,), from points that two of them show: least squares
     over the medians of all pairs. 1 where it is within ``SAME_GAIN``, or unknown."""
     pairs, ratios = [], []
@@ -117,7 +117,7 @@ def exposures(maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]]) ->
         at = np.flatnonzero(found.seen)
         at = at[:: max(1, len(at) // GAIN_POINTS)]
         points = found.points()[:: max(1, int(found.seen.sum()) // GAIN_POINTS)]
-        own = greys[k].ravel()[at]
+        own = grays[k].ravel()[at]
         for j, other in enumerate(maps):
             both = on_surface(other, points, GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
             if both.sum() < LEAST_SHARED:
@@ -125,7 +125,7 @@ def exposures(maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]]) ->
             lens, pose = other.intrinsics, other.camera_to_world
             column, row = lens.project((points[both] - pose[:3, 3]) @ pose[:3, :3]).astype(np.int64).T
             pairs.append((k, j))
-            ratios.append(np.median(np.log((greys[j][row, column] + 1.0) / (own[both] + 1.0))))
+            ratios.append(np.median(np.log((grays[j][row, column] + 1.0) / (own[both] + 1.0))))
     system = np.eye(len(maps)) * 1e-3  # images that share nothing keep their brightness
     right = np.zeros(len(maps))
     for (k, j), ratio in zip(pairs, ratios):
@@ -167,7 +167,7 @@ def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDA
     return np.where(away, -normal, normal).astype(np.float32)
 
 
-def _grey(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
+def _gray(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
     """Gray levels, not rounded: a third of the noise where only shading varies."""
     if picture.shape[:2] != found.depth.shape:
         raise SurfaceError(f"a picture of {picture.shape} does not belong to a depth map {found.depth.shape}")
@@ -188,13 +188,13 @@ def _fill_unknown(found: DepthMap) -> NDArray[np.float32]:
     return np.where(found.depth == 0, of_label[label], depth)
 
 
-def _view(k: int, found: DepthMap, grey: NDArray[np.float32]) -> View:
+def _view(k: int, found: DepthMap, gray: NDArray[np.float32]) -> View:
     rays = np.ascontiguousarray(found.intrinsics.rays() @ found.camera_to_world[:3, :3].T)
-    return View(k, rays, grey, np.full((*grey.shape, SOURCES), -1, np.int16))
+    return View(k, rays, gray, np.full((*gray.shape, SOURCES), -1, np.int16))
 
 
 def _images(
-    maps: Sequence[DepthMap], greys: Sequence[NDArray[np.float32]], planes: Sequence[Planes]
+    maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], planes: Sequence[Planes]
 ) -> Images:
     size = np.array([[m.intrinsics.width, m.intrinsics.height] for m in maps], np.int64).reshape(-1, 2)
     return Images(
@@ -203,7 +203,7 @@ def _images(
         origin=np.array([m.camera_to_world[:3, 3] for m in maps]).reshape(-1, 3),
         first=np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])]).astype(np.int64),
         size=size,
-        grey=np.concatenate([grey.ravel() for grey in greys]),
+        gray=np.concatenate([gray.ravel() for gray in grays]),
         depth=np.concatenate([found.depth.ravel() for found in planes]),
     )
 
@@ -223,11 +223,11 @@ def _offers(
     normals = np.concatenate([p.normal[s] for p, s in zip(planes, sure)])
     costs = np.concatenate([p.cost[s] for p, s in zip(planes, sure)])
     owners = np.repeat(np.arange(len(planes), dtype=np.int32), [int(s.sum()) for s in sure])
-    winner, least = np.empty(len(images.grey), np.int32), np.empty(len(images.grey), np.float32)
+    winner, least = np.empty(len(images.gray), np.int32), np.empty(len(images.gray), np.float32)
     pool.run(offer, images, points, normals, costs, owners, which == "nearest", winner, least)
     out = []
     for view, empty, first in zip(views, none, images.first):
-        won = winner[first : first + view.grey.size].reshape(view.grey.shape)
+        won = winner[first : first + view.gray.size].reshape(view.gray.shape)
         some = won >= 0
         index, ray = won[some], view.rays[some]
         along = (normals[index] * ray).sum(axis=-1)

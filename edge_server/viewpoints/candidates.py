@@ -24,7 +24,7 @@ class ViewpointError(ValueError):
 class Candidates:
     """Viewpoints to choose from.
 
-    poses: (N, 4, 4) camera-to-world, metres.
+    poses: (N, 4, 4) camera-to-world, meters.
     lens: intrinsics of the camera that is carried from one to the next.
     target: (3,) the point that is looked at; paths go round it.
     reachable: (N,) whether the robot gets there; all of them unless ``within`` says otherwise.
@@ -68,7 +68,7 @@ def half_hemisphere(
 ) -> Candidates:  # fmt: skip
     """``count`` viewpoints that cover a sector of a sphere evenly and look at its centre.
 
-    target: (3,) centre of the sphere, metres. lens: intrinsics of the camera.
+    target: (3,) centre of the sphere, meters. lens: intrinsics of the camera.
     elevations_deg, azimuths_deg: of the sector; azimuth 0 is on the target's -y side, 90 on its +x side.
     offset: shifts the azimuths, in parts of the sector: two sets of different offsets share no viewpoint.
 

@@ -21,18 +21,18 @@ Take = Callable[[int], View | None]
 
 @dataclass(frozen=True)
 class Budget:
-    """What a capture may spend: a number of views, metres of path, or both. ViewpointError for neither."""
+    """What a capture may spend: a number of views, meters of path, or both. ViewpointError for neither."""
 
     views: int | None = None
     path_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.views is None and self.path_m is None:
-            raise ViewpointError("a budget is a number of views, metres of path, or both")
+            raise ViewpointError("a budget is a number of views, meters of path, or both")
         if self.views is not None and self.views < 1:
             raise ViewpointError(f"budget: expected at least 1 view, got {self.views}")
         if self.path_m is not None and not 0.0 <= self.path_m < np.inf:
-            raise ViewpointError(f"budget: expected metres of path from 0, got {self.path_m:g}")
+            raise ViewpointError(f"budget: expected meters of path from 0, got {self.path_m:g}")
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,8 @@ def judge(taste: str, renderings: Sequence[NDArray[Any]], truths: Sequence[NDArr
 
 def _gradient(picture: Picture) -> Picture:
     """(H, W) lengths of the brightness's gradient."""
-    grey = picture.mean(axis=-1)
-    return np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    gray = picture.mean(axis=-1)
+    return np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
 
 
 def _detail(picture: Picture) -> Picture:

@@ -44,7 +44,7 @@ class StepFeatures:
     def actions(self, order: Sequence[int]) -> Array:
         """(N, F) features, named by GEOMETRY, of each candidate as the next view after those of ``order``:
         how much better all reachable directions would be seen by their nearest and by their second nearest
-        view; the way there in metres; the position, in mean distances to the target."""
+        view; the way there in meters; the position, in mean distances to the target."""
         seen = list(order)
         columns = []
         for alike in self._alike:

@@ -2,7 +2,7 @@
 
 Conventions of the whole project (loaders convert to them when they read):
 
-* poses are **camera-to-world** (``T_W^C``), in metres;
+* poses are **camera-to-world** (``T_W^C``), in meters;
 * camera axes are **OpenCV's**: x right, y down, z forward;
 * quaternions are **w first**, unit length;
 * pixel coordinates have their origin at the **corner** of the top-left pixel, so the center of that
@@ -150,7 +150,7 @@ def cross_matrix(w: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """A camera-to-world pose: unit quaternion (4,), w first, and translation (3,) in metres."""
+    """A camera-to-world pose: unit quaternion (4,), w first, and translation (3,) in meters."""
 
     quaternion: tuple[float, float, float, float]
     translation_m: tuple[float, float, float]

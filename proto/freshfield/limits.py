@@ -142,7 +142,7 @@ must not make a frame from the future the newest one until that future has come.
 # --- poses and lenses -------------------------------------------------------------------------
 
 MAX_TRANSLATION_M = 1e6
-"""From the origin, by axis: more is a wrong unit (a kilometre in millimetres) or garbage."""
+"""From the origin, by axis: more is a wrong unit (a kilometer in millimeters) or garbage."""
 
 MAX_QUATERNION_ERROR = 1e-3
 """Of a quaternion's length from 1; also of a rotation matrix from orthonormal. Real calibrations are

@@ -1,9 +1,9 @@
-"""Attacks on a live edge and emulator, while a well-behaved neighbour pushes frames to both.
+"""Attacks on a live edge and emulator, while a well-behaved neighbor pushes frames to both.
 
     PYTHONPATH=.:deploy python -m tests.chaos.attacks --json docs/results/attacks.json
 
 The first row is no attack. Each one goes on for SECONDS from a process of its own. It gives the time from
-sending to the refusal (passing 8 MB is part of it), the neighbour's time from frame to answer meanwhile, and
+sending to the refusal (passing 8 MB is part of it), the neighbor's time from frame to answer meanwhile, and
 the memory of the attacked process before, at most, and at most SETTLE_S after. Files are read by the
 attacker's process.
 """
@@ -72,7 +72,7 @@ channel:
   faults: {corruption: {probability: 0.01}}
 edge: {field: ngp, update_ms: 50, lpips: none}
 """
-NEIGHBOURS = {"edge": ("cam00", 0.02), "emulator": ("cam01", 0.05)}  # camera, seconds between frames
+NEIGHBORS = {"edge": ("cam00", 0.02), "emulator": ("cam01", 0.05)}  # camera, seconds between frames
 MINE = {"edge": "cam02", "emulator": "cam03"}
 MOST_STREAMS = MAX_STREAMS_PER_CAMERA * 5
 PUSH, EDGE = "/freshfield.v1.FrameStreamService/Push", "/freshfield.v1.EdgeService/"
@@ -321,16 +321,16 @@ ATTACKS: tuple[tuple[str, str, Run, str], ...] = (
     ("ids with terminal commands", "edge",
            pushed("edge", lambda: good(camera=MINE["edge"], session="\x1b[2J\nERROR all is lost")),
            f"{_OURS}transport.py::test_what_a_peer_says_stays_on_one_line_of_a_log"),
-    ("the neighbour's session, spoofed", "edge",
-           pushed("edge", lambda: good(camera=NEIGHBOURS["edge"][0], session="neighbour", sequence=2**63)),
+    ("the neighbor's session, spoofed", "edge",
+           pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="neighbor", sequence=2**63)),
            f"{_INGEST}another_stream_cannot_use_up_the_numbers_of_a_session"),
-    ("a second node of the neighbour's camera", "edge",
-           pushed("edge", lambda: good(camera=NEIGHBOURS["edge"][0], session="another")),
+    ("a second node of the neighbor's camera", "edge",
+           pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="another")),
            f"{_INGEST}two_nodes_of_one_name_are_told_apart_and_said"),
 )  # fmt: skip
 
 
-class Neighbour(threading.Thread):
+class Neighbor(threading.Thread):
     """Pushes a frame each ``period_s``. answers: instant, milliseconds and outcome of each."""
 
     def __init__(self, address: str, camera: str, period_s: float) -> None:
@@ -344,7 +344,7 @@ class Neighbour(threading.Thread):
             self._answered.acquire()
             time.sleep(self._period_s)
             now_ns = time.time_ns()
-            request = to_request(frame(self._camera, now_ns, now_ns, session="neighbour"))
+            request = to_request(frame(self._camera, now_ns, now_ns, session="neighbor"))
             self._sent_s = time.monotonic()
             yield request
 
@@ -382,14 +382,14 @@ def attacked(work: Path, only: str) -> dict[str, Any]:
     found = process_set(scenarios.load(file), out, page, edge_options=("--metrics-port", str(metrics)))
     to = {"edge": found.edge_address, "emulator": found.emulator_address, "metrics": f"127.0.0.1:{metrics}"}
     children = {"edge": found.edge, "emulator": found.emulator}
-    neighbours = {who: Neighbour(to[who], *about) for who, about in NEIGHBOURS.items()}
+    neighbors = {who: Neighbor(to[who], *about) for who, about in NEIGHBORS.items()}
     rows, loads = [], []
     try:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as attacker:
             for child in children.values():
                 child.start()
             wait_until(lambda: all(map(is_serving, (to["edge"], to["emulator"]))), "no start", READY_S)
-            for each in neighbours.values():
+            for each in neighbors.values():
                 each.start()
             status = out / "edge.json"
             wait_until(lambda: ((read_json(status) or {}).get("updates") or {}).get("count", 0) > 20,
@@ -414,7 +414,7 @@ def attacked(work: Path, only: str) -> dict[str, Any]:
                 rows.append({
                     "sent": sent, "at": at, "test": test, "answer": answer,
                     "times": len(times), "refused_ms": spread(times),
-                    "neighbours": {who: each.during(begun_s, over_s) for who, each in neighbours.items()},
+                    "neighbors": {who: each.during(begun_s, over_s) for who, each in neighbors.items()},
                     "memory_mb": [round(mb) for mb in (before_mb, most_mb, after_mb)],
                 })  # fmt: skip
                 print(json.dumps(rows[-1]), flush=True)
@@ -442,7 +442,7 @@ def main() -> int:
     print(json.dumps({key: value for key, value in result.items() if key != "attacks"}))
     held = all(result["alive"].values()) and not result["escapes_in_logs"] + result["tracebacks_in_logs"]
     refused = not any(row["answer"].startswith("read") for row in result["attacks"])
-    heard = all(each["frames"] for row in result["attacks"] for each in row["neighbours"].values())
+    heard = all(each["frames"] for row in result["attacks"] for each in row["neighbors"].values())
     return 0 if held and refused and heard else 1
 
 

@@ -41,7 +41,7 @@ def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path: Path) -> None
     assert not healthy("--node", str(tmp_path))
     (tmp_path / "node-cam01.json").write_text("{}")
     assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), CAMERA="cam01")
-    assert not healthy("--node", str(tmp_path), CAMERA="cam02"), "a neighbour's file is not this one's"
+    assert not healthy("--node", str(tmp_path), CAMERA="cam02"), "a neighbor's file is not this one's"
     old = time.time() - 60
     os.utime(tmp_path / "node-cam01.json", (old, old))
     assert not healthy("--node", str(tmp_path), CAMERA="cam01")

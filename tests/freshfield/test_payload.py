@@ -55,10 +55,10 @@ def test_color_is_not_subsampled_from_quality_90_up():
     assert error[90] < 0.5 * error[89]
 
 
-def test_a_grey_jpeg_or_png_comes_back_as_rgb():
-    grey = np.random.default_rng(0).integers(0, 256, (16, 16), dtype=np.uint8)
+def test_a_gray_jpeg_or_png_comes_back_as_rgb():
+    gray = np.random.default_rng(0).integers(0, 256, (16, 16), dtype=np.uint8)
     for codec, extension in (("jpeg", ".jpg"), ("png", ".png")):
-        data = cv2.imencode(extension, grey)[1].tobytes()
+        data = cv2.imencode(extension, gray)[1].tobytes()
         back = decode(data, codec, 16, 16)
         assert back.shape == (16, 16, 3) and np.ptp(back, axis=2).max() == 0
 

@@ -85,7 +85,7 @@ def test_a_target_seen_at_exactly_half_a_turn():
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_poses_in_other_units_scale_the_answer(factor):
-    """All lengths in kilometres or millimetres: the same calibration in that unit."""
+    """All lengths in kilometers or millimeters: the same calibration in that unit."""
     samples = noisy_samples(12, np.random.default_rng(2))
     hand, target = samples.hand.copy(), samples.target.copy()
     hand[:, :3, 3] *= factor
@@ -130,11 +130,11 @@ def test_wrong_samples_up_to_three_in_ten(share):
     assert distance_mm(found.x, X) < 1.5
 
 
-@pytest.mark.parametrize("rad, metres", [(1e-5, 1e-6), (0.02, 0.005), (0.1, 0.03)])
-def test_arms_from_superb_to_hopeless(rad, metres):
+@pytest.mark.parametrize("rad, meters", [(1e-5, 1e-6), (0.02, 0.005), (0.1, 0.03)])
+def test_arms_from_superb_to_hopeless(rad, meters):
     """The error stays what the answer says of itself."""
     ratios = []
     for k in range(12):
-        found = refine(noisy_samples(20, np.random.default_rng([8, k]), rad, metres))
+        found = refine(noisy_samples(20, np.random.default_rng([8, k]), rad, meters))
         ratios.append(distance_mm(found.x, X) / found.std_mm)
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6

@@ -10,7 +10,7 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.embed.cache import EmbeddingCache
-from edge_server.embed.letterbox import GREY, letterbox
+from edge_server.embed.letterbox import GRAY, letterbox
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
 from freshfield.frame import BufferedFrame
@@ -22,7 +22,7 @@ RNG = np.random.default_rng(3)
 HARD = {
     "black": np.zeros((128, 128, 3), np.uint8),
     "white": np.full((128, 128, 3), 255, np.uint8),
-    "grey": np.full((128, 128, 3), GREY, np.uint8),
+    "gray": np.full((128, 128, 3), GRAY, np.uint8),
     "one pixel": np.full((1, 1, 3), 200, np.uint8),
     "one row": RNG.integers(0, 256, (1, 4096, 3), dtype=np.uint8),
     "one column": RNG.integers(0, 256, (4096, 1, 3), dtype=np.uint8),
@@ -39,7 +39,7 @@ def shipped():
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_every_picture_has_a_finite_embedding_that_its_neighbours_do_not_change(shipped, name):
+def test_every_picture_has_a_finite_embedding_that_its_neighbors_do_not_change(shipped, name):
     alone = shipped.embed([HARD[name]])
     assert alone.shape == (1, shipped.dim) and np.isfinite(alone).all() and alone.any()
     # Far from anything trained on, and still of the size of embeddings: no picture swamps a policy's state.

@@ -20,7 +20,7 @@ HARD = {
     "white": np.ones((40, 40, 3)),
     "nearly black": np.full((40, 40, 3), 1e-300),
     "subnormal": np.full((40, 40, 3), 5e-324),
-    "grey": np.full((40, 40, 3), 0.1),
+    "gray": np.full((40, 40, 3), 0.1),
     "one pixel": np.pad(np.ones((1, 1, 3)), ((20, 19), (20, 19), (0, 0))),
     "checkers": np.indices((40, 40)).sum(0)[..., None].repeat(3, 2) % 2 * 1.0,
     "noise": RNG.random((40, 40, 3)),
@@ -44,7 +44,7 @@ def test_equal_images_score_the_ceiling_and_one(name):
 
 def test_ssim_of_two_constant_images_is_the_luminance_term_alone():
     expected = (2 * 0.1 * 1.0 + 1e-4) / (0.1**2 + 1.0**2 + 1e-4)
-    assert ssim(HARD["grey"], HARD["white"]) == pytest.approx(expected, abs=1e-12)
+    assert ssim(HARD["gray"], HARD["white"]) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("level", [0.1, 0.3, 1 / 3, 0.7, 1.0])

@@ -51,8 +51,8 @@ def test_pictures_of_one_row_and_of_one_column(name: str) -> None:
 
 
 @every_field
-def test_a_scene_ten_kilometres_away_is_learned_as_here(name: str) -> None:
-    """A float32 of ten kilometres has steps of a millimetre."""
+def test_a_scene_ten_kilometers_away_is_learned_as_here(name: str) -> None:
+    """A float32 of ten kilometers has steps of a millimeter."""
     away = np.eye(4)
     away[:3, 3] = 1e4, -1e4, 1e4
     views = [replace(v, camera_to_world=away @ v.camera_to_world) for v in VIEWS]
@@ -86,7 +86,7 @@ def test_two_hundred_cameras(name: str) -> None:
 
 
 @every_field
-def test_cameras_a_ten_millionth_of_a_metre_apart_and_from_straight_down(name: str) -> None:
+def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: str) -> None:
     for eye in ((2.5, 0.0, 1.0), (0.0, 0.0, 2.5)):
         poses = [
             look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)

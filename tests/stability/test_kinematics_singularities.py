@@ -15,7 +15,7 @@ angles = st.floats(-math.pi, math.pi, allow_subnormal=False)
 
 
 def check(q):
-    """Every posture that is found reaches the target to a nanometre, and there is one."""
+    """Every posture that is found reaches the target to a nanometer, and there is one."""
     target = UR3E.forward(q)
     found = UR3E.inverse(target, near=q)
     assert found

@@ -322,7 +322,7 @@ def _views(stage_s: float, cameras: Sequence[View], away: NDArray[np.float64]) -
     return views
 
 
-def test_ten_kilometres_away_it_is_shown_as_here() -> None:
+def test_ten_kilometers_away_it_is_shown_as_here() -> None:
     away = np.eye(4)
     away[:3, 3] = 1e4, -1e4, 1e4
     shown_db = []

@@ -61,7 +61,7 @@ def _room() -> NDArray[np.uint8]:
     return scene.render(next(iter(scene.cameras)), 0.0)
 
 
-def _a_metre_off(view: View, update: int) -> View:
+def _a_meter_off(view: View, update: int) -> View:
     pose = view.camera_to_world.copy()
     pose[:3, 3] += pose[:3, 0]
     return replace(view, camera_to_world=pose)
@@ -73,18 +73,18 @@ def _turned(view: View, update: int) -> View:
     return replace(view, camera_to_world=pose)
 
 
-def _in_millimetres(view: View, update: int) -> View:
+def _in_millimeters(view: View, update: int) -> View:
     pose = view.camera_to_world.copy()
     pose[:3, 3] *= 1000.0
     return replace(view, camera_to_world=pose)
 
 
 PICTURES: list[Poison] = [_noise, _black, _inverted, _another_scene]
-POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
+POSES: list[Poison] = [_a_meter_off, _turned, _in_millimeters]
 
 
 def each_with(
-    poisons: list[Poison], soon: list[Poison], in_slow_tests: tuple[Poison, ...] = (_noise, _in_millimetres)
+    poisons: list[Poison], soon: list[Poison], in_slow_tests: tuple[Poison, ...] = (_noise, _in_millimeters)
 ) -> pytest.MarkDecorator:
     """Every poison with splat and voxel. Networks take ten times as long, and share with voxel what refuses
     views: they meet ``in_slow_tests`` there, for one update, and ngp meets ``soon`` besides."""
@@ -150,7 +150,7 @@ def _finite(field: Any) -> None:
     assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
 
 
-@each_with(PICTURES + POSES, soon=[_noise, _a_metre_off])
+@each_with(PICTURES + POSES, soon=[_noise, _a_meter_off])
 def test_a_poisoned_view_is_survived(name: str, poison: Poison) -> None:
     _survives(name, poison, 1)
 
@@ -171,7 +171,7 @@ def _survives(name: str, poison: Poison, updates: int) -> None:
     assert expected > 22.0 and deployment.score() > expected - WITHIN_DB
 
 
-@each_with(PICTURES + POSES, soon=[_in_millimetres], in_slow_tests=(_in_millimetres,))
+@each_with(PICTURES + POSES, soon=[_in_millimeters], in_slow_tests=(_in_millimeters,))
 def test_poison_in_the_very_first_update_is_survived(name: str, poison: Poison) -> None:
     """Before anything is known, and where the scene's box is found."""
     deployment = Deployment(field_of(name))
@@ -270,7 +270,7 @@ def _in_motion(poison: Poison | None, updates: int = 3) -> tuple[Shown, Shown]:
     return result[0], result[1]
 
 
-@pytest.mark.parametrize("poison", [*PICTURES, _a_metre_off])
+@pytest.mark.parametrize("poison", [*PICTURES, _a_meter_off])
 def test_what_moves_is_not_made_of_poison(poison: Poison) -> None:
     """A wrong picture differs everywhere from the one before it and the one after: nothing moved there."""
     (now, guests), (later, guests_later) = _in_motion(poison)

@@ -19,7 +19,7 @@ skimage = pytest.importorskip("skimage", reason="scikit-image is not installed (
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
 RNG = np.random.default_rng(11)
-GREY = np.full((64, 64, 3), 90, np.uint8)
+GRAY = np.full((64, 64, 3), 90, np.uint8)
 
 
 def with_depth(found: DepthMap, depth: np.ndarray) -> DepthMap:
@@ -102,7 +102,7 @@ def test_a_million_equal_maps_would_not_overflow():
 def test_a_camera_within_the_surface_and_one_behind_it():
     inside = np.eye(4)
     inside[:3, 3] = (0.0, 0.0, 0.05)
-    look = depth_map(np.full((64, 64), 0.04, np.float32), GREY, inside, LENS)
+    look = depth_map(np.full((64, 64), 0.04, np.float32), GRAY, inside, LENS)
     volume = fuse_maps(GRID, [look, *ball_maps(8)])
     assert np.isfinite(volume.blocks.distance).all()
 
@@ -143,8 +143,8 @@ def test_pictures_of_noise_do_not_make_a_surface_anywhere_else():
 
 def test_cameras_that_see_nothing_in_common_are_left_as_they_are():
     pose = poses_around(1)[0]
-    alone = [depth_map(ball_depth(LENS, pose), GREY, pose, LENS)]
-    (found,) = refine_depth(alone, [GREY])
+    alone = [depth_map(ball_depth(LENS, pose), GRAY, pose, LENS)]
+    (found,) = refine_depth(alone, [GRAY])
     assert found.seen.sum() > 0.8 * alone[0].seen.sum()
     np.testing.assert_array_equal(found.depth[found.seen], alone[0].depth[found.seen])
 
@@ -160,7 +160,7 @@ def test_depth_refined_by_pictures_of_nothing(kind):
     """Bounded depth, and never NaN: nothing lies farther from where it was than is searched."""
     pictures = {
         "black": lambda k: np.zeros((64, 64, 3), np.uint8),
-        "plain": lambda k: GREY,
+        "plain": lambda k: GRAY,
         "noise": lambda k: RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8),
         "contradictory": lambda k: np.full((64, 64, 3), 255 * (k % 2), np.uint8),
     }

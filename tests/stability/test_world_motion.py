@@ -27,7 +27,7 @@ def test_the_world_repeats_however_late_it_is(turns):
     for t in (0.0, 0.3, 2.0, 4.7):
         early, late = scene.render("cam02", t), scene.render("cam02", t + turns * scene.period_s)
         difference = np.abs(early.astype(int) - late)
-        # 1e9 s has a resolution of 1e-7 s: edges move by nanometres, a ray in a thousand may flip.
+        # 1e9 s has a resolution of 1e-7 s: edges move by nanometers, a ray in a thousand may flip.
         assert (difference > 2).mean() < 2e-3
 
 

@@ -57,7 +57,7 @@ def test_any_ray_hits_within_the_bounding_sphere_or_misses(shape, origin, direct
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
 def test_size_does_not_matter(shape, scale):
-    """The same picture at any scale: the shape a micrometre or a thousand kilometres across."""
+    """The same picture at any scale: the shape a micrometer or a thousand kilometers across."""
     rng = np.random.default_rng(0)
     aim = rng.uniform(-0.8, 0.8, (3, 500)) - np.array([[1.5], [-1.2], [1.0]])
     d = aim / np.linalg.norm(aim, axis=0)

@@ -56,11 +56,11 @@ class CapsuleModel:
 
     @property
     def radii(self) -> Array:
-        """(8,) metres, in the order of PARTS."""
+        """(8,) meters, in the order of PARTS."""
         return np.array([*_RADII_M, self.tool_radius_m])
 
     def clearance(self, frames: Array) -> tuple[Array, Array]:
-        """Clearances in metres, from the ``link_frames`` (T, 7, 4, 4) of the arm's ``nominal_model``: (T,
+        """Clearances in meters, from the ``link_frames`` (T, 7, 4, 4) of the arm's ``nominal_model``: (T,
         pairs) between the surfaces of PAIRS, negative where they overlap, and the height (T,) of the lowest
         point beyond the upper arm."""
         a, b = self.segments(frames)

@@ -3,7 +3,7 @@
 ``camera-node calibrate hand-eye --out FILE`` writes the file::
 
     setup: eye-in-hand             # or eye-to-hand: the camera stands still, the hand holds the target
-    transform: [[...], [...], [...], [0, 0, 0, 1]]   # camera in hand (4.2), or camera in base; metres
+    transform: [[...], [...], [...], [0, 0, 0, 1]]   # camera in hand (4.2), or camera in base; meters
     time_offset_s: 0.0             # the arm's stamp of an instant minus the camera's
     ...                            # details of the calibration, for people
 """
@@ -36,7 +36,7 @@ class HandEye:
     """A hand-eye calibration.
 
     setup: one of ``SETUPS``.
-    transform: (4, 4), metres: T_EE^C for eye-in-hand, T_B^C for eye-to-hand.
+    transform: (4, 4), meters: T_EE^C for eye-in-hand, T_B^C for eye-to-hand.
     time_offset_s: the arm's stamp of an instant minus the camera's.
     details: the file's other keys.
     """

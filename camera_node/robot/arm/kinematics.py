@@ -69,8 +69,8 @@ class ArmModel:
     @property
     def nominal_model(self) -> ArmModel:
         """The uncalibrated model. Its link frames lie within the arm's parts, as clearances require. Those
-        of a calibrated model do not: the factory's fit puts metres into lengths along parallel axes, which
-        nearly cancel at the flange, so the elbow's frame may lie metres away."""
+        of a calibrated model do not: the factory's fit puts meters into lengths along parallel axes, which
+        nearly cancel at the flange, so the elbow's frame may lie meters away."""
         return self.nominal or self
 
     def link_frames(self, joints: ArrayLike) -> Array:
@@ -107,7 +107,7 @@ class ArmModel:
         return tuple(name for name, f, limit in zip(names, factors, limits) if abs(f) < limit)
 
     def singularity_factors(self, joints: ArrayLike) -> tuple[float, float, float]:
-        """Factors of the Jacobian's determinant: shoulder (metres), elbow and wrist (sines)."""
+        """Factors of the Jacobian's determinant: shoulder (meters), elbow and wrist (sines)."""
         base = self.nominal_model
         q = _check_joints(joints)
         reach = (
@@ -199,7 +199,7 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
 
     The controller stores the file in ``/root/.urcontrol/``. It is an INI file whose section ``mounting`` has
     ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, each a list of six numbers (radians and
-    metres) to add to the data sheet's Denavit-Hartenberg parameters. A missing list is zero. Raises
+    meters) to add to the data sheet's Denavit-Hartenberg parameters. A missing list is zero. Raises
     KinematicsError, also for a file without any of them.
     """
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
@@ -277,7 +277,7 @@ def _dh_transform(theta: float, d: float, a: float, alpha: float) -> Array:
 
 
 def pose_difference(now: Array, wanted: Array) -> Array:
-    """Difference (6,) from pose ``now`` to pose ``wanted``, both (4, 4), in base axes: metres, then a
+    """Difference (6,) from pose ``now`` to pose ``wanted``, both (4, 4), in base axes: meters, then a
     rotation vector in radians."""
     return np.concatenate([wanted[:3, 3] - now[:3, 3], so3_log(wanted[:3, :3] @ now[:3, :3].T)])
 

@@ -35,9 +35,9 @@ too. Motions that do not determine it are refused with the reason.
 
 from, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
-                 theta u], metres and radians)
+                 theta u], meters and radians)
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
-  --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, metres); the time offset is estimated too
+  --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
   --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when there is
                  enough; with --drive the arm moves by itself. Hand poses come from the camera's source
                  (without hand_eye), or from --hand CSV, by seconds since the first frame

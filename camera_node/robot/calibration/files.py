@@ -77,14 +77,14 @@ def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
 
 
 def read_track(file: Path) -> Track:
-    """Read poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), with or without a header, and sort them by stamp.
+    """Read poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, meters), with or without a header, and sort them by stamp.
     Raises TrajectoryError and CalibrationError."""
     times, poses = read_samples(file)
     return sorted_track(times, [pose.matrix() for pose in poses], f"poses in {file}")
 
 
 def read_visp_pose(file: Path) -> Array:
-    """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in metres and radians. Raises
+    """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in meters and radians. Raises
     CalibrationError."""
     try:
         data = read_yaml(file.read_text())

@@ -6,7 +6,7 @@
     qr:60mm[:TEXT]                     side of the code; its text (default: any)
 
 Target axes: origin at the top left corner of the printed pattern (of a chessboard: the first inner corner),
-x to the right, y down, z away from the viewer, metres.
+x to the right, y down, z away from the viewer, meters.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class TargetPose:
 
     pose: (4, 4) target in camera.
     error_px: root mean square of the reprojection errors.
-    unit_covariance: (6, 6) of rotation (radians, target axes) and translation (metres, camera axes) for one
+    unit_covariance: (6, 6) of rotation (radians, target axes) and translation (meters, camera axes) for one
         pixel of noise in each coordinate of a corner.
     corners: those that it was estimated from.
     """
@@ -138,7 +138,7 @@ def _charuco(
     name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50", *extra: str
 ) -> Target:
     across, down = _counts(squares)
-    side, inner = _metres(square), _metres(marker)
+    side, inner = _meters(square), _meters(marker)
     if not inner < side or extra:
         raise ValueError("the markers must be smaller than the squares")
     board = cv2.aruco.CharucoBoard((across, down), side, inner, _dictionary(f"DICT_{dictionary.upper()}"))
@@ -163,7 +163,7 @@ def _charuco(
 
 def _chessboard(name: str, corners: str, square: str) -> Target:
     across, down = _counts(corners)
-    side = _metres(square)
+    side = _meters(square)
     if (across + down) % 2 == 0:
         raise ValueError("one of the numbers of corners must be odd and the other even, or up looks as down")
     y, x = np.mgrid[0:down, 0:across].reshape(2, -1) * side
@@ -200,7 +200,7 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
 def _apriltag(name: str, family: str, number: str, size: str) -> Target:
     if family.lower() not in _FAMILIES:
         raise ValueError(f"the families are {', '.join(_FAMILIES)}")
-    side, wanted = _metres(size), int(number)
+    side, wanted = _meters(size), int(number)
     dictionary = _dictionary(f"DICT_APRILTAG_{family.upper()}")
     if not 0 <= wanted < len(dictionary.bytesList):
         raise ValueError(f"family {family} has numbers 0 to {len(dictionary.bytesList) - 1}")
@@ -220,7 +220,7 @@ def _apriltag(name: str, family: str, number: str, size: str) -> Target:
 
 
 def _qr(name: str, size: str, *text: str) -> Target:
-    side, wanted = _metres(size), ":".join(text)
+    side, wanted = _meters(size), ":".join(text)
     detector = cv2.QRCodeDetector()
 
     def find(picture: GrayImage) -> Corners | None:
@@ -268,7 +268,7 @@ def _counts(text: str) -> tuple[int, int]:
     return across, down
 
 
-def _metres(text: str) -> float:
+def _meters(text: str) -> float:
     units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
     unit = next((u for u in units if text.endswith(u)), None)
     if unit is None:

@@ -15,7 +15,7 @@ SOLVERS = ("auto", "pink", "dls")
 class TeleopConfig(Bounded):
     """How a stylus moves the arm. Positions are those of the flange, in the axes of the arm's base.
 
-    scale: S of (4.1): metres of the arm per metre of the stylus, along each axis of the base.
+    scale: S of (4.1): meters of the arm per meter of the stylus, along each axis of the base.
     yaw_deg: rotation of the stylus's axes about the vertical.
     orientation: whether the arm turns with the stylus.
     rate_hz: joint targets per second, 20 to 500.

@@ -83,7 +83,7 @@ class PoseIntegrator:
         return StylusSample(now_ns, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), clutch)
 
     def shift(self, distance: Array, turn: Array) -> None:
-        """Move by a distance (3,) in metres and a rotation vector (3,) in radians."""
+        """Move by a distance (3,) in meters and a rotation vector (3,) in radians."""
         half = 0.5 * FARTHEST_M  # with the clutch open it may move without end
         self.position = np.clip(self.position + distance, -half, half)
         turned = matrix_to_quaternion(so3_exp(turn))

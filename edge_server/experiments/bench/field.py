@@ -228,7 +228,7 @@ def _render_ms(field: Field, pose: Any, lens: Pinhole) -> float:
 
 def draw(figures: dict[str, Any], path: Path) -> None:
     """PSNR against seconds from scratch, a panel a scene, a line a representation, to ``path`` (PNG)."""
-    from edge_server.report.style import CYCLE, GREY, figure, label_lines
+    from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
     scenes = [name for name, part in figures.items() if isinstance(part, dict) and "scene" in part]
     if not scenes:
@@ -243,7 +243,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
                 line = ".-" if k < len(CYCLE) else ".--"
                 ax.plot(x, y, line, color=CYCLE[k % len(CYCLE)], label=name)
             known = [v for v in part["baseline"].values() if v is not None]
-            ax.axhline(max(known), color=GREY, linestyle=":", linewidth=1.2, label="needs no field")
+            ax.axhline(max(known), color=GRAY, linestyle=":", linewidth=1.2, label="needs no field")
             ax.set_xscale("log")
             ax.xaxis.set_major_formatter("{x:g}")
             ax.xaxis.set_minor_formatter("{x:g}")
@@ -263,7 +263,7 @@ def table(figures: dict[str, Any]) -> str:
     bases = [
         (
             part["scene"], f"{part['angle_deg']:.1f}",
-            *(number(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
+            *(number(part["baseline"][key], 1) for key in ("mean_color_db", "nearest_view_db")),
         )
         for part in scenes.values()
     ]  # fmt: skip

@@ -182,7 +182,7 @@ def _cut(cut: Foreground, view: View) -> View:
 
 
 def _with_alpha(seen: View, view: View) -> View:
-    """``seen`` with the true mask: the object's edges carry the background's colour, as with any mask."""
+    """``seen`` with the true mask: the object's edges carry the background's color, as with any mask."""
     mask = true_mask(view)
     image = np.dstack([np.where(mask[..., None], seen.image, 0), np.where(mask, 255, 0)]).astype(np.uint8)
     return dataclasses.replace(seen, image=image)

@@ -258,7 +258,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
 def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
     """The lines of all runs and the markers of the fresh fits. of_scene: see ``_runs``, without the scene."""
-    from edge_server.report.style import CYCLE, GREY
+    from edge_server.report.style import CYCLE, GRAY
 
     names = list(dict.fromkeys(name for name, *_ in of_scene))
     runs = list(dict.fromkeys(run for _, run, *_ in of_scene))
@@ -271,7 +271,7 @@ def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
             ax.plot(*_fresh(rows, metric), "o", color=color, markersize=4.5, label=f"{name}, fresh")
     name, _, _, rows = of_scene[0]
     still = _fresh(rows, f"not_updated_{metric}")
-    ax.plot(*still, "x", color=GREY, markersize=4.5, label=f"{name}, never updated")
+    ax.plot(*still, "x", color=GRAY, markersize=4.5, label=f"{name}, never updated")
 
 
 def _fresh(rows: Mapping[str, Any], key: str) -> tuple[list[int], list[float]]:
@@ -301,7 +301,7 @@ def table(figures: dict[str, Any]) -> str:
             f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
             _both(whole, moving, "median_db"),
             f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
-            ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
+            ", ".join(_db(bases[key]) for key in ("mean_color_db", "nearest_view_db")),
             _db(of_field.get("outside_cores")),
         ))  # fmt: skip
     return markdown_table(head.split("|"), rows)

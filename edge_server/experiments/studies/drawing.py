@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.study import METRICS, Curve, StudyRequest, Table
 from edge_server.experiments.studies.trial import Trial, last_images
-from edge_server.report.style import CYCLE, GREY, figure, label_lines
+from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
 Image = NDArray[np.uint8]
 _HEIGHT = 220  # pixels of an image in a figure
@@ -22,16 +22,14 @@ _HEIGHT = 220  # pixels of an image in a figure
 def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
     """Draw the means of a curve with the band of their intervals.
 
-    place: number of the curve in its panel, which chooses its colour and line style.
+    place: number of the curve in its panel, which chooses its color and line style.
     """
     xs, ys = list(curve), [interval(values.values()) for values in curve.values()]
-    colour = CYCLE[place % len(CYCLE)]
-    axes.plot(xs, [y.mean for y in ys], marker="o", markersize=3, color=colour, label=label,
+    color = CYCLE[place % len(CYCLE)]
+    axes.plot(xs, [y.mean for y in ys], marker="o", markersize=3, color=color, label=label,
               linestyle="-" if place < len(CYCLE) else "--")  # fmt: skip
     if all(y.count > 1 for y in ys):
-        axes.fill_between(
-            xs, [y.low for y in ys], [y.high for y in ys], color=colour, alpha=0.15, linewidth=0
-        )
+        axes.fill_between(xs, [y.low for y in ys], [y.high for y in ys], color=color, alpha=0.15, linewidth=0)
 
 
 def draw_metrics(
@@ -55,7 +53,7 @@ def draw_metrics(
                 level = interval(table.values(metric, **labels).values())
                 if level.count:
                     style = (":", "--", "-.")[k % 3]
-                    at.axhline(level.mean, color=GREY, linestyle=style, linewidth=1.2, label=label)
+                    at.axhline(level.mean, color=GRAY, linestyle=style, linewidth=1.2, label=label)
             last = metric == measured[-1]
             label_lines(
                 at, METRICS[metric].label.replace(", ", ",\n"), axis if last else None,

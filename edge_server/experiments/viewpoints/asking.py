@@ -30,7 +30,7 @@ from freshfield.transport import Transport
 ANSWERS = "answers.json"
 SHOWN_S = 10.0  # that the page has to fetch the plan, before the server ends
 ShowPlan = Callable[[list[str], bytes], None]
-VIEWS = 8  # of a reconstruction, where the budget is of metres only
+VIEWS = 8  # of a reconstruction, where the budget is of meters only
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""``edge-server viewpoints``: plans the capture of a scenario within a budget of views or metres of path."""
+"""``edge-server viewpoints``: plans the capture of a scenario within a budget of views or meters of path."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def read_budget(text: str) -> Budget:
-    """``8`` is views, ``2.5m`` metres of path, ``8,2.5m`` both. Raises OptionError or ViewpointError."""
+    """``8`` is views, ``2.5m`` meters of path, ``8,2.5m`` both. Raises OptionError or ViewpointError."""
     views: int | None = None
     path_m: float | None = None
     try:
@@ -121,7 +121,7 @@ def read_budget(text: str) -> Budget:
             else:
                 views = int(word)
     except ValueError:
-        raise OptionError(f"--budget {text}: expected views (8), metres (2.5m) or both (8,2.5m)") from None
+        raise OptionError(f"--budget {text}: expected views (8), meters (2.5m) or both (8,2.5m)") from None
     return Budget(views, path_m)
 
 
@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("viewpoints", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
-    add("--budget", required=True, metavar="N|Dm|N,Dm", help="views, metres of path, or both")
+    add("--budget", required=True, metavar="N|Dm|N,Dm", help="views, meters of path, or both")
     add("--selector", default="coverage", metavar="NAME", help="[%(default)s]")
     add("--travel", type=float, default=0.2, metavar="W",
         help="of the way against the value, as shares of their ranges; 0: none [%(default)g]")  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_server.experiments.viewpoints.stage import Stage
-from edge_server.report.style import CYCLE, GREY, INK, figure
+from edge_server.report.style import CYCLE, GRAY, INK, figure
 from edge_server.viewpoints.capture_planner import Plan
 
 _A_ROW = 3  # plans
@@ -29,8 +29,8 @@ def draw_plan(path: Path, stage: Stage, plans: Sequence[tuple[str, Plan]]) -> No
             none = np.full(len(candidates), np.nan)
             values = plan.stops[-1].values if len(plan.stops) > 1 else none
             known, lost = np.isfinite(values), ~candidates.reachable
-            at.scatter(x[lost], y[lost], marker="x", s=14, color=GREY, linewidths=0.8, label="not reachable")
-            at.scatter(x[~lost & ~known], y[~lost & ~known], s=10, color=GREY, label="taken or closed")
+            at.scatter(x[lost], y[lost], marker="x", s=14, color=GRAY, linewidths=0.8, label="not reachable")
+            at.scatter(x[~lost & ~known], y[~lost & ~known], s=10, color=GRAY, label="taken or closed")
             shown = at.scatter(x[known], y[known], c=values[known], s=16, cmap="viridis")
             if known.any() and len(plans) == 1:
                 fig.colorbar(shown, ax=at, label="value at the last choice")

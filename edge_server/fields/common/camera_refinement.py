@@ -93,7 +93,7 @@ class PoseCorrections:
     finite differences of the rendered colors by small motions of the camera, so any representation will do.
     The mean correction of all cameras is kept at 0: the scene stays where it is.
 
-    most_m, most_deg: largest shift in metres and largest rotation in degrees.
+    most_m, most_deg: largest shift in meters and largest rotation in degrees.
     """
 
     def __init__(self, most_m: float, most_deg: float) -> None:

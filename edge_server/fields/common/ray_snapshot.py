@@ -23,7 +23,7 @@ SOLID = 0.5  # opacity from which on a ray has met a surface
 
 
 Pixels = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""Color (N, 3), depth (N,) in metres and opacity (N,) at N image points."""
+"""Color (N, 3), depth (N,) in meters and opacity (N,) at N image points."""
 
 
 class PixelSnapshot(ABC):
@@ -50,7 +50,7 @@ class PixelSnapshot(ABC):
         return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """At most ``count`` points (N, 3) in world metres and colors (N, 3): where the rays of evenly spaced
+        """At most ``count`` points (N, 3) in world meters and colors (N, 3): where the rays of evenly spaced
         pixels of ``cameras`` meet a surface."""
         positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
         share = max(count // max(len(self.cameras), 1), 1)

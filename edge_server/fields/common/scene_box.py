@@ -49,7 +49,7 @@ class SceneBox:
         return (4.0 if self.contracted else 2.0) * self.radius_m / self.pixel_m
 
     def normalise(self, points_m: Array) -> Array:
-        """World metres (..., 3) -> scene units."""
+        """World meters (..., 3) -> scene units."""
         return (points_m - np.asarray(self.centre_m)) / self.radius_m
 
 
@@ -155,7 +155,7 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
     if astray[first] >= AGREED or 4 * np.count_nonzero(~kept) > len(origins):
         return None
     point = converging_point(origins[kept], axes[kept])
-    # From very far away, a camera may look past the point by kilometres at a small angle.
+    # From very far away, a camera may look past the point by kilometers at a small angle.
     return point if point is not None and _agreed(origins, axes, point) else points[first]
 
 
@@ -192,7 +192,7 @@ def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
 
 
 def _seen_radius(views: Sequence[View], centre: Array) -> float:
-    """Radius in metres of the ball around ``centre`` that nine of ten cameras see whole."""
+    """Radius in meters of the ball around ``centre`` that nine of ten cameras see whole."""
     radii = []
     for view in views:
         camera = view.intrinsics

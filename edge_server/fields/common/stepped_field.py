@@ -104,7 +104,7 @@ class SteppedField(ABC, Generic[S]):
         return self.snapshot().render(camera_to_world, intrinsics)
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world metres and their colors; none before the first fit."""
+        """Surface points in world meters and their colors; none before the first fit."""
         return self.snapshot().points(count)
 
     def snapshot(self, present_ns: int | None = None) -> S:

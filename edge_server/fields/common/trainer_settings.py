@@ -19,7 +19,7 @@ BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """What all representations share. Lengths in metres; None means: found from the cameras."""
+    """What all representations share. Lengths in meters; None means: found from the cameras."""
 
     name: ClassVar[str]
     has_cuda: ClassVar[bool] = False  # whether the representation runs on a GPU, too
@@ -148,7 +148,7 @@ class TrainerSettings(FieldSettings):
 
 @dataclass(frozen=True)
 class HashGridSettings(TrainerSettings):
-    """What representations with a hash grid add. Lengths in metres; None means: found from the cameras."""
+    """What representations with a hash grid add. Lengths in meters; None means: found from the cameras."""
 
     levels: int = option(8, "levels of the hash grid, coarse to fine")
     log2_table: int = option(16, "largest number of vertices a level stores, as a power of two")

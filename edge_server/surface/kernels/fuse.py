@@ -22,8 +22,8 @@ class KernelDepth(NamedTuple):
     """One depth map as the kernel reads it.
 
     lens: float64 (8,), fx fy cx cy k1 k2 p1 p2.
-    rotation: float64 (3, 3), camera-to-world. origin: float64 (3,), metres.
-    depth: float32 (H, W), metres along the ray, 0 where unknown, FAR where the ray meets nothing.
+    rotation: float64 (3, 3), camera-to-world. origin: float64 (3,), meters.
+    depth: float32 (H, W), meters along the ray, 0 where unknown, FAR where the ray meets nothing.
     trust: float32 (H, W), w_new of (3.9). cosine: float32 (H, W), between ray and normal.
     color: uint8 (H, W, 3).
     """
@@ -41,9 +41,9 @@ class Blocks(NamedTuple):
     """B blocks of SIDE^3 voxels, x slowest.
 
     place: int32 (B, 3), position of each block in the grid, in blocks.
-    lowest: float64 (3,), centre of voxel (0, 0, 0), metres.
-    distance, weight: float32 (B, CELLS), metres and weights of (3.9) and (3.10).
-    color: float32 (B, CELLS, 4), sums of weighted colours in [0, 255] and of their weights.
+    lowest: float64 (3,), centre of voxel (0, 0, 0), meters.
+    distance, weight: float32 (B, CELLS), meters and weights of (3.9) and (3.10).
+    color: float32 (B, CELLS, 4), sums of weighted colors in [0, 255] and of their weights.
     """
 
     place: NDArray[np.int32]

@@ -44,7 +44,7 @@ class Images(NamedTuple):
     lens: float64 (N, 8), fx fy cx cy k1 k2 p1 p2.
     rotation, origin: float64 (N, 3, 3), camera-to-world, and (N, 3), meters.
     first: int64 (N + 1,), each image's first pixel. size: int64 (N, 2), width and height.
-    grey, depth: float32 (P,), row by row: gray levels, and meters along the ray (0: unknown).
+    gray, depth: float32 (P,), row by row: gray levels, and meters along the ray (0: unknown).
     """
 
     lens: NDArray[np.float64]
@@ -52,20 +52,20 @@ class Images(NamedTuple):
     origin: NDArray[np.float64]
     first: NDArray[np.int64]
     size: NDArray[np.int64]
-    grey: NDArray[np.float32]
+    gray: NDArray[np.float32]
     depth: NDArray[np.float32]
 
 
 class View(NamedTuple):
     """The image whose planes are sought.
 
-    index: its number in ``Images``. rays: float64 (H, W, 3), world, unit. grey: float32 (H, W).
+    index: its number in ``Images``. rays: float64 (H, W, 3), world, unit. gray: float32 (H, W).
     chosen: int16 (H, W, SOURCES), images to compare each pixel with, best first; -1: none.
     """
 
     index: int
     rays: NDArray[np.float64]
-    grey: NDArray[np.float32]
+    gray: NDArray[np.float32]
     chosen: NDArray[np.int16]
 
 
@@ -195,17 +195,17 @@ def _pattern(across, down, fade):
 
 
 @part
-def _take_patch(grey, row, column, across, down, fade, patch, weight):
+def _take_patch(gray, row, column, across, down, fade, patch, weight):
     """Write a pixel's patch, less its weighted mean, and its weights; returns sum of weights, mean and
     variance. Taps similar to the middle weigh more, taps outside nothing."""
-    height, width = grey.shape
+    height, width = gray.shape
     total = mean = spread = np.float32(0.0)
     for t in range(LANES):
         r, c = row + np.int64(down[t]), column + np.int64(across[t])
         g, w = np.float32(0.0), np.float32(0.0)
         if r >= 0 and c >= 0 and r < height and c < width:
-            g = grey[r, c]
-            w = exp32(-abs(g - grey[row, column]) / SIMILAR) * fade[t]
+            g = gray[r, c]
+            w = exp32(-abs(g - gray[row, column]) / SIMILAR) * fade[t]
         patch[t], weight[t] = g, w
         total += w
         mean += w * g
@@ -221,7 +221,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
     """Cost of the plane through depth d with a normal: mean of the two images that differ least; and how many
     of these there are: 0 (the cost is WORST), 1 or 2. facts: what ``_take_patch`` returned for the pixel."""
     k, rays = view.index, view.rays
-    height, width = view.grey.shape
+    height, width = view.gray.shape
     total, mean, spread = facts
     # A pixel to the right and one down, or their opposites at the border.
     right, below = 1 if column < width - 1 else -1, 1 if row < height - 1 else -1
@@ -261,9 +261,9 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
             fa, fb = p - np.float32(px), q - np.float32(py)
             at = np.uint32(first + np.uint32(py * stride + px))
             under = np.uint32(at + np.uint32(stride))
-            top = images.grey[at] + fa * (images.grey[np.uint32(at + np.uint32(1))] - images.grey[at])
-            low = images.grey[under]
-            low += fa * (images.grey[np.uint32(under + np.uint32(1))] - low)
+            top = images.gray[at] + fa * (images.gray[np.uint32(at + np.uint32(1))] - images.gray[at])
+            low = images.gray[under]
+            low += fa * (images.gray[np.uint32(under + np.uint32(1))] - low)
             g = top + fb * (low - top) - mean
             w = weight[t]
             level += w * g
@@ -371,7 +371,7 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
             d = np.float64(planes.depth[row, column])
             if not d > 0.0 or view.chosen[row, column, 0] < 0:
                 continue
-            facts = _take_patch(view.grey, row, column, across, down, fade, patch, weight)
+            facts = _take_patch(view.gray, row, column, across, down, fade, patch, weight)
             rx, ry, rz = view.rays[row, column, 0], view.rays[row, column, 1], view.rays[row, column, 2]
             nx = np.float64(planes.normal[row, column, 0])
             ny = np.float64(planes.normal[row, column, 1])
@@ -392,7 +392,7 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                 there = qx * view.rays[r, c, 0] + qy * view.rays[r, c, 1] + qz * view.rays[r, c, 2]
                 meets[way] = np.float64(planes.depth[r, c]) * there / along
                 normals[way, 0], normals[way, 1], normals[way, 2] = qx, qy, qz
-                nearness[way] = exp32(-abs(view.grey[r, c] - view.grey[row, column]) / SIMILAR)
+                nearness[way] = exp32(-abs(view.gray[r, c] - view.gray[row, column]) / SIMILAR)
                 total += nearness[way]
             pixel = 1.0 / (middle * step)
             least = WORST
@@ -495,7 +495,7 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
                     agree[row, column] += 1
                 elif shown > far + 2.0 * tolerance:
                     against[row, column] += 1
-            facts = _take_patch(view.grey, row, column, across, down, fade, patch, weight)
+            facts = _take_patch(view.gray, row, column, across, down, fade, patch, weight)
             nx = np.float64(planes.normal[row, column, 0])
             ny = np.float64(planes.normal[row, column, 1])
             nz = np.float64(planes.normal[row, column, 2])

@@ -67,8 +67,8 @@ def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
         m = body.matrices(walk.period_s * k / n)
         local = np.stack([p.shape.bounding_sphere()[0] for p in body.parts])
         centers.append((m[:, :3, :3] @ local[:, :, None])[:, :, 0] + m[:, :3, 3])
-    metres = np.linalg.norm(np.diff(np.stack(centers), axis=0), axis=2).sum(axis=0).mean()
-    assert metres / walk.period_s == pytest.approx(speed, rel=0.03)
+    meters = np.linalg.norm(np.diff(np.stack(centers), axis=0), axis=2).sum(axis=0).mean()
+    assert meters / walk.period_s == pytest.approx(speed, rel=0.03)
 
 
 @given(

@@ -107,7 +107,7 @@ def test_color_depends_on_the_place_and_not_on_the_viewer():
     both = np.abs(b.distance()[row, column] - np.linalg.norm(points[inside] - other[:3, 3], axis=1)) < 0.02
     assert both.sum() > 5000
     gap = np.abs(image_a[inside][both] - image_b[row, column][both]).max(axis=1)
-    # One pixel is up to some centimetres: smooth textures differ by little, shadow edges by more.
+    # One pixel is up to some centimeters: smooth textures differ by little, shadow edges by more.
     assert np.median(gap) <= 2 and np.mean(gap > 12) < 0.03
 
 

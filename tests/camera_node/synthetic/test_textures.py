@@ -47,7 +47,7 @@ def test_checker_alternates():
     "texture", [tx.Checker(RED, BLUE, 0.5, soft=0.05), tx.Stripes(RED, BLUE, 0.5, soft=0.05)]
 )
 def test_edges_are_as_soft_as_asked(texture):
-    """No step between neighbours is steeper than a smoothstep of that width (slope 1.5 / width)."""
+    """No step between neighbors is steeper than a smoothstep of that width (slope 1.5 / width)."""
     u = np.linspace(-2, 2, 8001)
     steps = np.abs(np.diff(texture(np.stack([u, np.full_like(u, 0.2)])), axis=1)).max()
     assert steps <= 0.8 * 1.5 / 0.05 * (u[1] - u[0]) * 1.01

@@ -13,7 +13,7 @@ DIM = 4
 
 
 class Means:
-    """Embeds a picture as its mean colours, and notes what it was asked for."""
+    """Embeds a picture as its mean colors, and notes what it was asked for."""
 
     dim = DIM
 

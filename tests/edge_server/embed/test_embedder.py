@@ -101,12 +101,12 @@ def test_a_tap_is_a_tensor_or_a_module(tmp_path):
         embedder(path, tap="large")
 
 
-def test_alpha_is_laid_over_grey(tmp_path):
+def test_alpha_is_laid_over_gray(tmp_path):
     made = embedder(detector(tmp_path / "d.onnx"))
     clear = np.zeros((32, 32, 4), np.uint8)
-    grey = np.full((32, 32, 3), 114, np.uint8)
+    gray = np.full((32, 32, 3), 114, np.uint8)
     solid = np.concatenate([image(32, 32), np.full((32, 32, 1), 255, np.uint8)], axis=2)
-    rows = made.embed([clear, grey, solid, np.ascontiguousarray(solid[..., :3])])
+    rows = made.embed([clear, gray, solid, np.ascontiguousarray(solid[..., :3])])
     assert (rows[0] == rows[1]).all() and (rows[2] == rows[3]).all()
 
 

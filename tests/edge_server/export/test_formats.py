@@ -150,7 +150,7 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, harmonics):
         2.5 * np.exp(params[:, 3:6]),
         rtol=1e-5,
     )
-    # The colour a viewer works out is ours, from any side: its basis has the other sign for odd orders.
+    # The color a viewer works out is ours, from any side: its basis has the other sign for odd orders.
     way = RNG.normal(size=3)
     x, y, z = (way / np.linalg.norm(way)).astype(np.float32)
     theirs = kerbl(x, y, z)

@@ -133,9 +133,9 @@ def test_the_noise_of_real_video_is_not_motion():
 
 
 def test_selected_views_are_averaged_and_say_so():
-    grey = np.full((32, 32, 3), 128, np.uint8)
-    off = (grey / 255 + 0.1).astype(np.float32)
-    score = Scorer().score_selected([("a", grey / 255, grey), ("b", off, grey)], 5 * MS)
+    gray = np.full((32, 32, 3), 128, np.uint8)
+    off = (gray / 255 + 0.1).astype(np.float32)
+    score = Scorer().score_selected([("a", gray / 255, gray), ("b", off, gray)], 5 * MS)
     assert score.on == "selected" and score.truth_gap_ms is None and score.camera == "a,b"
     assert score.psnr_db == pytest.approx((PSNR_CEILING_DB + 20.0) / 2, abs=1e-4)
     assert score.psnr_moving_db is None
@@ -164,10 +164,10 @@ def test_a_poisoned_rendering_goes_unscored_and_the_log_says_where(caplog):
 
 
 def test_the_mean_over_cameras_skips_what_a_camera_lacks():
-    grey = np.full((16, 16, 3), 0.5)
+    gray = np.full((16, 16, 3), 0.5)
     scorer = Scorer()
-    a = scorer.score("a", grey, 0, grey + 0.1, 0, [grey])
-    b = scorer.score("b", grey[:8], 0, grey[:8] + 0.1, 0)
+    a = scorer.score("a", gray, 0, gray + 0.1, 0, [gray])
+    b = scorer.score("b", gray[:8], 0, gray[:8] + 0.1, 0)
     mean = mean_score([a, b])
     assert mean.ssim == a.ssim and b.ssim is None and mean.psnr_moving_db == pytest.approx(20.0)
     assert mean.camera == "a,b"

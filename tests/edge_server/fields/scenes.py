@@ -22,7 +22,7 @@ def seen(
     camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M,
     radius_m: float = RADIUS_M,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:  # fmt: skip
-    """The picture (H, W, 3), and how far away in metres what it shows is (H, W), inf for the sky."""
+    """The picture (H, W, 3), and how far away in meters what it shows is (H, W), inf for the sky."""
     origin, rays = world_rays(camera, pose)
     color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
     down = rays[..., 2] < -1e-6

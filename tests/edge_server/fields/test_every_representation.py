@@ -41,7 +41,7 @@ def test_it_learns_a_view_it_has_not_seen(name: str) -> None:
 
 
 @every_field
-def test_depth_is_in_metres(name: str) -> None:
+def test_depth_is_in_meters(name: str) -> None:
     out = _trained(name).render(HELD.camera_to_world, HELD.intrinsics)
     middle = out.depth[22:26, 22:26]
     expected = np.linalg.norm(HELD.camera_to_world[:3, 3] - [0, 0, 0.45]) - 0.5

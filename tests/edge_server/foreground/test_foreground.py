@@ -39,7 +39,7 @@ def test_grabcut_finds_what_the_box_alone_does_not():
         assert cut.counts.masked == 1
         kept = rgba[..., 3] == 255
         assert np.array_equal(rgba[kept][:, :3], picture[kept])
-        assert not rgba[rgba[..., 3] == 0].any(), "what is transparent has no colour either"
+        assert not rgba[rgba[..., 3] == 0].any(), "what is transparent has no color either"
     assert found["grabcut"] > 0.95 > found["box"]
 
 
@@ -201,7 +201,7 @@ def test_a_real_yolo_finds_the_people_of_a_real_video():
         ({"box": [0, 0, 1]}, "expected a list of 4 values"),
         ({"box": [0, 0, 1, 1], "side": 3}, "side: expected 16 to 4096"),
         ({"box": [0, 0, 1, 1], "segment": "u2net.onnx"}, "segment: expected detector or grabcut or box"),
-        ({"box": [0, 0, 1, 1], "colour": 1}, "colour"),
+        ({"box": [0, 0, 1, 1], "color": 1}, "color"),
     ],
 )
 def test_wrong_sections_are_refused_in_one_line(section, part):

@@ -64,7 +64,7 @@ def test_a_slow_camera_leaves_as_many_viewpoints_behind_as_a_fast_one(step_deg):
     walked = [view("hand", degrees, t_ms) for t_ms, degrees in enumerate(np.arange(0.0, 120.0, step_deg))]
     for each in walked:
         given = kept.with_earlier([each])
-    # A viewpoint each tenth of a metre or so, of the two metres walked.
+    # A viewpoint each tenth of a meter or so, of the two meters walked.
     assert 15 <= len(kept) <= 21
     places = np.array([v.camera_to_world[:3, 3] for v in given])
     for each in walked:  # nothing that it passed is forgotten, the start neither

@@ -28,7 +28,7 @@ NEW = PreferenceSession(
 
 
 def sprite(k):
-    """Of reconstruction k: its grey level says which it is."""
+    """Of reconstruction k: its gray level says which it is."""
     return cv2.imencode(".jpg", np.full((2 * SIDE, 3 * SIDE, 3), 30 * k + 40, np.uint8))[1].tobytes()
 
 
@@ -164,7 +164,7 @@ def swipe(browser, dx):
     browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
 
-def grey(browser):
+def gray(browser):
     """Reconstructions that the two canvases show."""
     return browser.evaluate(
         "['leftView', 'rightView'].map(id => {const c = document.getElementById(id);"
@@ -186,7 +186,7 @@ def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
                 lambda: not browser.evaluate("document.getElementById('left').disabled"), "a pair"
             )
             asked = page.session.question
-            assert grey(browser) == [asked.left, asked.right]
+            assert gray(browser) == [asked.left, asked.right]
 
         browser.call("Emulation.setTouchEmulationEnabled", enabled=True)
         ready(0)

@@ -10,7 +10,7 @@ from edge_server.report.style import CYCLE, figure
 
 
 def test_a_line_that_another_covers_keeps_its_color_in_the_legend(tmp_path):
-    """A palette of few colors took a rare one for its neighbour's."""
+    """A palette of few colors took a rare one for its neighbor's."""
     with figure(tmp_path / "a.png", 6) as (_, axes):
         for at in axes[:, 0]:
             for k, color in enumerate(CYCLE[:4]):

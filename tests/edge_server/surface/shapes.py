@@ -34,7 +34,7 @@ def poses_around(count: int, distance_m: float = 0.4) -> list[NDArray]:
 
 
 def ball_maps(count: int = 20, camera: Pinhole = LENS) -> list[DepthMap]:
-    """A ball seen from all sides, grey with a red upper half."""
+    """A ball seen from all sides, gray with a red upper half."""
     maps = []
     for pose in poses_around(count):
         depth = ball_depth(camera, pose)

@@ -83,7 +83,7 @@ def test_coverage_goes_where_the_object_was_not_seen():
     assert DOME.directions[int(np.argmax(values))] @ DOME.directions[seen] < 0.5 and values[seen] < 1e-9
 
 
-def test_a_budget_of_metres_is_kept():
+def test_a_budget_of_meters_is_kept():
     plan = plan_capture(DOME, make_selector("random"), Budget(path_m=2.0), take)
     assert 1.2 < plan.path_m <= 2.0
     both = plan_capture(DOME, make_selector("random"), Budget(30, 2.0), take)

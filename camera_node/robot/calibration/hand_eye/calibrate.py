@@ -27,12 +27,12 @@ ALL_METHODS = (*METHODS, REFINED)
 # With fewer poses, each method's own scatter is as large as the differences between methods.
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
-# Larger values mean wrong input: inverted poses, millimetres, or poses of another body.
+# Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
 _ADVICE = (
-    "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
+    "are the poses hand in base and target in camera, not their inverses, in meters, and is the set-up right?"
 )
-_EXACT_ARM = (1e-6, 1e-6)  # radians, metres: negligible beside the noise of any camera
+_EXACT_ARM = (1e-6, 1e-6)  # radians, meters: negligible beside the noise of any camera
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def angle_deg(a: Array, b: Array) -> float:
 
 
 def distance_mm(a: Array, b: Array) -> float:
-    """Distance between the origins of two transforms (4, 4) in metres."""
+    """Distance between the origins of two transforms (4, 4) in meters."""
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]) * 1e3)
 
 

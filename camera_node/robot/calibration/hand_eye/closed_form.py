@@ -123,7 +123,7 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
         places = target_at_rest(few, x)
         y = _median_transform(places)
         off = _residuals_from(places, y)
-        # A rotation counts as the motion of a point at a third of a metre.
+        # A rotation counts as the motion of a point at a third of a meter.
         score = float(np.median(off.mm + np.deg2rad(off.deg) * 330.0))
         if best is None or score < best[0]:
             best = score, x, y

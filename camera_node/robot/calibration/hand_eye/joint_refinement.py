@@ -35,9 +35,9 @@ from camera_node.robot.calibration.hand_eye.samples import (
 # Of Student's t. ``calibrate accuracy`` shows the loss of efficiency on data without outliers.
 _DEGREES_OF_FREEDOM = 8.0
 _ROUNDS, _INNER_ROUNDS = 12, 60
-# Radians, metres and seconds: smaller steps are far below what can be measured.
+# Radians, meters and seconds: smaller steps are far below what can be measured.
 _CONVERGED = 1e-8
-# Step of the central differences: radians and metres.
+# Step of the central differences: radians and meters.
 _STEP = 1e-6
 # Lower bound of the noise: perfect data would make the likelihood infinite.
 _MIN_RAD, _MIN_M = 1e-7, 1e-7
@@ -51,7 +51,7 @@ class Refinement:
     """Result of the refinement.
 
     x, y: (4, 4).
-    covariance: (6, 6) of x: rotation (radians, camera axes) and translation (metres).
+    covariance: (6, 6) of x: rotation (radians, camera axes) and translation (meters).
     arm_noise_rad, arm_noise_m: the arm's noise, estimated or given.
     weights: (N,), about 1 for a good sample.
     offset_s, offset_std_s: time offset and its deviation, if velocities were given.
@@ -88,7 +88,7 @@ def refine(
     """Maximize the likelihood of X and Y.
 
     start: X and Y (4, 4) to begin with; None: those of ``robust_start``.
-    arm_noise: (radians, metres), fixed instead of estimated. Near zero takes the arm as exact, which makes
+    arm_noise: (radians, meters), fixed instead of estimated. Near zero takes the arm as exact, which makes
         sense only if the target's covariance is known.
     velocity: (N, 6) of the hand in its own axes (rad/s, m/s), to refine the time offset too.
     Raises CalibrationError.
@@ -122,7 +122,7 @@ def cramer_rao_bound(
     samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]
 ) -> tuple[float, float]:
     """Cramer-Rao bound of X in degrees and mm at the truth, with Y unknown too. arm_noise: (radians,
-    metres)."""
+    meters)."""
     return _deviations(np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0)))
 
 

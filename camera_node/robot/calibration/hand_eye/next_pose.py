@@ -37,7 +37,7 @@ def propose_pose(
     up to 50 degrees, with any roll.
 
     x, y: (4, 4), the current estimates of X and Y.
-    noise: of the arm (radians, metres).
+    noise: of the arm (radians, meters).
     middle: (3,) of the target, in its axes.
     new_deg: hands rotated by at least this from earlier ones, and not much farther out, are preferred.
     """

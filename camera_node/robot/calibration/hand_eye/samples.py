@@ -34,7 +34,7 @@ class Samples:
 
     hand: (N, 4, 4) hand in base.
     target: (N, 4, 4) target in camera.
-    covariance: (N, 6, 6) of the target's rotation (radians, about its own axes) and translation (metres,
+    covariance: (N, 6, 6) of the target's rotation (radians, about its own axes) and translation (meters,
         camera axes); None: exact.
     names: for messages.
     """

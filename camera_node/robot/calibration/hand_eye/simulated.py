@@ -1,5 +1,5 @@
 """A simulated hand with a camera over a target, with known truth, to measure calibration and pairing.
-Everything is within half a metre of the base, as on the table of a UR3e."""
+Everything is within half a meter of the base, as on the table of a UR3e."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def observed_targets(hands: Array) -> Array:
     return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
 
 
-def add_noise(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
+def add_noise(poses: Array, rng: np.random.Generator, rad: float, meters: float) -> Array:
     """Poses with Gaussian noise: a rotation vector about the body's own axes, and a translation."""
     turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
-    shifts = rng.normal(0.0, metres, (len(poses), 3))
+    shifts = rng.normal(0.0, meters, (len(poses), 3))
     return transform_of(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
 
 

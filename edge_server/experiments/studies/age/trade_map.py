@@ -172,7 +172,7 @@ class Phase(Study):
         return found
 
     def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:
-        """Draw speed against delay for each scene, coloured by the gain of the best policy over use-all."""
+        """Draw speed against delay for each scene, colored by the gain of the best policy over use-all."""
         for scene in table.distinct("scene"):
             mine = [c for c in cells if c.scene == scene]
             kinds = list(dict.fromkeys((c.memory, c.compute) for c in mine))

@@ -29,7 +29,7 @@ from edge_server.experiments.training.scheduler.evaluation import (
 )
 from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.experiments.training.scheduler.trainer import Row, stage_file
-from edge_server.report.style import CYCLE, GREY, figure, label_lines
+from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 from edge_server.scheduler.learned.actor import Actor
 
 EPISODES = {True: 60, False: 600}
@@ -178,7 +178,7 @@ def _draw_dims(request: StudyRequest, evaluations: dict[str, Evaluation]) -> Non
     found = [paired_difference(mine, runs[0]) for mine in runs[1:]]
     off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
     with figure(request.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
-        axes[0, 0].axhline(0.0, color=GREY, linewidth=1.0)
+        axes[0, 0].axhline(0.0, color=GRAY, linewidth=1.0)
         axes[0, 0].errorbar([str(dim) for dim in DIMS[1:]], [one.mean for one in found], off, fmt="o",
                             color=CYCLE[0], capsize=3)  # fmt: skip
         label_lines(axes[0, 0], "reward over none", "numbers of an embedding",

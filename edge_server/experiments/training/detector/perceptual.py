@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[str]]:
-    """Pairs (n, 2, H, W, 3) of a distorted and a true image, and the name of each distortion. Neighbours in
+    """Pairs (n, 2, H, W, 3) of a distorted and a true image, and the name of each distortion. Neighbors in
     ``images`` are other instants of the same view."""
     from edge_server.experiments.training.detector.distortions import distorted
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation, PerSeed
-from edge_server.report.style import CYCLE, GREY, figure, label_lines
+from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
 # Batches that a point of the smoothed curve is the mean of.
 _SMOOTH = 9
@@ -31,7 +31,7 @@ def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, flo
         top.plot(episodes, rewards, color=CYCLE[0], alpha=0.3, linewidth=0.9)
         top.plot(episodes, smoothed(rewards), color=CYCLE[0], label="reward in training")
         for k, (label, level) in enumerate((levels or {}).items()):
-            top.axhline(level, color=GREY, linestyle=(":", "--", "-.")[k % 3], linewidth=1.1, label=label)
+            top.axhline(level, color=GRAY, linestyle=(":", "--", "-.")[k % 3], linewidth=1.1, label=label)
         label_lines(top, "reward", None, "Learning, explored actions included")
         for k, term in enumerate(terms):
             values = smoothed(_numbers(rows, term))

@@ -113,7 +113,7 @@ def encode(grid, levels, x, a, b, features):
 
 @part
 def _mark(dirty, i, j):
-    """Flag the segments of two vertices that are neighbours along x, and so mostly share one."""
+    """Flag the segments of two vertices that are neighbors along x, and so mostly share one."""
     a, b = i >> np.uint32(4), j >> np.uint32(4)
     dirty[a] = True
     if b != a:
@@ -173,10 +173,10 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
 
 @kernel
 def smooth_grid(counter, worker, grid, levels, smooth, gradient, dirty):
-    """Add the gradient of half the squared differences between neighbouring vertices, times ``smooth``
+    """Add the gradient of half the squared differences between neighboring vertices, times ``smooth``
     (float32), to what is about to be updated; a task is a level.
 
-    Only levels that are stored densely: in a hashed one, neighbours in the table are not neighbours in space.
+    Only levels that are stored densely: in a hashed one, neighbors in the table are not neighbors in space.
     Only segments that are dirty already: what no ray reaches stays as it is.
     """
     while True:

@@ -92,7 +92,7 @@ class MovingSet:
         return Gaussians(params, self.settings.harmonics, np.zeros((len(params), 3), np.float32))
 
     def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
-        """Distance from a camera to the middle of the Gaussians, metres."""
+        """Distance from a camera to the middle of the Gaussians, meters."""
         middle = np.median(self.places(instant_s), axis=0)
         apart = middle - self.box.normalise(camera.view.camera_to_world[:3, 3])
         return float(np.linalg.norm(apart)) * self.box.radius_m

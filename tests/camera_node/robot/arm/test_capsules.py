@@ -55,7 +55,7 @@ def test_clearances_are_those_of_a_collision_library():
 
 
 def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
-    """Its link frames lie metres beside it: neither the limits nor pink may take them for the arm."""
+    """Its link frames lie meters beside it: neither the limits nor pink may take them for the arm."""
     file = tmp_path / "calibration.conf"
     file.write_text(CALIBRATION)
     arm = apply_calibration(UR3E, file)

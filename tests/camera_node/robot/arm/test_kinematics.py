@@ -9,7 +9,7 @@ from freshfield.geometry import so3_exp
 POSTURES = np.random.default_rng(3).uniform(-math.pi, math.pi, (40, 6))
 
 # Deviations as large as real files have them: lengths along nearly parallel axes are ill-determined, so the
-# factory's fit puts metres into d of joints 2 to 4 that all but cancel.
+# factory's fit puts meters into d of joints 2 to 4 that all but cancel.
 CALIBRATION = """
 [mounting]
 delta_theta = [ 4.1e-05, -0.0597, 0.1880, -0.1284, 1.9e-05, -3.7e-05]   # radians

@@ -101,7 +101,7 @@ def test_the_tour_begins_where_it_can_be_begun():
 
 
 def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
-    """The height of its joints, not of the frames that its calibration puts metres beside them."""
+    """The height of its joints, not of the frames that its calibration puts meters beside them."""
     file = tmp_path / "calibration.conf"
     file.write_text(CALIBRATION)
     arm = apply_calibration(UR3E, file)

@@ -75,7 +75,7 @@ def noisy_samples(
     count: int,
     rng: np.random.Generator,
     rad: float = simulated.ARM_RAD,
-    metres: float = simulated.ARM_M,
+    meters: float = simulated.ARM_M,
     setup: str = EYE_IN_HAND,
 ) -> Samples:
     """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
@@ -84,7 +84,7 @@ def noisy_samples(
     targets = simulated.observed_targets(hands)
     if setup != EYE_IN_HAND:
         hands = inverse(hands)
-    return Samples(simulated.add_noise(hands, rng, rad, metres), targets, setup)
+    return Samples(simulated.add_noise(hands, rng, rad, meters), targets, setup)
 
 
 def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:

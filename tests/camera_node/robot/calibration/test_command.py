@@ -57,7 +57,7 @@ def test_scripts_are_warned_too(tmp_path, capsys):
     assert said.err.startswith("note: 6 poses: 10 to 20")
 
 
-@pytest.mark.parametrize("wrong", ["inverted", "millimetres"])
+@pytest.mark.parametrize("wrong", ["inverted", "millimeters"])
 def test_nonsense_is_refused_and_not_an_answer(wrong, tmp_path, capsys):
     good = noisy_samples(15, np.random.default_rng(1))
     hand, target = good.hand.copy(), good.target.copy()
@@ -70,7 +70,7 @@ def test_nonsense_is_refused_and_not_an_answer(wrong, tmp_path, capsys):
     file.write_text(json.dumps([[h.tolist(), t.tolist()] for h, t in zip(hand, target)]))
     assert hand_eye("--pairs", file, "--json", "--out", out) == 2
     said = capsys.readouterr()
-    assert "not their inverses, in metres" in said.err and said.out == "" and not out.exists()
+    assert "not their inverses, in meters" in said.err and said.out == "" and not out.exists()
 
 
 def test_an_offset_between_two_clocks_beginnings_is_told_and_not_written(tmp_path, capsys):
@@ -187,7 +187,7 @@ def test_a_printed_target_is_one(spelling, tmp_path, capsys):
     assert "must measure" in capsys.readouterr().out
     picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     corners = parse_target(spelling).find(picture)
-    # Metres a pixel, over the whole target: what --dpi says.
+    # Meters a pixel, over the whole target: what --dpi says.
     pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
     assert pixels == pytest.approx(200 / 0.0254, rel=0.02)
 

@@ -18,7 +18,7 @@ from camera_node.synthetic import make_scene
 from freshfield.geometry import Pinhole, matrix_to_quaternion
 
 WIDTH, HEIGHT = 64, 48
-# Points about the middle of the room, in the world's metres.
+# Points about the middle of the room, in the world's meters.
 POINTS = np.random.default_rng(3).uniform([-0.6, -0.6, 0.3], [0.6, 0.6, 1.2], (200, 3))
 
 

@@ -40,7 +40,7 @@ def test_frames_differ_and_repeat_in_any_order():
     assert (image == 100).all()
 
 
-def test_neighbours_and_channels_are_independent():
+def test_neighbors_and_channels_are_independent():
     image = np.full((256, 256, 3), 128, np.uint8)
     noise = make(read_noise_counts=4.0)
     a, b = (noise.apply(image, k).astype(float) - 128 for k in (0, 1))

@@ -29,7 +29,7 @@ from edge_server.fields.registry import field_names, make_field
 
 TINY = Workload(1, 3, (0.1,), 2, 2, (0.1,), 4)
 TRIED = (
-    Option("colour", {"harmonics": 1}, {"harmonics": 4}, ("still",)),
+    Option("color", {"harmonics": 1}, {"harmonics": 4}, ("still",)),
     Option("distortion", {"distortion": 0.0}, {"distortion": 0.01}, ("still",)),
     Option("sharpness", {"sharpness": 0.0}, {"sharpness": 1.0}, ("still",)),
     Option("changed", {"changed_share": 0.0}, {"changed_share": 0.25}, ("room, late",)),
@@ -61,8 +61,8 @@ def test_every_option_is_measured_off_and_on(tmp_path, tiny, capsys):
     assert sorted(found["points"]["still"]["ngp"]) == ["default", "distortion=0.0", "harmonics=4"]
     assert "ngp has no option sharpness" in found["left_out"]["ngp"]["sharpness"]
     rows = {row["option"]: row for row in found["rows"]}
-    assert list(rows) == ["colour", "distortion", "changed"]
-    assert rows["colour"]["off"] == rows["distortion"]["on"]
+    assert list(rows) == ["color", "distortion", "changed"]
+    assert rows["color"]["off"] == rows["distortion"]["on"]
     for row in rows.values():
         steps = "2_steps" if row["scene"] in MOVING else "3_steps"
         assert row["off"]["steps"][steps] == (4 if row["scene"] in MOVING else 3)  # of two updates, or once
@@ -97,26 +97,26 @@ def test_what_is_known_is_not_measured_again(tmp_path, tiny, monkeypatch):
         return point(name, make, scene, options, workload)
 
     monkeypatch.setattr(bench_options, "_point", counted)
-    assert bench(path, "--only", "colour", "--only", "distortion") == 130
+    assert bench(path, "--only", "color", "--only", "distortion") == 130
     before = json.loads(path.read_text())["options"]
-    assert [row["option"] for row in before["rows"]] == ["colour"]  # of the other only one side is known
-    assert "| colour | still |" in path.with_suffix(".md").read_text()
+    assert [row["option"] for row in before["rows"]] == ["color"]  # of the other only one side is known
+    assert "| color | still |" in path.with_suffix(".md").read_text()
     assert bench(path, "--resume") == 0
     assert len(asked) == 3 + 3  # what was interrupted, and two of the moving scene
     after = json.loads(path.read_text())["options"]
     assert after["rows"][0] == before["rows"][0] and len(after["rows"]) == 3
     # Other budgets are other figures.
     monkeypatch.setattr(bench_options, "QUICK", replace(TINY, steps=4))
-    assert bench(path, "--resume", "--only", "colour") == 0
+    assert bench(path, "--resume", "--only", "color") == 0
     assert len(asked) == 6 + 2
     # What was measured with the old ones is not set beside them.
     mixed = json.loads(path.read_text())["options"]["rows"]
-    assert [row["option"] for row in mixed] == ["colour", "changed"]
+    assert [row["option"] for row in mixed] == ["color", "changed"]
 
 
 def test_an_option_that_does_not_exist_is_refused(tmp_path, tiny, capsys):
     assert bench(tmp_path / "bench.json", "--only", "taste") == 1
-    assert "no option is called taste: colour, distortion" in capsys.readouterr().err
+    assert "no option is called taste: color, distortion" in capsys.readouterr().err
 
 
 def test_every_option_is_one_of_some_representation_and_has_scenes():

@@ -64,7 +64,7 @@ def test_transparent_sky_has_no_depth() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_pictures_of_one_colour_have_no_depth(level: int) -> None:
+def test_pictures_of_one_color_have_no_depth(level: int) -> None:
     views = [replace(v, image=np.full_like(v.image, level)) for v in SEEN]
     data, box = _packed(views)
     assert (_guide(views, data, box) == 0).all()

@@ -44,7 +44,7 @@ def test_it_moves_and_scales_with_the_rig() -> None:
     np.testing.assert_allclose(b.centre_m, 100 * np.array(a.centre_m) + [5, 6, 7], atol=1e-6)
 
 
-def test_axes_that_meet_less_than_a_metre_ahead_meet() -> None:
+def test_axes_that_meet_less_than_a_meter_ahead_meet() -> None:
     poses = np.stack([view.camera_to_world for view in ring(8, size=16, distance_m=0.2)])
     point = converging_point(poses[:, :3, 3], poses[:, :3, 2])
     assert point is not None

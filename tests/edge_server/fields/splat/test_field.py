@@ -124,7 +124,7 @@ def test_a_ball_that_moved_is_removed_and_seeded_anew() -> None:
 
 
 MS = 1_000_000
-START, SPEED = np.array([-0.3, -0.3, 0.5]), np.array([0.8, 0.0, 0.0])  # metres, metres a second
+START, SPEED = np.array([-0.3, -0.3, 0.5]), np.array([0.8, 0.0, 0.0])  # meters, meters a second
 
 
 def _ball_at(t_ms: int, late: bool = False) -> list[View]:

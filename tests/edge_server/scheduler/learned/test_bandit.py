@@ -172,8 +172,8 @@ def test_a_policy_that_needs_embeddings_is_refused_where_there_are_none():
 def test_a_policy_that_was_taught_with_other_embeddings_is_refused():
     with pytest.raises(ValueError, match=r"embeddings of 2 numbers, .* brightness of 1"):
         updates(policy("select", parts=("semantics",), dim=2), Brightness())
-    other = policy("select", parts=("semantics",), dim=1, embedding="colour")
-    with pytest.raises(ValueError, match="trained with colour"):
+    other = policy("select", parts=("semantics",), dim=1, embedding="color")
+    with pytest.raises(ValueError, match="trained with color"):
         updates(other, Brightness())
     updates(policy("select", parts=("semantics",), dim=1, embedding="brightness"), Brightness())
 

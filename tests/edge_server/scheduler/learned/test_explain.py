@@ -98,7 +98,7 @@ def test_the_same_state_has_the_same_explanation():
 
 
 def brightness(images):
-    """Embeds a picture by how bright each colour is on the whole: what a region adds is known."""
+    """Embeds a picture by how bright each color is on the whole: what a region adds is known."""
     return np.array([image.mean(axis=(0, 1)) / 64.0 for image in images], np.float32)
 
 

@@ -72,7 +72,7 @@ def test_a_batch_pads_with_cameras_that_never_reported():
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"parts": ("colour",)}, "colour"),
+        ({"parts": ("color",)}, "color"),
         ({"parts": ()}, "no parts"),
         ({"parts": ("age",), "dim": 4}, "dim 4"),
         ({"parts": ("semantics",)}, "dim 0"),
@@ -100,7 +100,7 @@ def test_a_state_of_the_wrong_shape_is_refused():
 # --- observe ----------------------------------------------------------------------------------------
 
 
-class Colours:
+class Colors:
     """Embeds a frame by its number; the third frame asked for has none. Counts."""
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ def rig(scale=1.0, shift=(0.0, 0.0, 0.0)):
 def test_observing_gives_ages_poses_and_embeddings_in_the_cameras_order():
     newest = rig()
     del newest["c1"]
-    s = observe(("c3", "c2", "c1", "c0"), newest, 100 * MS, Colours())
+    s = observe(("c3", "c2", "c1", "c0"), newest, 100 * MS, Colors())
     np.testing.assert_array_equal(s.ages_ms, [70, 80, np.nan, 100])
     np.testing.assert_array_equal(s.reported, [True, True, False, True])
     assert s.cameras == ("c3", "c2", "c1", "c0")
@@ -144,16 +144,16 @@ def test_poses_do_not_depend_on_where_a_rig_stands_nor_on_its_size():
 
 
 def test_only_what_is_asked_for_is_computed():
-    colours = Colours()
-    s = observe(("c0", "c1"), rig(), 0, colours, parts=("age",))
-    assert colours.asked == 0
+    colors = Colors()
+    s = observe(("c0", "c1"), rig(), 0, colors, parts=("age",))
+    assert colors.asked == 0
     assert s.embeddings is None
     assert not s.poses.any()
 
 
 def test_nobody_has_reported_and_one_camera_alone():
-    s = observe(("c0", "c1"), {}, 0, Colours())
+    s = observe(("c0", "c1"), {}, 0, Colors())
     layout = StateLayout(("age", "pose", "semantics"), dim=2)
     assert not layout.features(s).any()
     alone = {"c0": rig()["c0"]}
-    assert np.isfinite(layout.features(observe(("c0", "c1"), alone, 0, Colours()))).all()
+    assert np.isfinite(layout.features(observe(("c0", "c1"), alone, 0, Colors()))).all()

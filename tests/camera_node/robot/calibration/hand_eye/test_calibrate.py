@@ -144,7 +144,7 @@ def test_the_refinement_finds_a_real_arms_noise():
     published = np.loadtxt(folder / "expected_eMc.txt")
     found = calibrate(samples)
     assert angle_deg(found.transform, published) < 0.2 and distance_mm(found.transform, published) < 1.0
-    # This arm is off by millimetres: a calibration that takes it as exact is degrees away.
+    # This arm is off by millimeters: a calibration that takes it as exact is degrees away.
     assert 1e-3 < found.refined.arm_noise_m < 1e-2
     assert found.exact_arm is not None and found.exact_arm.from_refined_deg > 1.0
     assert {row.method for row in found.rows} == set(ALL_METHODS)

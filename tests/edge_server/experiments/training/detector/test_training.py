@@ -40,7 +40,7 @@ def _as_it_was():
 
 
 def squares(n: int) -> LabeledImages:
-    """Bright squares (kind 2) and dark ones (kind 3) on grey."""
+    """Bright squares (kind 2) and dark ones (kind 3) on gray."""
     rng = np.random.default_rng(0)
     images, boxes = np.full((n, SIDE, SIDE, 3), 110, np.uint8), []
     for image in images:

@@ -89,7 +89,7 @@ def test_table_gradient_equals_finite_differences() -> None:
 
 
 def _variation(grid: Grid, levels: int, table: Tensor) -> Tensor:
-    """Half the squared differences between neighbouring vertices of the levels that are stored densely."""
+    """Half the squared differences between neighboring vertices of the levels that are stored densely."""
     total = table.sum() * 0.0
     for l in range(levels):
         side = int(grid.resolution[l]) + 1

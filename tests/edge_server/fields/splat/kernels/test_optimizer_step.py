@@ -156,7 +156,7 @@ def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -
     dropped = hurt[victim] == params[victim]
     assert dropped.sum() >= lost  # neither the number nor its moment moves
     assert (moments.m[victim][dropped] == was[dropped]).sum() >= lost
-    if column == 7:  # a colour's sum reaches that colour alone
+    if column == 7:  # a color's sum reaches that color alone
         assert lost == 1 and dropped[COLOR + 1]
 
 

@@ -89,7 +89,7 @@ def test_the_depth_of_a_plane_is_where_the_rays_meet_it(angle):
     exact = -(origin @ tilt[:, 2]) / (rays @ tilt[:, 2])
     solid = opacity > 0.9
     assert solid.mean() > 0.2
-    assert np.abs(depth / exact - 1)[solid].max() < 1e-4  # blended middles are off by centimetres
+    assert np.abs(depth / exact - 1)[solid].max() < 1e-4  # blended middles are off by centimeters
 
 
 def test_the_kernel_blends_as_a_loop_over_pixels_does():
