@@ -1,3 +1,3 @@
-"""freshfield's contract: what two processes must agree on, and nothing else."""
+"""What the processes must agree on: wire format, geometry, scenario, files, limits; and nothing else."""
 
 __version__ = "0.1.0"
