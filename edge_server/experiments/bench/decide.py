@@ -32,8 +32,7 @@ _LENS = Pinhole.from_fov(64, 64, 60.0)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """Milliseconds of decisions, median and 99th percentile, by the kind of action and the number of cameras.
-    """
+    """Milliseconds of decisions, median and 99th percentile, by kind of action and number of cameras."""
     repeats = 200 if run.quick else 2000
     load = LoadMeter()
     found = {

@@ -48,8 +48,7 @@ def fit_from_scratch(
     effort: Effort, still: MultiviewStill, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
     """Measure one point: fit a new field for ``seconds``; returns its score on the held-out views and its
-    cost.
-    """
+    cost."""
     model = make_field(effort.field, effort.options, seed=seed)
     model.warm_up()
     load = LoadMeter()

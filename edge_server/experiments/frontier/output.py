@@ -77,8 +77,7 @@ def conclusion(rows: Sequence[Row]) -> str:
 
 def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
     """Draw PSNR, SSIM and LPIPS of every effort level against seconds from scratch, with the PSNR front
-    marked.
-    """
+    marked."""
     shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
     efforts = list(dict.fromkeys(row["effort"] for row in rows))
     looks = _line_styles([tuple(effort.split(" ", 1)) for effort in efforts])

@@ -80,8 +80,7 @@ class MovingScene:
 
 class WarmStart:
     """Cameras of a scene at one speed, which keep their renderings, and a warm field: converged on the first
-    instant, or in layers that follow arrivals for a while before each run.
-    """
+    instant, or in layers that follow arrivals for a while before each run."""
 
     def __init__(
         self,

@@ -1,6 +1,5 @@
 """Compares a run's mesh with the true surface that its cameras saw, which is known for static synthetic
-scenes.
-"""
+scenes."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from edge_server.experiments.virtual.virtual_deployment import RunSettings
 from freshfield.scenario import Scenario
 
 FREE_S, SETTLING_S, SCORED_S = 7.0, 1.0, 4.0
-SETTINGS = replace(LAYERS_RUN, steps=5)  # steps of the static field: about as many as another core does meanwhile
-_SHED, _BUSY = 0.01, 0.9  # a point with a larger share of shed frames, or more following cores, is saturated
+SETTINGS = replace(LAYERS_RUN, steps=5)  # of the static field, about as many as another core does meanwhile
+_SHED, _BUSY = 0.01, 0.9  # share of shed frames and following cores above which a point is saturated
 _SCORES = ("psnr_db", "psnr_moving_db", "psnr_still_db")
 _COSTS = ("update_ms", "view_ms", "following_cores", "static_cores")
 _ROOM = (12, 128, 128, 15.0, 1.0, 1)

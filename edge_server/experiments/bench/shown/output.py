@@ -87,8 +87,7 @@ def _trends(figures: Figures) -> list[str]:
 
 def _slower_table(figures: Figures) -> list[str]:
     """Table of rows on slower processors and the same rows on this one, with a heading; empty without such
-    runs.
-    """
+    runs."""
     slower = {row.name: row for row in ROWS if row.slower > 1.0 and row.name in figures and not row.minutes}
     if not slower:
         return []

@@ -1,6 +1,5 @@
 """``edge-server train-perceptual``: fits the replacement for LPIPS to real LPIPS and measures the
-correlation.
-"""
+correlation."""
 
 from __future__ import annotations
 
