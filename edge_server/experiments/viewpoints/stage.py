@@ -79,7 +79,7 @@ def open_stage(
 
     A synthetic world has ``count`` candidates on a half-hemisphere round its object, at the distance of the
     scenario's held-out camera or of its arm's path; with an arm, only those that it reaches are reachable.
-    The candidates of a recording are its views, of which every eighth is held out.
+    The candidates of a recording are its training views; every eighth view is held out.
 
     size: width and height of a world's images; None: the scenario's.
     data: folder of recorded data sets.

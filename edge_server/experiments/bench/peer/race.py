@@ -171,7 +171,7 @@ _T = tuple(f"{t}" for t in TARGETS_DB)
 
 
 def _median(runs: list[dict[str, Any]], target: str) -> float:
-    """Median seconds to the target; infinite if more than half of the runs did not reach it."""
+    """Median seconds to the target; infinite if half of the runs or more did not reach it."""
     return statistics.median(r["seconds_to"][target] or float("inf") for r in runs)
 
 

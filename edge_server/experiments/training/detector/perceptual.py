@@ -1,4 +1,4 @@
-"""``edge-server train-perceptual``: fits the replacement for LPIPS to real LPIPS and measures the
+"""``edge-server train-perceptual``: fits the stand-in for LPIPS to real LPIPS and measures the
 correlation."""
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ SHOWN_EVERY_MS = 125.0
 
 @dataclass(frozen=True)
 class Hindsight:
-    """An upper bound that no policy can reach: every ``hold_ms`` it takes the threshold with the highest PSNR
-    shown until the next decision. Greedy: later effects of an action do not count."""
+    """An oracle that knows the future: every ``hold_ms`` it takes the threshold with the highest PSNR shown
+    until the next decision. It is greedy: later effects of an action do not count."""
 
     hold_ms: float
     omegas_ms: tuple[float, ...]
