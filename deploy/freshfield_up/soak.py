@@ -251,7 +251,7 @@ def memory(samples: Sequence[tuple[float, dict[str, tuple[int, float]]]]) -> dic
 
 
 def problems(result: dict[str, Any]) -> list[str]:
-    """What did not hold, one line each."""
+    """The conditions that did not hold, one line each."""
     found = []
     for fault in result["faults"]:
         if fault["recovery_s"] is None or fault["recovery_s"] > RECOVERY_S:

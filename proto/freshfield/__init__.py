@@ -1,3 +1,3 @@
-"""What the processes must agree on: wire format, geometry, scenario, files, limits; and nothing else."""
+"""Code shared by all processes: wire format, geometry, scenario, files and limits; nothing else."""
 
 __version__ = "0.1.0"

@@ -21,8 +21,7 @@ MAX_PNG_CHUNKS = 10_000
 """Chunks of a PNG, because a decoder reads all. Encoders write 8 kB or more per chunk: 1000 in 8 MB."""
 
 MAX_JPEG_SEGMENTS = 1000
-"""Segments before a JPEG's first scan, with fill bytes. A camera writes some ten; 16 MB of profile are
-250."""
+"""Segments and fill bytes before a JPEG's first scan. A camera writes some ten; a 16 MB profile takes 250."""
 
 MAX_JPEG_SCANS = 16
 """Scans of a JPEG: a baseline one has 1 to 3, a progressive one some 10. Each visits every block."""

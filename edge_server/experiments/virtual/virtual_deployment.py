@@ -385,7 +385,7 @@ class VirtualDeployment:
         while True:
             settings = self.settings
             steps = steps or settings.steps
-            # A field begins with all that has come; only then does it know what a frame takes.
+            # The first update takes in all frames that have arrived; later ones are limited.
             most_new = settings.most_new if self.publications else None
             if self.next_policy is not None:
                 updates.policy, self.next_policy = self.next_policy, None
