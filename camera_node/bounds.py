@@ -1,4 +1,4 @@
-"""Bounds of settings, each written beside its field."""
+"""Dataclass fields that state the range or the choices of a setting, and the check of them."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Any
 
 
 def bounded(default: Any, lowest: float, highest: float) -> Any:
-    """Field of a ``Bounded`` class: a number, or numbers in a tuple, from ``lowest`` to ``highest``; None is
-    not checked."""
+    """Field of a ``Bounded`` class: a number, or a tuple of numbers, from ``lowest`` to ``highest``
+    inclusive. None is not checked."""
     return field(default=default, metadata={"range": (lowest, highest)})
 
 
 def one_of(default: str, names: Sequence[str]) -> Any:
-    """Field of a ``Bounded`` class: one of these names."""
+    """Field of a ``Bounded`` class: one of ``names``."""
     return field(default=default, metadata={"names": names})
 
 
 @dataclass(frozen=True)
 class Bounded:
-    """Base of settings. Raises ValueError, in one line, for a value that its field does not allow."""
+    """Base of settings. Raises ValueError, in one line, for a value that its field does not allow, and for an
+    empty tuple."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

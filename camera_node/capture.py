@@ -1,4 +1,4 @@
-"""Cameras of a scenario and their shots as they are sent: compressed once, cached while there is room."""
+"""The cameras of a scenario and their compressed shots, which are cached while there is room."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from freshfield.scenario import Scenario
 
 @dataclass(frozen=True)
 class EncodedShot:
-    """A compressed shot: all of a frame but the instant it was due. captured_ns: see ``Shot``."""
+    """A compressed shot: the part of a frame that does not depend on its due instant. Fields as in
+    ``Shot``."""
 
     payload: bytes
     pose: Pose
@@ -33,10 +34,10 @@ class EncodedShot:
 
 
 class ShotCache:
-    """Compressed shots by (camera, content), up to ``max_bytes``. Nothing is evicted.
+    """Compressed shots by (camera, content), up to ``max_bytes``. Thread-safe. Nothing is evicted.
 
-    Shots repeat in a fixed order, so the oldest is the one that is needed next: a full cache that keeps what
-    it has still serves its share of every round.
+    Shots repeat in a fixed order, so the oldest one is needed next. Without eviction, a full cache serves its
+    share of every round.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -58,7 +59,11 @@ class ShotCache:
 
 
 class Camera:
-    """A source with the scenario's codec and the process's cache behind it."""
+    """A source, with compression by the scenario's codec and the process's cache.
+
+    config: gives codec and quality. cache: shared by the process's cameras.
+    clock_error: makes the camera's clock wrong; None: it is right.
+    """
 
     def __init__(
         self, source: Source, config: SourceConfig, cache: ShotCache, clock_error: ClockError | None = None
@@ -66,42 +71,43 @@ class Camera:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
-        # What is replayed has been compressed already.
+        # Replayed frames are compressed already.
         self.codec = source.codec if isinstance(source, ScheduledSource) else config.codec
         self._quality = config.quality
         self._cache = cache
         self._clock_error = clock_error
 
     def clock(self, true: Clock) -> NodeClock:
-        """The clock this camera stamps with, given the true time."""
+        """The clock with which this camera stamps frames. true: tells the true time."""
         return NodeClock(true, self._clock_error)
 
     def schedule(self, start_ns: int) -> CaptureSchedule:
-        """When it captures; a recording that is played once begins at ``start_ns``."""
+        """The instants at which it captures. start_ns: start of a recording that is played once."""
         source = self.source
         return source.schedule(start_ns) if isinstance(source, ScheduledSource) else self.rate_schedule
 
     @property
     def rate_schedule(self) -> RateSchedule:
-        """The ticks of its rate, at its phase."""
+        """The multiples of 1 / fps, shifted by the camera's phase."""
         return RateSchedule(self.fps, self.source.phase_ns)
 
     def cached(self, tick: int) -> EncodedShot | None:
-        """The tick's shot if it is in the cache."""
+        """The tick's shot if it is cached, else None."""
         if self.source.contents is None:
             return None
         return self._cache.get(self.name, self.source.content(tick))
 
     def capture(self, tick: int) -> EncodedShot:
-        """The tick's shot, made if need be: milliseconds, so not on the event loop.
+        """The tick's shot, from the cache or newly made. Making it takes milliseconds: do not call this on
+        the event loop.
 
         Raises ValueError if the source has no such shot or it cannot be sent, OSError if its file is gone.
         """
         return self.shot(self.source.content(tick))
 
     def shot(self, content: int) -> EncodedShot:
-        """One of the source's shots, from the cache or else made; a shot that repeats is kept while there is
-        room. Raises as ``capture``."""
+        """The source's shot number ``content``, from the cache or newly made; a repeating shot is cached
+        while there is room. Raises as ``capture``."""
         if self.source.contents is None:
             return self._encode(content)
         shot = self._cache.get(self.name, content)
@@ -111,7 +117,7 @@ class Camera:
         return shot
 
     def fits(self) -> bool:
-        """Whether all shots will fit into the cache, judged by the size of the first, which is made."""
+        """Whether all shots will fit into the cache, estimated from the size of the first, which is made."""
         contents = self.source.contents
         if contents is None:
             return False
@@ -137,12 +143,11 @@ def build_cameras(
     data: Path | None = None,
     cache_bytes: int = 64 * 2**20,
 ) -> list[Camera]:
-    """Open the sources of ``cameras``, in the scenario's order, with one cache for all.
+    """Open the sources of ``cameras`` with one common cache. Returns them in the scenario's order.
 
-    data: folder of the data sets, else $FRESHFIELD_DATA.
-    cache_bytes: bound on compressed shots kept.
-
-    Raises ScenarioError, DatasetError, CameraError or ArmError, each with one line for a person.
+    data: folder of the data sets; None: $FRESHFIELD_DATA.
+    cache_bytes: bound on the cached payloads.
+    Raises ScenarioError, DatasetError, CameraError or ArmError, each with a message of one line.
     """
     effects = {camera: camera_effects(scenario, config, camera) for camera in cameras}
     sources = open_sources(scenario, config, cameras, data, effects)
@@ -152,10 +157,10 @@ def build_cameras(
 
 
 def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
-    """Fill the cache with the shots of each camera whose shots all fit, and free what made them.
+    """Cache all shots of each camera whose shots fit as a whole, and free the resources that made them.
 
-    Shots that do not all fit are made as they are captured: making a part of them now would delay the first
-    frame and save little.
+    Other cameras make their shots as they are captured: making a part of them now would delay the first frame
+    and save little. Returns early once ``stopped()`` is true.
     """
     for camera in cameras:
         camera.source.prepare(stopped)
@@ -174,6 +179,6 @@ def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
 
 
 def return_memory() -> None:
-    """Hand freed memory back to the system where the C library can (glibc keeps it otherwise)."""
+    """Return freed memory to the system if the C library can; glibc would keep it otherwise."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""When a camera captures: at the ticks of its frame rate, or when a recording did."""
+"""Capture schedules: at the ticks of a frame rate, or at the instants of a recording."""
 
 from __future__ import annotations
 
@@ -9,28 +9,31 @@ from typing import Protocol, runtime_checkable
 
 
 class CaptureSchedule(Protocol):
-    """Numbered captures, each due at an instant of true time. lossless: every capture is sent, however late;
-    otherwise a newer one replaces one that still waits."""
+    """Numbered captures (ticks), each due at an instant of true time.
+
+    lossless: every capture is sent, however late; otherwise a newer one replaces one that still waits.
+    """
 
     lossless: bool
 
     def first(self, now_ns: int) -> int:
-        """The first capture to make."""
+        """Tick of the first capture to make."""
         ...
 
     def due_ns(self, tick: int) -> int:
-        """The instant that a capture shows."""
+        """The instant at which the capture is due, which its image shows."""
         ...
 
     def next(self, tick: int, now_ns: int) -> tuple[int | None, int]:
-        """The capture after ``tick`` (None if that was the last), and how many are missed between."""
+        """The tick to capture after ``tick`` (None if that was the last), and the number of ticks missed in
+        between."""
         ...
 
 
 @runtime_checkable
 class ScheduledSource(Protocol):
-    """A source with a schedule and codec of its own. start_ns: the instant of its first capture, if it has a
-    first; the same for all cameras of a node."""
+    """A source with its own schedule and codec. ``start_ns``, the same for all cameras of a node, is when a
+    schedule with a beginning begins."""
 
     codec: str
 
@@ -38,7 +41,7 @@ class ScheduledSource(Protocol):
 
 
 class _Endless:
-    """Captures without an end. A node that is late goes on with the newest."""
+    """Captures without an end. A node that is late continues with the newest due tick."""
 
     lossless = False
 
@@ -69,8 +72,8 @@ class RateSchedule(_Endless):
 
 
 class LoopSchedule(_Endless):
-    """Captures at ``times_ns`` (from 0, below ``period_ns``) of every period since the epoch, so that nodes
-    that replay one recording are in step."""
+    """Captures at ``times_ns`` within every period since the epoch, so that nodes replaying one recording
+    stay synchronized. times_ns: ascending, from 0 to below ``period_ns``."""
 
     def __init__(self, times_ns: Sequence[int], period_ns: int) -> None:
         self._times, self._period = times_ns, period_ns
@@ -85,7 +88,8 @@ class LoopSchedule(_Endless):
 
 
 class OnceSchedule:
-    """Captures ``times_ns`` after ``start_ns``, each of them, however late the node is."""
+    """Captures at ``times_ns`` after ``start_ns``, once and without skipping any, however late the node
+    is."""
 
     lossless = True
 

@@ -1,4 +1,4 @@
-"""The peer's clock minus ours, estimated from one small exchange a second on the channel of the frames."""
+"""Estimates the offset of the peer's clock from one small exchange a second, on the frames' channel."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from freshfield.v1 import clock_pb2 as pb
 from freshfield.v1 import clock_pb2_grpc as rpc
 
 PERIOD_S = 1.0
-# The first exchanges follow one another closely, so that early frames get a good estimate too.
+# The first exchanges follow each other quickly, so that early frames get a good estimate too.
 _FIRST = 4
 _FIRST_PERIOD_S = 0.05
-# 146 years: clocks differ by what has passed since 1970 at most, and a frame's header has room for this.
+# 146 years. Real clocks differ at most by the time since 1970, and a frame's header can hold this much.
 _MAX_OFFSET_NS = 2**62
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Another clock minus this one.
+    """Estimate of another clock minus this one.
 
-    uncertainty_ns: bound of the error, half the round trip of the exchange that the estimate rests on.
+    uncertainty_ns: bound of the error: half the round trip of the exchange used, plus drift since then.
     """
 
     offset_ns: int
@@ -34,10 +34,10 @@ class Offset:
 
 
 class OffsetEstimator:
-    """NTP's estimate: the offset of the exchange with the shortest round trip among the last 16.
+    """NTP's estimate: the offset of the exchange with the smallest error bound among the last 16.
 
-    The bound of an exchange grows by ``drift_ppm`` of its age, so that the estimate follows a drifting clock.
-    Thread-safe.
+    The bound is half the round trip plus ``drift_ppm`` (parts per million) of the exchange's age, so the
+    estimate follows a drifting clock. Thread-safe.
     """
 
     def __init__(self, drift_ppm: float = 50.0) -> None:
@@ -46,8 +46,11 @@ class OffsetEstimator:
         self._lock = threading.Lock()
 
     def add(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
-        """One exchange: sent by this clock, received and replied to by the other, returned by this one.
-        Impossible exchanges are ignored."""
+        """Add one exchange; impossible ones are ignored.
+
+        sent_ns, returned_ns: request sent and reply received, on this clock.
+        received_ns, replied_ns: request received and reply sent, on the other clock.
+        """
         round_trip = (returned_ns - sent_ns) - (replied_ns - received_ns)
         if round_trip < 0 or replied_ns < received_ns:
             return
@@ -58,7 +61,7 @@ class OffsetEstimator:
             self._samples.append((returned_ns, offset, round_trip // 2))
 
     def estimate(self, now_ns: int) -> Offset | None:
-        """Best offset at ``now_ns`` of this clock; None before the first exchange."""
+        """Best estimate at ``now_ns`` on this clock; None before the first exchange."""
         with self._lock:
             samples = list(self._samples)
         if not samples:
@@ -72,7 +75,10 @@ class OffsetEstimator:
 
 
 class ClockSync:
-    """``offset()`` is the peer's clock minus ``clock``, or None before the first answer."""
+    """Measures the peer's clock minus ``clock`` as long as ``run`` runs.
+
+    channel, metadata: of the calls to the peer.
+    """
 
     def __init__(
         self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock
@@ -83,13 +89,14 @@ class ClockSync:
         self._estimator = OffsetEstimator()  # the first one is used from its first exchange on
 
     def offset(self) -> Offset | None:
+        """The current estimate; None before the first answer."""
         return self._estimator.estimate(self._clock.now_ns())
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Exchange times about once a second, until cancelled."""
         fresh, exchanges = self._estimator, 0
         while True:
-            # A call made while the connection is being set up would count that as a round trip.
+            # A call made while the connection is being set up would include the set-up in its round trip.
             await self._channel.channel_ready()
             try:
                 answered = await exchange(self._channel, self._metadata, self._clock, fresh, PERIOD_S)
@@ -98,8 +105,8 @@ class ClockSync:
             if answered:
                 exchanges += 1
             else:
-                # After a silence the peer may be another process with another clock: start afresh, but
-                # keep to the old estimate until the new one rests on a few exchanges.
+                # After a failed exchange the peer may be another process with another clock: start anew, but
+                # use the old estimate until the new one has a few exchanges.
                 fresh, exchanges = OffsetEstimator(), 0
             if exchanges == _FIRST:
                 self._estimator = fresh
@@ -113,7 +120,10 @@ async def exchange(
     estimator: OffsetEstimator,
     timeout_s: float,
 ) -> bool:
-    """Ask the peer for its time once; whether it answered. Raises grpc.RpcError, and grpc.aio.BaseError."""
+    """Ask the peer for its time once, and add the exchange to ``estimator``.
+
+    Returns whether the peer answered. Raises grpc.RpcError or grpc.aio.BaseError if the call fails.
+    """
     sent = clock.now_ns()
     answer = await rpc.ClockServiceStub(channel).Exchange(
         pb.ExchangeRequest(client_sent_ns=sent), timeout=timeout_s, metadata=metadata

@@ -9,13 +9,15 @@ from freshfield.clock import Clock
 
 
 class ClockError(Protocol):
-    """What makes a camera's clock wrong: its effects."""
+    """The error of a camera's clock, as its effects make it."""
 
-    def node_ns(self, true_ns: int) -> int: ...
+    def node_ns(self, true_ns: int) -> int:
+        """What the wrong clock shows at a true time."""
+        ...
 
 
 class NodeClock:
-    """``true`` with ``error``, or ``true`` itself where there is none."""
+    """The clock ``true`` with ``error`` applied; without an error, ``true`` itself."""
 
     def __init__(self, true: Clock, error: ClockError | None = None) -> None:
         self._true = true
@@ -23,6 +25,7 @@ class NodeClock:
 
     @property
     def exact(self) -> bool:
+        """Whether it has no error."""
         return self._error is None
 
     def now_ns(self) -> int:
@@ -34,11 +37,11 @@ class NodeClock:
 
 
 class ArrivalClock:
-    """Converts a device's stamps to the host's clock, from nothing but the arrival of its samples.
+    """Converts a device's time stamps to the host's clock, using only the arrival times of its samples.
 
-    A sample comes late, never early, so the least delay of the last ``window_ns`` gives the offset between
-    the clocks; older samples are forgotten, because the clocks drift apart. The delay that even the fastest
-    sample has (a cable, a cycle of the device) remains in the result.
+    Samples arrive late, never early, so the smallest difference between arrival and stamp within the last
+    ``window_ns`` estimates the offset between the clocks. Older samples are forgotten, because the clocks
+    drift apart. The delay of the fastest sample (a cable, a cycle of the device) remains in the result.
     """
 
     def __init__(self, window_ns: int = 5_000_000_000) -> None:
@@ -46,7 +49,10 @@ class ArrivalClock:
         self._least: deque[tuple[int, int]] = deque()  # (arrival, offset), offsets increasing
 
     def host_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """When a sample was taken, given its stamp and its arrival (ns)."""
+        """When a sample was taken, on the host's clock.
+
+        stamp_ns: on the device's clock. arrived_ns: on the host's clock, ascending from call to call.
+        """
         offset = arrived_ns - stamp_ns
         while self._least and self._least[-1][1] >= offset:
             self._least.pop()

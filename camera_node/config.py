@@ -1,7 +1,8 @@
 """The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the model in ``MODELS``. Every key is checked here, with file and key in the message. What
-needs the data itself (does the folder hold this camera?) is checked when the source opens.
+``kind`` chooses the dataclass in ``MODELS``, whose docstring ``camera-node sources`` prints. All keys are
+checked here, with file and key in the message. Checks that need the data itself (does the folder hold this
+camera?) are made when the source opens.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ PAIRINGS = ("nearest", "interpolated")
 BACKGROUNDS = ("white", "black", "keep")
 ROBOTS = ("ur3e",)
 FPS_RANGE = (0.01, 1000.0)
-"""Of captures, and of frames of a recording, a second."""
+"""Bounds of a rate of captures or of a recording, frames a second."""
 MAX_GAP_MS = 3.6e6
-"""Between a frame and the pose it is paired with: poses an hour away are another recording's."""
+"""Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
 MAX_LATENCY_MS = 6e4
-"""Of a camera: one that shows what was a minute ago is not live."""
+"""Longest latency of a camera: one that is a minute late is not live."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class WorldConfig(SourceConfig):
     arm: ArmConfig | None = None
 
     def scene_parameters(self) -> dict[str, Any]:
-        """What the scene is made with: the keys above that were given, and ``params``."""
+        """Parameters of the scene by name: the fields above that were given, and ``params``."""
         names = ("width", "height", "horizontal_fov_deg", "speed_m_per_s", "motion_seed")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return {**given, **self.params}
@@ -297,7 +298,7 @@ MODELS: dict[str, type[SourceConfig]] = {
 
 @contextlib.contextmanager
 def errors_of(where: str) -> Iterator[None]:
-    """A ValueError within becomes a ScenarioError that begins with ``where``: file and key."""
+    """Context in which a ValueError becomes a ScenarioError that begins with ``where`` (file and key)."""
     try:
         yield
     except ValueError as error:
@@ -314,8 +315,11 @@ def source_config(scenario: Scenario) -> SourceConfig:
 
 
 def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:
-    """The file or folder ``name`` of ``key``: absolute, or below ``base`` (--data), else below
-    $FRESHFIELD_DATA. Raises ScenarioError saying what to set."""
+    """Locate the file or folder ``name`` that the scenario gives as ``source.key``.
+
+    name: absolute, or relative to the data folder. base: the data folder (--data); None: $FRESHFIELD_DATA.
+    Raises ScenarioError if there is no data folder, or nothing at the path.
+    """
     where = f"{scenario.path}: source.{key}"
     path = Path(name).expanduser()
     if not path.is_absolute():

@@ -1,6 +1,6 @@
-"""``camera-node doctor``: examines what a scenario needs on this machine, part by part, and moves nothing.
+"""``camera-node doctor``: checks what a scenario needs on this machine, part by part. It moves no arm.
 
-Every part is checked whatever the result of the ones before, so that one call names all that is wrong.
+All parts are checked, whatever the earlier results, so one call reports everything that is wrong.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from freshfield.scenario import Scenario, load
 LEAST_FREE_GB = 2.0
 _EXCHANGES = 8
 _ANSWER_S = 2.0
-_LISTEN_S = 1.0  # in half of it, one late frame changes the rate by a third
+_LISTEN_S = 1.0  # to a camera; in half of it, one late frame changes the rate by a third
 _LISTEN_AT_MOST_S = 3.0  # to a slow camera
-_JUDGED_FRAMES = 5  # of the rate that was asked for; with fewer, chance decides
+_JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with fewer, chance decides
 _LEAST_RATE = 0.6
 # extra -> (module, distribution)
 _PACKAGES = {
@@ -44,12 +44,12 @@ _TIMEX_BYTES = 512
 
 
 class CheckFailed(ValueError):
-    """What is wrong with a part, and what to do."""
+    """A failed check; the message says what is wrong and what to do."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The result for one part. ok: None where nothing was checked."""
+    """The result for one part. ok: None if nothing was checked. said: the finding, for people."""
 
     part: str
     ok: bool | None
@@ -57,7 +57,7 @@ class CheckResult:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine and print; 1 if something is wrong."""
+    """Run all checks and print the results. Returns the exit code: 1 if something is wrong, else 0."""
     results = []
     for result in run_checks(args.scenario, args.to, args.data, args.out, transport.from_arguments(args)):
         results.append(result)
@@ -75,11 +75,13 @@ def run(args: argparse.Namespace) -> int:
 def run_checks(
     name: str | None, to: str | None, data: Path | None, out: Path, security: transport.Transport
 ) -> Iterator[CheckResult]:
-    """The results, as they come.
+    """Yield the results as they come.
 
     name: scenario file, or the name of a shipped one; None checks only what every scenario needs.
-    to: HOST:PORT of the next hop; None leaves the network out.
-    data: folder of the data sets. out: where runs will be written. security: of the connection.
+    to: HOST:PORT of the next hop; None skips the network.
+    data: folder of the data sets; None: $FRESHFIELD_DATA.
+    out: folder where runs will be written.
+    security: TLS and tokens of the connection to ``to``.
     """
     yield _check("python", _python)
     yield _check("clock", _clock)
@@ -123,7 +125,7 @@ def _check(part: str, check: Callable[[], str]) -> CheckResult:
         return CheckResult(part, True, check())
     except (ValueError, OSError) as error:
         return CheckResult(part, False, " ".join(str(error).split()).removeprefix(f"{part.split()[-1]}: "))
-    except Exception as error:  # libraries of devices raise what they like: the other parts count too
+    except Exception as error:  # device libraries raise anything; the other parts must still be checked
         return CheckResult(part, False, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -144,7 +146,7 @@ def _package(extra: str) -> str:
 
 
 def _clock() -> str:
-    """What the kernel says of the clock's discipline (adjtimex)."""
+    """Whether the kernel reports the clock as synchronized (adjtimex)."""
     if sys.platform != "linux":
         raise CheckFailed("whether the clock is synchronized can only be asked on Linux")
     buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
@@ -191,7 +193,7 @@ def _network(to: str, security: transport.Transport) -> str:
 
 
 async def _exchange(target: str, security: transport.Transport) -> tuple[float, float]:
-    """The other clock minus ours and its bound, both in ms."""
+    """The peer's clock minus ours and the error bound, both in ms."""
     import grpc
     import grpc.aio
 
@@ -231,7 +233,7 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
 
 
 def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
-    """Open it, take frames until at least five should have come, close it."""
+    """Open the camera, take frames for as long as five should take (1 to 3 s), and close it."""
     from camera_node.sources.devices.live import DEFAULT_FPS, calibrations, open_feed
 
     clock = WallClock()

@@ -1,4 +1,4 @@
-"""What ``camera-node sources`` and ``camera-node effects`` print, taken from the models themselves."""
+"""The output of ``camera-node sources`` and ``camera-node effects``, taken from the settings' dataclasses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _doc(model: type) -> str:
 
 def _keys(model: Any, leave_out: list[str] | None = None) -> list[str]:
     fields = [f for f in dataclasses.fields(model) if f.name not in (leave_out or [])]
-    fields.sort(key=lambda f: bool(f.kw_only))  # what every effect has comes last
+    fields.sort(key=lambda f: bool(f.kw_only))  # fields that all effects share come last
     return [f"    {f.name:22} {_default(f)}" for f in fields]
 
 

@@ -1,4 +1,4 @@
-"""A camera node: its cameras capture on one schedule, each sends on a stream of its own."""
+"""A camera node: captures with one or several cameras, each of which sends on its own stream."""
 
 from __future__ import annotations
 
@@ -41,9 +41,10 @@ class NodeOptions:
     """How a node runs.
 
     to: HOST:PORT of the next hop.
-    clock: true time, which decides when frames are taken; a camera with a wrong clock stamps by that.
-    out: folder for ledger and status; None for neither.
-    seconds: how long to capture; None until stopped.
+    transport: TLS and tokens of the connection.
+    clock: true time, which decides when frames are captured; a camera with a wrong clock only stamps with it.
+    out: folder for the ledger and the status file; None writes neither.
+    seconds: duration of capture; None: until stopped.
     response_timeout_s: see ``Sender``.
     """
 
@@ -56,8 +57,11 @@ class NodeOptions:
 
 
 class Node:
-    """One process's cameras, from capture to the stream. ``await run()`` returns when ``stop`` was called
-    or the time is over."""
+    """The cameras of one process, from capture to the stream. ``await run()`` returns once ``stop`` was
+    called, the options' duration is over, or all recordings have ended.
+
+    cameras: opened, at least one.
+    """
 
     def __init__(self, scenario: Scenario, cameras: Sequence[Camera], options: NodeOptions) -> None:
         self.name = node_name([c.name for c in cameras])
@@ -76,11 +80,12 @@ class Node:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="capture")
 
     def stop(self) -> None:
-        """Ask ``run`` to end; safe to call from a signal handler of the loop, and twice."""
+        """Ask ``run`` to end. May be called from the loop's signal handlers, and more than once."""
         self._stopping.set()
 
     async def run(self) -> None:
-        """Connect, prepare, capture and send until stopped. Raises what a camera's task raised."""
+        """Connect, prepare, capture and send until stopped. Raises what a camera's task raised, OSError if
+        the ledger cannot be created, and TransportError."""
         ledger = None
         if self._options.out is not None:
             ledger = Ledger(self._options.out, "node", self.name, self._clock.now_ns())
@@ -109,7 +114,8 @@ class Node:
     def _sync_of(
         self, camera: str, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...]
     ) -> ClockSync:
-        """Cameras on the machine's clock share one estimate; one with a wrong clock needs its own."""
+        """The offset estimate of a camera: shared by cameras on the exact clock; a wrong clock has its
+        own."""
         clock = self._clocks[camera]
         if not clock.exact:
             return ClockSync(channel, metadata, clock)
@@ -140,7 +146,7 @@ class Node:
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
         if any(camera.schedule(0).lossless for camera in self._cameras):
-            # A recording that began before there is somebody to send it to would lose its beginning.
+            # Wait for the connection: a recording that started earlier would lose its beginning.
             self._enter("connecting")
             while not all(sender.ready for sender in self.senders.values()):
                 await asyncio.sleep(_READY_POLL_S)
@@ -159,7 +165,7 @@ class Node:
                 raise result
 
     async def _capture(self, camera: Camera, start_ns: int) -> None:
-        """One camera's captures, each when its schedule has it due in true time."""
+        """Capture with one camera, each time its schedule is due in true time."""
         loop = asyncio.get_running_loop()
         outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
         schedule = camera.schedule(start_ns)
@@ -175,8 +181,8 @@ class Node:
             except (ValueError, OSError) as error:  # OSError: a photo that is gone
                 self._failed(camera.name, error)
             else:
-                # What is rendered or read shows the instant the tick was due, however late the loop woke for
-                # it; a real camera says itself when it exposed.
+                # A rendered or read image shows the instant at which the tick was due, however late the loop
+                # woke up; a real camera reports when it exposed.
                 shown_ns = due_ns if shot.captured_ns is None else shot.captured_ns
                 generated_ns = self._clocks[camera.name].stamp_ns(shown_ns)
                 if schedule.lossless:
@@ -225,18 +231,20 @@ class Node:
 
     def _write_status(self) -> None:
         if self._options.out is not None:
-            with contextlib.suppress(OSError):  # a full disk costs a status, not the node
+            with contextlib.suppress(OSError):  # a full disk must not end the node
                 write_json(self._options.out / f"node-{self.name}.json", self.status())
 
     def status(self) -> dict[str, Any]:
-        """What the status file ``OUT/node-<name>.json`` holds, replaced as a whole about once a second.
+        """Contents of the status file ``OUT/node-<name>.json``, which is replaced about once a second.
 
-        Keys: name, pid, session, phase (starting, preparing, connecting, streaming, stopped), to, t_ns
-        (machine's clock), and for each of ``cameras``: fps, held_out, connected, connections, trouble (text
-        or null), clock_offset_ms and clock_uncertainty_ms (peer minus camera; null before the first
-        exchange), waiting, captured, replaced, sent, broken, outcomes {accepted, dropped_busy, superseded,
-        "rejected:<reason>"}, missed (ticks the machine was too slow for), failed (shots that could not be
-        made).
+        Keys: name, pid, session, phase (starting, preparing, connecting, streaming, stopped), to, t_ns (on
+        the node's true clock), and cameras.
+
+        Keys of each camera: fps, held_out, connected, connections, trouble (text or null), clock_offset_ms
+        and clock_uncertainty_ms (peer minus camera; null before the first exchange), the numbers of frames
+        waiting, captured, replaced, sent and broken, outcomes {accepted, dropped_busy, superseded,
+        "rejected:<reason>"}, missed (ticks for which the machine was too slow), failed (shots that could not
+        be made).
         """
         return {
             "name": self.name,
@@ -270,5 +278,5 @@ class Node:
 
 
 def node_name(cameras: Sequence[str]) -> str:
-    """Name of a node in file names: its camera, or the first and how many more."""
+    """Name of a node in file names: its camera, or the first one and the number of the others (cam00+3)."""
     return cameras[0] if len(cameras) == 1 else f"{cameras[0]}+{len(cameras) - 1}"

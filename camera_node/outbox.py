@@ -1,4 +1,4 @@
-"""The one place where a captured frame waits to be sent, and the counts of all frames' outcomes."""
+"""Holds the one captured frame that waits to be sent, and counts the outcomes of all frames."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from freshfield.ledger import Ledger
 
 
 class Outbox:
-    """One camera's newest unsent frame. Counts every frame's events and writes them to the ledger.
+    """One camera's newest unsent frame. Counts the events of all frames and writes them to the ledger.
 
-    counts: captured, replaced, sent, broken, and one entry for each outcome of an answer.
+    ledger: None writes none. clock: stamps the events.
+    counts: numbers of frames captured, replaced, sent and broken, and of answers by outcome.
     """
 
     def __init__(self, camera: str, session: str, ledger: Ledger | None, clock: Clock) -> None:
@@ -29,12 +30,13 @@ class Outbox:
 
     @property
     def waiting(self) -> int:
+        """Number of waiting frames: 0 or 1."""
         return int(self._frame is not None)
 
     def put(self, frame: Frame) -> None:
         """Offer a captured frame; it replaces one that still waits."""
         if self._frame is not None:
-            # Before ``captured``, so that a process killed in between leaves at most one frame waiting.
+            # Recorded before ``captured``: a process killed in between leaves at most one frame waiting.
             self.record(self._frame.sequence, "replaced")
         self._frame = frame
         self.record(frame.sequence, "captured")
@@ -42,16 +44,17 @@ class Outbox:
         self._emptied.clear()
 
     async def wait_empty(self) -> None:
-        """Until no frame waits, so that ``put`` replaces none."""
+        """Wait until no frame waits, so that ``put`` replaces none."""
         await self._emptied.wait()
 
     async def wait_frame(self) -> None:
-        """Until a frame waits."""
+        """Wait until a frame waits."""
         await self._filled.wait()
 
     def take(self) -> Frame:
-        """The waiting frame, which counts as sent from now on: a process killed between this and the
-        write leaves a frame in flight, never one that arrived without having been sent."""
+        """Take the waiting frame and record it as sent. Recording it before the write means that a killed
+        process may leave a frame in flight, but never one that arrived without a record of being sent.
+        Raises LookupError if no frame waits."""
         frame, self._frame = self._frame, None
         if frame is None:
             raise LookupError("no frame is waiting")
@@ -61,12 +64,12 @@ class Outbox:
         return frame
 
     def close(self) -> None:
-        """The node ends: enter a frame that still waits in the ledger as ``waiting``."""
+        """At the node's end: record a frame that still waits as ``waiting`` in the ledger."""
         if self._frame is not None:
             self._write(self._frame.sequence, "waiting")
 
     def record(self, sequence: int, event: str, detail: str = "") -> None:
-        """Count an event and write it to the ledger."""
+        """Count an event (an answer by its outcome, ``detail``) and write it to the ledger."""
         self.counts[detail if event == "answered" else event] += 1
         self._write(sequence, event, detail)
 

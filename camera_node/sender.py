@@ -1,4 +1,5 @@
-"""One camera's stream: each frame is sent when the one before was answered, as long as the node lives."""
+"""One camera's stream: sends each frame after the previous one was answered, and reconnects after
+failures."""
 
 from __future__ import annotations
 
@@ -27,13 +28,13 @@ FIRST_BACKOFF_S = 0.2
 MAX_BACKOFF_S = 1.0
 # How long one attempt waits for a peer that cannot be reached.
 CONNECT_S = 6.0
-# How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
+# How long the first frame waits for the first clock exchange; with a peer that tells no time, only once.
 OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
-# An answer is waited for so many times as long as the slowest of the last ones took, this long at least.
+# An answer may take this many times as long as the slowest recent one, and at least this many seconds.
 _PATIENCE, _LEAST_PATIENCE_S = 8.0, 1.25
-_FORGET = 0.95  # by answer, of how long the slowest took
-# An offset that was never measured may be anything: zero with a small uncertainty would be wrong.
+_FORGET = 0.95  # decay per answer of the slowest recent answer's time
+# An offset that was never measured may have any value, so its uncertainty is large.
 UNKNOWN_OFFSET = Offset(0, MAX_CAPTURE_AGE_NS)
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
 
@@ -45,16 +46,18 @@ _OUTCOMES = {
 
 
 class ProtocolError(RuntimeError):
-    """The peer sent an answer that does not belong to the frame."""
+    """The peer broke the protocol, e.g. answered another frame, or ended the stream."""
 
 
 class Sender:
-    """Sends what waits in an outbox over one stream, one frame unacknowledged, and reconnects for ever.
+    """Sends the frames of an outbox over one stream, at most one unanswered at a time, and reconnects for
+    ever.
 
-    offset: returns the current estimate of the peer's clock, which each frame carries.
-    jitter: of the pauses between attempts.
-    response_timeout_s: an answer that takes longer means a dead stream, and one that takes much longer than
-        those before as well. After each such stream the next answer may take twice as long.
+    metadata: of the calls.
+    offset: returns the current estimate of the peer's clock minus the camera's, which each frame carries.
+    jitter: random generator for the pauses between attempts.
+    response_timeout_s: the stream counts as dead if an answer takes longer than this, or much longer than the
+        recent ones. After each such timeout the allowed time is doubled, up to this one.
     """
 
     def __init__(
@@ -83,11 +86,11 @@ class Sender:
 
     @property
     def ready(self) -> bool:
-        """Whether a frame put into the outbox now would leave at once, dated."""
+        """Whether a frame put into the outbox now would be sent at once, with a clock offset."""
         return self.connected and self._offset_awaited
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Connect and send until cancelled."""
         failures = 0
         while True:
             answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
@@ -102,7 +105,7 @@ class Sender:
             ) as error:
                 self._report(error)
             except asyncio.CancelledError:
-                # gRPC raises this too where a call was cancelled by itself; only our own ends the sender.
+                # gRPC raises this also if only the call was cancelled; a cancelled task ends the sender.
                 task = asyncio.current_task()
                 if task is None or task.cancelling():
                     raise
@@ -133,8 +136,8 @@ class Sender:
             call.cancel()
 
     async def _await_offset(self, call: grpc.aio.StreamStreamCall) -> None:
-        """Wait up to ``OFFSET_WAIT_S`` until the peer's clock is known: the age of earlier frames would be
-        unknown. The outbox takes captures meanwhile, so that the newest is sent first."""
+        """Wait up to ``OFFSET_WAIT_S`` until the peer's clock is known, because the age of earlier frames
+        would be unknown. The outbox takes captures meanwhile, so the newest one is sent first."""
         if self._offset_awaited:
             return
         try:
@@ -156,7 +159,7 @@ class Sender:
                 response = await call.read()
             if response is grpc.aio.EOF:
                 raise await _status(call)
-            if response is None:  # what gRPC makes of bytes that are no PushResponse
+            if response is None:  # gRPC's result for bytes that are no PushResponse
                 raise ProtocolError("the answer is no PushResponse")
             if response.sequence != frame.sequence:
                 raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
@@ -192,7 +195,7 @@ class Sender:
         self.outbox.record(frame.sequence, "answered", outcome)
 
     def _report(self, error: Exception) -> None:
-        """Log what broke, once per kind of trouble and not once per attempt."""
+        """Log what failed, once per kind of trouble and not once per attempt."""
         if isinstance(error, grpc.aio.AioRpcError):
             text = f"{error.code().name}: {peer_text(error.details())}"
         else:

@@ -40,8 +40,11 @@ Emulates a bad network between cameras and the edge, seeded and per frame.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line. Exit status 0; 1: a replay or a bench that did not agree, or the live emulator
-    broke; 2: bad input."""
+    """Run the command line. argv: arguments without the program's name; None: those of the process.
+
+    Returns the exit status: 0; 1 if a replay differed, a bench lost frames or the live emulator failed; 2 for
+    bad input; 130 after Ctrl-C.
+    """
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -98,7 +101,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
-    """The options of both live commands, as ``_serve`` reads them. what: passes the link."""
+    """Add the options of both live commands, which ``_serve`` reads. what: unit that passes the link."""
     sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--trace", type=out_file, metavar="FILE", help=f"record what happens to every {what}")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
@@ -109,7 +112,7 @@ def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
 def _serve(
     args: argparse.Namespace, config: ChannelConfig, seed: int, hook: Hook | None = None, **options: Any
 ) -> tuple[int, Report | None]:
-    """Run a proxy until told to stop: the exit status, and the report if nothing broke."""
+    """Run a proxy until SIGINT or SIGTERM. Returns the exit status, and the report if nothing failed."""
     from channel_emu.live.priority import SWITCH_INTERVAL_S, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
     from channel_emu.model import trace
@@ -161,7 +164,7 @@ def _add_simulate(commands: Any) -> None:
 
 
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
-    """The options that describe a channel, as ``_config_of`` reads them."""
+    """Add the options that describe a channel, which ``_config_of`` reads."""
     source = sub.add_mutually_exclusive_group()
     source.add_argument("--preset", default="ideal", metavar="NAME", help="one of those that channel-emu "
                         "presets lists, or of a file (%(default)s)")  # fmt: skip
@@ -213,7 +216,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
-    """The channel of ``_add_channel_options``; a scenario spells its section in the same way."""
+    """The channel that the options of ``_add_channel_options`` describe; they override the preset or the
+    scenario's section."""
     if args.service and args.service_by_state:
         raise spelling.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
@@ -232,7 +236,7 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
             section["faults"] |= spelling.fault(text)
     if args.shared_server:
         section["server"] = {"shared": True}
-    if vars(args).get("spread"):  # of simulate alone
+    if vars(args).get("spread"):  # only simulate has it
         section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
     return channel_from_mapping(section, "channel", folder)
 

@@ -1,7 +1,7 @@
 """A bad network for your own tests: the pytest fixture ``channel``.
 
-It needs pytest and nothing else (``pip install freshfield[test]``). In the ``conftest.py`` at the root of
-your tests::
+It needs only pytest besides freshfield (``pip install freshfield[test]``). In the ``conftest.py`` at the root
+of your tests::
 
     pytest_plugins = ["channel_emu.testing"]
 
@@ -28,7 +28,7 @@ behind a seeded link, talks to ``link.address`` instead of the service, and asse
 
 The first argument is a preset (``ideal``, ``ch5``, ``ch6``, ...), a mapping as in a scenario's ``channel:``
 section, or a ``ChannelConfig``. The same seed gives the same decisions for messages offered at the same
-instants. When a test fails, pytest shows each link's seed and figures in a section of their own.
+instants. When a test fails, pytest shows each link's seed and statistics in a section of their own.
 """
 
 from __future__ import annotations
@@ -56,8 +56,10 @@ _PATIENCE_S = 30.0
 
 
 class EmulatedLink:
-    """A running proxy in front of one service, with an event loop in a thread of its own. address: where
-    clients connect."""
+    """A running proxy in front of one service, with an event loop in its own thread.
+
+    address: HOST:PORT to which clients connect.
+    """
 
     def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
         self.config = config
@@ -77,11 +79,11 @@ class EmulatedLink:
 
     def report(self) -> Report:
         """Ages, losses and delays so far, in total and by method; after ``close`` the last report. Raises
-        EmulatorFailed if the proxy broke."""
+        EmulatorFailed if the proxy failed."""
         return self._last or self._await(self._report(checked=True))
 
     def settle(self, timeout_s: float = 10.0) -> Report:
-        """Wait until no message is inside the link, then report. Raises TimeoutError."""
+        """Wait until no message is inside the link, then report. Raises TimeoutError, EmulatorFailed."""
         try:
             self._await(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + _PATIENCE_S)
         except TimeoutError:
@@ -90,7 +92,7 @@ class EmulatedLink:
         return self.report()
 
     def close(self) -> None:
-        """Stop the proxy; open calls end. A second call does nothing."""
+        """Stop the proxy and end open calls. A second call does nothing."""
         if self._last is None:
             try:
                 self._last = self._await(self._report(checked=False))
@@ -99,7 +101,7 @@ class EmulatedLink:
                 self._end()
 
     def describe(self) -> str:
-        """The call that makes the same link again, and what this one did."""
+        """Text with the call that makes the same link again, and with the report of this one."""
         report = self._last or self._await(self._report(checked=False))
         head = (
             f"channel({self._channel_argument()}, to={self.options.to!r}, seed={self.seed}, "
@@ -147,16 +149,19 @@ def put_behind(
     replay: Path | None = None,
     transport: Transport | None = None,
 ) -> EmulatedLink:
-    """A link in front of the service at ``to``; ``close`` it after use. The fixture calls this.
+    """Start a link in front of the service at ``to``; ``close`` it after use. The fixture calls this.
 
     channel: a preset's name, a ``channel:`` section, or a configuration.
-    to, listen: HOST:PORT of the service and of the link; port 0 takes any free one.
+    to: HOST:PORT of the service.
+    seed: of the link's decisions.
     direction: the messages that pass the link: up (to the service), down (its answers) or both.
     shared: one link for all methods of a direction, instead of one each.
-    trace: record to this file. replay: repeat the decisions of a recorded file.
-    transport: TLS and tokens of both sides.
-
-    Raises ScenarioError, TraceError, TransportError (all ValueErrors), one line that says what to change.
+    listen: HOST:PORT of the link; port 0 takes any free one.
+    trace: record to this file.
+    replay: repeat the decisions of a trace file.
+    transport: TLS and tokens of both sides; None: plain text.
+    Raises ScenarioError, TraceError or TransportError (all ValueErrors) with one line that says what to
+    change.
     """
     section: Any = {"preset": channel} if isinstance(channel, str) else channel
     config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
@@ -167,9 +172,9 @@ def put_behind(
 
 @pytest.fixture
 def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
-    """Makes seeded links in front of gRPC services: ``link = channel("ch5", to="localhost:50051", seed=1)``.
+    """Fixture that makes links in front of gRPC services: ``link = channel("ch5", to="localhost:50051")``.
 
-    Arguments as ``put_behind``. All links end with the test.
+    Arguments as in ``put_behind``. All links are closed at the end of the test.
     """
     links: list[EmulatedLink] = []
 
@@ -187,6 +192,6 @@ def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
             for link in links:
                 ending.callback(link.close)
         if links:
-            # Shown by pytest where the test failed.
+            # Shown by pytest if the test failed.
             text = "\n".join(link.describe() for link in links)
             request.node.add_report_section("teardown", "emulated channel", text)

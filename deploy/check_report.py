@@ -1,6 +1,7 @@
 """Checks the report of a run: ``python deploy/check_report.py OUT``; exit code 1 if it is wrong.
 
-Continuous integration runs it after a short demo. It checks what every healthy run has, and no figures.
+Continuous integration runs it after a short demo. It checks properties of every healthy run, not how good the
+results are.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Writes the lock files that the images install from: ``python deploy/lock.py`` (``make lock``).
 
 ``deploy/locks/*.txt`` name each package's exact version and the SHA-256 of its wheels, for Python 3.11 on
-Linux (x86-64, and ARM where there is a wheel). ``camera`` is for nodes and emulator, ``edge`` for the edge
-without torch, ``torch-cpu`` and ``torch-cuda`` for each build of torch with what it alone needs, ``build``
-for what builds the package. Versions are the newest that pyproject.toml allows, but torch's stands here.
+Linux (x86-64, and ARM if there is a wheel). ``camera`` is for nodes and emulator, ``edge`` for the edge
+without torch, ``torch-cpu`` and ``torch-cuda`` for each build of torch with the packages that only it needs,
+``build`` for building the package. Versions are the newest that pyproject.toml allows, except torch's, which
+is set here.
 
-Needs Python 3.11 and pip 23 or newer. The CPU build of torch is not on the default index: name PyTorch's own
-in TORCH_INDEX, or in pip's configuration.
+Needs Python 3.11 and pip 23 or newer. The CPU build of torch is not on the default index: name PyTorch's
+index in TORCH_INDEX, or in pip's configuration.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 TORCH = "2.13.0"
-"""What checkpoints, kernels and figures were measured with."""
+"""The version with which checkpoints, kernels and figures were made."""
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCKS = ROOT / "deploy" / "locks"
@@ -34,8 +35,10 @@ Lock = dict[str, tuple[str, set[str]]]
 
 
 def resolve(*wanted: str, pins: Lock | None = None) -> Lock:
-    """What pip would install for ``wanted`` on this machine, at the versions of ``pins`` where it names them.
-    Ends the program where there is nothing to install."""
+    """The packages that pip would install for the requirements ``wanted`` on this machine.
+
+    pins: versions to use for the packages in it. Exits the program if pip cannot resolve them.
+    """
     index = os.environ.get("TORCH_INDEX")
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as constraints:
         constraints.writelines(f"{name}=={version}\n" for name, (version, _) in (pins or {}).items())
@@ -48,7 +51,7 @@ def resolve(*wanted: str, pins: Lock | None = None) -> Lock:
 
 
 def arm_hashes(requirement: str) -> set[str]:
-    """Of the wheel for ARM; empty where there is none."""
+    """Hashes of a requirement's wheel for ARM; empty if there is none."""
     platforms = (f"--platform={name}" for name in ARM)
     done = _dry_run("--no-deps", "--target", tempfile.gettempdir(), *platforms, requirement)
     return set() if done.returncode else {h for _, hashes in _wheels(done.stdout).values() for h in hashes}
@@ -62,7 +65,7 @@ def _dry_run(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def _wheels(report: str) -> Lock:
-    """Of pip's report, without the project itself, which is no archive."""
+    """The packages in pip's report, without the project itself, which is not an archive."""
     return {
         item["metadata"]["name"].lower().replace("_", "-"): (
             item["metadata"]["version"],
@@ -74,7 +77,7 @@ def _wheels(report: str) -> Lock:
 
 
 def sha256(download: dict[str, Any]) -> str:
-    """Of one wheel in pip's report, computed where it is a file of this machine that no index describes."""
+    """Hash of one wheel in pip's report; computed if the wheel is a local file without a hash."""
     known = download["archive_info"].get("hashes", {}).get("sha256")
     if known is None:
         known = hashlib.sha256(Path(unquote(urlsplit(download["url"]).path)).read_bytes()).hexdigest()
@@ -82,7 +85,7 @@ def sha256(download: dict[str, Any]) -> str:
 
 
 def write(name: str, lock: Lock) -> None:
-    """``locks/NAME.txt``: one line a package. The hashes of ARM's wheels are added where each is there."""
+    """Write ``locks/NAME.txt``, one line a package. Adds the hashes of the wheels for ARM to ``lock``."""
     pinned = {package: f"{package}=={version}" for package, (version, _) in lock.items()}
     for package, requirement in pinned.items():
         lock[package][1].update(arm_hashes(requirement))
@@ -95,7 +98,7 @@ def write(name: str, lock: Lock) -> None:
 
 def main() -> None:
     LOCKS.mkdir(exist_ok=True)
-    # "===" compares text: "==" would take a build for another processor as well.
+    # "===" compares text; "==" would accept builds with another local version (+cpu) as well.
     cuda = resolve(".[edge,embed]", f"torch==={TORCH}")
     cpu = resolve(
         ".[edge,embed]", f"torch==={TORCH}+cpu", pins={n: v for n, v in cuda.items() if n != "torch"}

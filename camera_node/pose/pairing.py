@@ -1,8 +1,8 @@
-"""Pairing frames with what an arm reports (thesis 4.3.3), while both still arrive, each at its own rate.
+"""Pairs live frames with the pose samples of an arm (thesis 4.3.3), which arrive at another rate.
 
 The thesis takes the sample nearest to the frame. The two samples around it can also be interpolated: linearly
-with slerp, or linearly in joint space. ``camera-node calibrate accuracy`` measures what that gains. The time
-to the nearest sample goes with the frame, and a frame without a sample within a bound gets no pose.
+with slerp, or linearly in joint space; ``camera-node calibrate accuracy`` measures the gain. The frame
+carries the time to the nearest sample, and a frame without a sample within a bound gets no pose.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ Joints = NDArray[np.float64]
 
 
 def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
-    """Joint angles (J,) in radians, linearly: a controller reports them unwrapped."""
+    """Interpolate joint angles (J,), radians, linearly: a controller reports them unwrapped."""
     return (1.0 - fraction) * a + fraction * b
 
 
 @dataclass
 class PairingCounts:
-    """Samples of a buffer or recording.
+    """Counts of the samples of a buffer or recording.
 
-    duplicates: those with a known stamp (the first is kept). reordered: those older than the newest, inserted
-    at their place. restarts: how often the sender's clock was seen to be set back.
+    samples: all that came.
+    duplicates: those with a stamp that was known already (the first is kept).
+    reordered: those older than the newest, inserted in order.
+    restarts: how often the sender's clock was found to be set back.
     """
 
     samples: int = 0
@@ -43,13 +45,14 @@ class PairingCounts:
 
 
 class SampleBuffer(Generic[T]):
-    """The last ``keep_ns`` of a stream of samples, sorted by stamp. Thread-safe: one thread adds, others ask.
+    """The last ``keep_ns`` of a stream of samples, sorted by stamp. Thread-safe.
 
-    interpolate: makes a sample between two; None takes the nearest.
+    interpolate: makes a sample at a fraction between two; None takes the nearest sample.
     max_gap_ns: an instant farther than this from every sample is refused.
-    keep_ns: samples this much older than the newest are dropped.
-    restart_after: so many stale samples in a row, each newer than the one before, mean that the sender's
-        clock was set back or that a wrong stamp had emptied the buffer; they then replace its contents.
+    keep_ns: samples older than the newest by more than this are dropped.
+    restart_after: number of consecutive samples, ascending but too old, after which they replace the buffer:
+        the sender's clock was set back, or a wrong stamp had emptied the buffer.
+    Raises ValueError for a value out of range.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class SampleBuffer(Generic[T]):
         self._lock = threading.Lock()
 
     def add(self, t_ns: int, sample: T) -> bool:
-        """Take a sample; False if it was a duplicate or too old."""
+        """Add a sample taken at ``t_ns``. False if it was a duplicate or too old."""
         with self._lock:
             self.counts.samples += 1
             if self._times and t_ns < self._times[-1] - self._keep_ns:
@@ -87,12 +90,12 @@ class SampleBuffer(Generic[T]):
             return True
 
     def at(self, t_ns: int) -> tuple[T, int]:
-        """See ``PoseProvider``, of whatever samples these are."""
+        """The sample for an instant, and the time (ns) to the nearest sample; see ``sample_at``."""
         with self._lock:
             return sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
 
     def ready(self, t_ns: int) -> bool:
-        """Whether a sample as new as the instant has come; until then the newest one would be repeated."""
+        """Whether a sample at or after the instant has come; before that, ``at`` cannot interpolate."""
         with self._lock:
             return bool(self._times) and self._times[-1] >= t_ns
 
@@ -109,14 +112,15 @@ class SampleBuffer(Generic[T]):
         return True
 
     def _prune(self) -> None:
-        # An eighth more than is kept, so that a full list is not moved at every sample.
+        # Let the list grow by an eighth first, so that it is not moved at every sample.
         if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
             first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
             del self._times[:first], self._samples[:first]
 
 
 def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], PairingCounts]:
-    """A recording sorted by stamp, each stamp once (the first that came), and what was corrected."""
+    """Sort a recording by stamp and keep the first sample of each stamp. Returns times, samples and
+    counts."""
     counts = PairingCounts(samples=len(times_ns))
     newest = None
     kept: dict[int, T] = {}

@@ -1,7 +1,7 @@
-"""Poses of cameras: fixed ones, and ones that follow a recorded trajectory.
+"""Poses of cameras: fixed ones, and poses along a recorded trajectory.
 
-A trajectory is a TUM file, ``t tx ty tz qx qy qz qw`` a line: seconds, meters, camera-to-world, OpenCV camera
-axes, the quaternion's w last (it is first everywhere else in this project).
+A trajectory is a TUM file with lines ``t tx ty tz qx qy qz qw``: seconds, meters, camera-to-world, OpenCV
+camera axes, w last in the quaternion (it is first everywhere else in this project).
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ class TrajectoryError(ValueError):
 
 
 class PoseGapError(ValueError):
-    """No pose sample is near enough to the asked instant."""
+    """No pose sample is near enough to the requested instant."""
 
 
 class PoseProvider(Protocol):
     def at(self, t_ns: int) -> tuple[Pose, int]:
-        """The pose for an instant, and the time (ns) from that instant to the nearest sample used. Raises
-        PoseGapError where no sample is near enough."""
+        """The camera-to-world pose for an instant, and the time (ns) from that instant to the nearest sample.
+        Raises PoseGapError if no sample is near enough."""
         ...
 
 
 @runtime_checkable
 class Closable(Protocol):
-    """What holds a connection or device until ``close``."""
+    """An object that holds a connection or device until ``close``."""
 
     def close(self) -> None: ...
 
 
 @dataclass(frozen=True)
 class FixedPose:
-    """A camera that does not move: always the same pose, no gap."""
+    """The pose of a camera that does not move."""
 
     pose: Pose
 
@@ -56,11 +56,13 @@ class FixedPose:
 
 
 class Trajectory:
-    """Pose samples in the order of time (ns), paired with instants.
+    """A recorded trajectory as a pose provider.
 
-    interpolate: rotation by slerp and translation by a straight line between the two samples around the
-    instant; otherwise the nearest sample (thesis 4.3.3). Either way an instant further than ``max_gap_ns``
-    from every sample has no pose: before the first, after the last, or within a long hole.
+    times_ns: of the samples, strictly increasing. poses: one for each time.
+    interpolate: slerp of the rotation and a straight line for the translation between the two samples around
+        the instant; False takes the nearest sample (thesis 4.3.3).
+    max_gap_ns: an instant farther than this from every sample has no pose.
+    Raises TrajectoryError if there are no samples, or times and poses do not match.
     """
 
     def __init__(
@@ -89,8 +91,10 @@ def sample_at(
 ) -> tuple[T, int]:
     """The sample for an instant, and the time (ns) from that instant to the nearest sample.
 
-    times_ns: of the samples, increasing. interpolate: makes a sample between two, at a share of the way from
-    the first to the second; None takes the nearest. Raises PoseGapError where none is within ``max_gap_ns``.
+    times_ns: of the samples, increasing.
+    t_ns: the instant.
+    interpolate: makes a sample at a fraction of the way from a first to a second; None takes the nearest.
+    Raises PoseGapError if no sample is within ``max_gap_ns``.
     """
     if not times_ns:
         raise PoseGapError("there is no pose yet")
@@ -113,7 +117,11 @@ def sample_at(
 def read_tum(
     path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0
 ) -> Trajectory:
-    """Read a trajectory file. start_ns: the file's time that becomes 0. Raises TrajectoryError."""
+    """Read a trajectory file. interpolate, max_gap_ns: see ``Trajectory``.
+
+    start_ns: time in the file that becomes 0.
+    Raises TrajectoryError.
+    """
     times, poses = read_samples(path)
     try:
         return Trajectory([t_ns - start_ns for t_ns in times], poses, interpolate, max_gap_ns)
@@ -122,9 +130,11 @@ def read_tum(
 
 
 def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
-    """Times (ns) and poses of a file as they stand in it, in whatever order; fields are separated by spaces
-    or commas. Lines that are empty, start with # or name the columns (``t,x,...``) are skipped. Raises
-    TrajectoryError naming file and line."""
+    """Times (ns) and poses of a trajectory file, in the file's order.
+
+    Fields are separated by spaces or commas. Lines that are empty, start with # or name the columns
+    (``t,x,...``) are skipped. Raises TrajectoryError naming file and line.
+    """
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -154,7 +164,7 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
 
 
 def _nanoseconds(seconds: str) -> int:
-    # Stamps in UTC seconds have more digits than a float keeps: 1305031102.175304 is off by 100 ns.
+    # Stamps in UTC seconds have more digits than a float holds: 1305031102.175304 is off by 100 ns.
     whole, _, part = seconds.partition(".")
     if part.isdigit() and whole.lstrip("-").isdigit():
         value = int(whole.lstrip("-")) * 10**9 + int(part[:9].ljust(9, "0"))

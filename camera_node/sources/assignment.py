@@ -1,4 +1,4 @@
-"""Which camera of a data set stands for which camera of the scenario."""
+"""Maps the cameras of a scenario to cameras of a data set."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from freshfield.scenario import Scenario, ScenarioError
 def assign_cameras(
     scenario: Scenario, assignment: Mapping[str, str], cameras: Sequence[str], available: Sequence[str]
 ) -> dict[str, str]:
-    """Data set camera of each of ``cameras``.
+    """The data set camera of each of ``cameras``.
 
-    assignment: scenario camera -> data set camera; where it says nothing, the names are the same.
-    available: the data set's cameras.
-
-    Raises ScenarioError where a camera does not exist, or two cameras would show the same.
+    assignment: scenario camera to data set camera; cameras that it lacks have the same name in both.
+    available: names of the data set's cameras.
+    Raises ScenarioError if a camera does not exist, or two of the scenario's cameras would show the same one.
     """
     where = f"{scenario.path}: source.assignment"
     for camera in assignment:

@@ -1,4 +1,4 @@
-"""What a source of frames is: one camera, asked for the shot of a tick."""
+"""The interface of frame sources: one camera, which returns the shot of a tick."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from freshfield.geometry import Pinhole, Pose
 class Shot:
     """What a camera saw at one instant.
 
-    image: uint8 (H, W, 3) RGB or (H, W, 4) RGBA, or bytes in the scenario's codec; its size is that of
-        ``intrinsics``.
+    image: uint8 (H, W, 3) RGB or (H, W, 4) RGBA, or an encoded image (bytes) in the camera's codec; its size
+        is that of ``intrinsics``.
+    pose: camera-to-world.
     pose_gap_ns: time between the exposure and the pose sample that it was paired with.
-    captured_ns: when a real camera exposed it, on the node's clock; None: at the tick it was asked for.
+    captured_ns: when a real camera exposed it, on the node's clock; None: at the tick's instant.
     """
 
     image: NDArray[np.uint8] | bytes
@@ -31,15 +32,17 @@ class Shot:
 
 
 def rate(fps: float) -> Fraction:
-    """A frame rate as an exact fraction: 29.97 is 2997/100, 33.3333 is 100/3."""
+    """A frame rate as a fraction with a denominator up to 1001: 29.97 is 2997/100, 33.3333 is 100/3."""
     return Fraction(fps).limit_denominator(1001)
 
 
 class Source(ABC):
-    """One camera. Tick k is the instant k / fps since the epoch, and phase_ns later, so that cameras in
-    different processes look at the same world.
+    """One camera. Tick k is the instant k / fps + phase_ns since the epoch, so cameras in different processes
+    see the same world.
 
-    contents: number of different shots before they repeat; None if they never do.
+    camera: id in the scenario.
+    intrinsics: of the shots; a shot's own hold if they differ.
+    contents: number of different shots before they repeat; None if they never repeat.
     """
 
     camera: str
@@ -49,16 +52,17 @@ class Source(ABC):
     phase_ns: int = 0
 
     def content(self, tick: int) -> int:
-        """Which shot a tick shows, 0 .. contents - 1; the tick itself where nothing repeats."""
+        """Number of the shot that a tick shows: 0 to contents - 1, or the tick itself if shots never
+        repeat."""
         return tick
 
     @abstractmethod
     def read(self, content: int) -> Shot:
-        """Render, read or decode one shot. Raises ValueError (DatasetError, PoseGapError) for a shot that is
-        not available; others may still be."""
+        """Render, read or decode shot number ``content``. Raises ValueError (DatasetError, PoseGapError) if
+        it is not available; other shots may still be."""
 
     def prepare(self, stopped: Callable[[], bool]) -> None:  # noqa: B027
-        """Render or decode ahead, so that ``read`` is fast. Returns when that is done, or ``stopped()``."""
+        """Render or decode ahead, so that ``read`` is fast. Returns early once ``stopped()`` is true."""
 
     def release(self) -> None:  # noqa: B027
-        """Free what making shots needs (decoders, renderers). ``read`` gets it again."""
+        """Free decoders and renderers; ``read`` opens them again."""

@@ -1,7 +1,8 @@
-"""A recorded session, replayed message by message: the bytes, poses and lenses that an edge once received.
+"""Replays a recorded session message by message: the bytes, poses and lenses that an edge once received.
 
-Frames keep their intervals to the nanosecond. Where clocks differed, each session of a node is shifted as a
-whole, by its least uncertain offset."""
+Frames keep their intervals to the nanosecond. To put nodes with different clocks on one time scale, each
+session of a node is shifted as a whole, by its least uncertain clock offset.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +34,8 @@ log = logging.getLogger("camera-node")
 class ReplaySource(Source):
     """One camera of a session.
 
-    times_ns: of its frames since the session's first, strictly increasing.
-    period_ns: of a replay that loops; None plays it once.
+    times_ns: capture times of its frames since the session's first frame, strictly increasing.
+    period_ns: length of one round of a replay that loops; None plays it once.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class ReplaySource(Source):
         self._times, self._period = times_ns, period_ns
 
     def schedule(self, start_ns: int) -> CaptureSchedule:
-        """Once from ``start_ns`` on, or over and over in step with the epoch."""
+        """Once from ``start_ns`` on, or looping in periods counted from the epoch."""
         if self._period is None:
             return OnceSchedule(self._times, start_ns)
         return LoopSchedule(self._times, self._period)
@@ -87,7 +88,7 @@ def open_replay(
     times = {name: _times(frames) for name, frames in session.frames.items()}
     first = min(t[0] for t in times.values())
     last = max(t[-1] for t in times.values())
-    # From the last frame to the first of the next round: a usual interval.
+    # Between the last frame and the first one of the next round: the median interval.
     gaps = [b - a for t in times.values() for a, b in pairwise(t)]
     period = last - first + (round(float(np.median(gaps))) if gaps else 10**9)
     names = assign_cameras(scenario, config.assignment, cameras, list(session.frames))
@@ -102,7 +103,7 @@ def open_replay(
 
 
 def _times(frames: Sequence[SessionFrame]) -> list[int]:
-    """When frames were captured, in ns on the edge's clock; intervals are those of the node's clock."""
+    """Capture times in ns on the edge's clock, with the intervals of the node's clock."""
     best: dict[str, tuple[int, int]] = {}
     for frame in frames:
         h = frame.header
@@ -114,7 +115,7 @@ def _times(frames: Sequence[SessionFrame]) -> list[int]:
 def _in_order(
     name: str, frames: Sequence[SessionFrame], times_ns: Sequence[int]
 ) -> tuple[list[SessionFrame], list[int]]:
-    """The frames whose time is after that of the one before: an edge would refuse the others."""
+    """Keep the frames that are newer than all before them; an edge would refuse the others."""
     newest_before = [-math.inf, *accumulate(times_ns, max)]
     kept = [k for k, t_ns in enumerate(times_ns) if t_ns > newest_before[k]]
     if left_out := len(frames) - len(kept):

@@ -21,10 +21,11 @@ def open_sources(
     data: Path | None = None,
     effects: Mapping[str, Effects | None] | None = None,
 ) -> dict[str, Source]:
-    """The sources of ``cameras``, sharing what can be shared, with each camera's effects.
+    """Open the sources of ``cameras``, by camera; they share scene, data and devices where possible.
 
-    data: folder of the data sets, else $FRESHFIELD_DATA. Raises ScenarioError, DatasetError, CameraError or
-    ArmError.
+    data: folder of the data sets; None: $FRESHFIELD_DATA.
+    effects: by camera; a source applies those of its camera.
+    Raises ScenarioError, DatasetError, CameraError or ArmError.
     """
     effects = effects or {}
     if isinstance(config, WorldConfig):

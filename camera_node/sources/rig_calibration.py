@@ -1,10 +1,10 @@
-"""Calibration JSON of a video rig: one entry a camera, in OpenCV's terms.
+"""Calibration JSON of a camera rig: one entry a camera, in OpenCV's conventions.
 
     {"cam01": {"width": 1080, "height": 1920, "K": [[...]], "dist_k1k2p1p2": [...],
                "R_world_to_cam": [[...]], "t_world_to_cam": [...]}, ...}
 
-``K`` counts pixel centers as whole numbers, as OpenCV does, and gains 0.5 here. ``R`` and ``t`` take world
-points to camera axes (meters); they may be absent where a trajectory gives the poses.
+In ``K`` pixel centers are whole numbers, as in OpenCV, so 0.5 is added here. ``R`` and ``t`` take world
+points to camera axes (meters); they may be missing if a trajectory or an arm gives the poses.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from freshfield.geometry import Pinhole, Pose
 
 @dataclass(frozen=True)
 class CalibratedCamera:
+    """A calibrated camera. pose: None if the file has none."""
+
     intrinsics: Pinhole
     pose: Pose | None
 

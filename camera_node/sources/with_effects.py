@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | None:
-    """The effects of one camera. None where the scenario lists none: then nothing of them is imported. Raises
-    ScenarioError."""
+    """The effects of one camera; None, without importing any, if the scenario lists none. Raises
+    ScenarioError for an invalid effect, or one that needs a synthetic world."""
     if not config.effects:
         return None
     from camera_node.synthetic.effects import load_effects
@@ -37,8 +37,11 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
 
 
 class AffectedSource(Source):
-    """Another source's shots, each changed by the effects of its own tick, so that none repeats. A pose error
-    that is the same in every frame leaves them repeating."""
+    """Another source's shots, changed by effects.
+
+    Effects differ from tick to tick, so shots do not repeat, unless the only effect is a pose error that is
+    the same in every frame.
+    """
 
     def __init__(self, source: Source, effects: Effects, codec: str) -> None:
         self.camera = source.camera

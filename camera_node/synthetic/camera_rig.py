@@ -13,8 +13,8 @@ PosedCameras = dict[str, tuple[Pinhole, Array]]
 def on_sphere(
     target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float, outward: bool = False
 ) -> Array:
-    """Camera-to-world (4, 4) at ``radius_m`` from ``target``, looking at it, or ``outward``, away from it.
-    Azimuth 0 is on its -y side, 90 on its +x side; elevation 90 is above it."""
+    """Camera-to-world (4, 4) at ``radius_m`` from ``target`` (3,), looking at it or, if ``outward``, away
+    from it. Azimuth 0 is on the target's -y side, 90 on its +x side; elevation 90 is above it."""
     a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
     target = np.asarray(target, dtype=np.float64)
@@ -23,8 +23,8 @@ def on_sphere(
 
 
 def spread_order(directions: Array) -> list[int]:
-    """Farthest-point order of unit directions (N, 3), starting with the first: every prefix is as well spread
-    as its size allows. Ties go to the lower number."""
+    """Farthest-point order of unit directions (N, 3), starting with the first, so that every prefix is well
+    spread. Ties go to the lower index."""
     order = [0]
     nearest = directions @ directions[0]
     while len(order) < len(directions):
@@ -45,8 +45,9 @@ def build_rig(
 ) -> PosedCameras:
     """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``, looking at it or outward.
 
-    The first entry is cam00, which is held out; the others are numbered in spread order, so that a smaller
-    ``count`` leaves out the last names and the others keep their poses.
+    angles_deg: the first entry is cam00, which is held out; the others are numbered in spread order.
+    count: number of cameras; a smaller one omits the last names, and the others keep their poses.
+    camera: intrinsics of all cameras.
     """
     poses = [on_sphere(target, radius_m, a, e, outward) for a, e in angles_deg]
     away = np.stack([-p[:3, 2] for p in poses])

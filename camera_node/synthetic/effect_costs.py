@@ -1,11 +1,11 @@
-"""What scenes and effects cost in milliseconds of processor time a frame.
+"""Measures the cost of scenes and effects in milliseconds of processor time a frame.
 
     python -m camera_node.synthetic.effect_costs --size 128x128 640x480 --json costs.json
 
-Medians over frames spread through a period, of processor time of all threads, which other load affects
-little. Scenes are rendered ahead and cached: they and world, lens and exposure effects cost once for every
-different frame; only image, clock and pose effects cost while streaming. An added cost is the difference to
-the same frame without the effect, in the same run.
+Values are medians over frames spread through a period, of the processor time of all threads, which other load
+affects little. Scenes are rendered ahead and cached, so they and the world, lens and exposure effects cost
+once for every different frame; only image, clock and pose effects cost while streaming. An added cost is the
+difference to the same frame without the effect, in the same run.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ Size = tuple[int, int]
 
 
 def measure_ms(*calls: Callable[[int], object], frames: int, within_s: float = np.inf) -> list[float]:
-    """Median processor milliseconds of each call(k), k = 0 .. frames - 1, after a warm-up."""
+    """Median processor milliseconds of each call(k) over k = 0 .. frames - 1, after a warm-up; fewer frames
+    if they take longer than ``within_s``."""
     return [median(row) for row in _times_ms(*calls, frames=frames, within_s=within_s)]
 
 
@@ -50,7 +51,7 @@ def added_ms(
 
 
 def _times_ms(*calls: Callable[[int], object], frames: int, within_s: float) -> list[list[float]]:
-    """Processor milliseconds of each call. Calls alternate, so that a change in the machine's load meets all
+    """Processor milliseconds of each call. Calls alternate, so that changes of the machine's load affect all
     of them. If they take longer than ``within_s`` together, fewer frames are measured, but at least three."""
     for call in calls:
         call(0)
@@ -78,9 +79,12 @@ def measure_scenes(size: Size, frames: int, within_s: float) -> list[dict[str, A
 
 
 def measure_effects(size: Size, frames: int, within_s: float) -> list[dict[str, Any]]:
-    """A row for each of CASES, and one for no effect: added ms a frame, paid ahead or while streaming.
-    setup_ms: once for each camera, if the effect needs its own renderer. rms_counts: difference of a faster
-    case's frames to those with default parameters."""
+    """A row for each of CASES, and one for no effect: added ms a frame, and whether it is paid ahead or while
+    streaming.
+
+    setup_ms: once for each camera, if the effect needs its own renderer.
+    rms_counts: root mean square difference between a case's frames and those with default parameters.
+    """
     scene = make_scene("room", {"width": size[0], "height": size[1], "supersample": 1})
     _prepared(scene)  # the first call of everything takes longer
     plain, _ = _prepared(scene.with_world(scene.world))

@@ -1,8 +1,8 @@
-"""Frames of a periodic scene, rendered ahead and kept on disk, so that streaming costs a look-up.
+"""Frames of a periodic scene, rendered ahead and kept on disk, so that streaming costs only a look-up.
 
-The key of an entry hashes everything that decides its bytes: scene, parameters, camera, frame rate, codec,
+An entry's key hashes everything that determines its bytes: scene, parameters, camera, frame rate, codec,
 quality, rendered effects and the renderer's source. An entry is therefore never stale, only unused. Damaged
-or missing ones are rendered again.
+or missing entries are rendered again.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield import payload
 
-# A sequence with more different frames counts as not repeating: it is rendered as it goes and not kept.
+# A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
 MAX_FRAMES = 3000
 MAX_DISK_BYTES = 2 << 30
-# Written by a process before it looks again at how much there is: that reads the whole folder.
+# Bytes that a process writes between two checks of the cache's size, which read the whole folder.
 _PRUNE_EVERY_BYTES = MAX_DISK_BYTES // 16
 MAX_MEMORY_BYTES = 32 << 20
 _MAGIC = b"FFC1"
-_NAME = re.compile("[0-9a-f]{32}")  # of the folder of one camera's frames
-_written: dict[Path, int] = {}  # root -> bytes that this process wrote since it looked
-# Files here that do not decide what a frame looks like.
+_NAME = re.compile("[0-9a-f]{32}")  # name of the folder of one camera's frames
+_written: dict[Path, int] = {}  # root -> bytes that this process wrote since its last check
+# Files of this package that do not influence what a frame looks like.
 _NOT_RENDERING = ("frame_cache.py", "effect_costs.py", "preview.py", "source.py")
 
 
@@ -51,15 +51,20 @@ def default_folder() -> Path:
 
 
 class FrameCache:
-    """The frames of one camera at one rate. Frame k shows the scene phase_ns after k / fps. Safe for several
-    threads.
+    """The frames of one camera at one rate. Frame k shows the scene at k / fps + phase_ns. Thread-safe.
 
-    fps: frames a second, kept as a fraction (29.97 is 2997/100). effects: from load_effects. codec, quality:
-    of the encoded frames. folder: default_folder() if None. on_disk: False keeps frames in memory only.
+    camera_id: camera of the scene.
+    fps: frames a second, kept as a fraction (29.97 is 2997/100).
+    effects: of this camera, from ``load_effects``.
+    codec, quality: of the encoded frames.
+    folder: root of the cache; None: ``default_folder()``.
+    on_disk: False keeps frames in memory only.
+    Raises ValueError for a rate that is not positive, EffectError for effects that do not fit the scene.
 
-    repeats_after: frames until the sequence repeats (1 for a static scene), None for more than MAX_FRAMES.
-    contents: number of different outputs of ``read``, None if noise makes each unique. disk_error: why the
-    folder is not used, or None.
+    Attributes:
+    repeats_after: frames until the sequence repeats (1 for a static scene); None for more than MAX_FRAMES.
+    contents: number of different outputs of ``read``; None if they do not repeat.
+    disk_error: why the folder is no longer used, or None.
     """
 
     def __init__(
@@ -84,7 +89,7 @@ class FrameCache:
         self.contents = None if effects.image else self.repeats_after
         self.disk_error: str | None = None
         self._effects = effects
-        # Frames that get noise later are kept without loss.
+        # Frames to which image effects are applied later are stored losslessly.
         self._stored_codec = "zstd" if effects.image else codec
         self._memory: dict[int, bytes] = {}
         self._memory_bytes = 0
@@ -101,12 +106,12 @@ class FrameCache:
         return self._folder is not None
 
     def content(self, tick: int) -> int:
-        """The output of ``read`` that tick number ``tick`` shows."""
+        """Number of the output of ``read`` that a tick shows."""
         return tick % self.contents if self.contents else tick
 
     def read(self, content: int) -> Image | bytes:
-        """What the node sends: encoded bytes or, if effects act on each frame, an image (H, W, 3) to
-        encode."""
+        """Output number ``content``: encoded bytes or, if there are image effects, an image uint8 (H, W, 3)
+        that is still to be encoded."""
         if self._effects.image:
             return self._effects.apply(self.frame(content), content, self._time_s(content))
         return self.encoded(content)
@@ -125,8 +130,8 @@ class FrameCache:
         return self._stored(index)
 
     def fill(self, stop: Callable[[], bool] = lambda: False) -> int:
-        """Make all missing frames, until ``stop`` returns True; returns how many were rendered. Frames can be
-        read meanwhile: a missing one is rendered at once."""
+        """Render all missing frames, until ``stop`` returns True. Returns how many were rendered. Frames can
+        be read meanwhile: a missing one is rendered at once."""
         rendered = 0
         for index in range(self.repeats_after or 0):
             if stop():
@@ -135,7 +140,7 @@ class FrameCache:
         return rendered
 
     def key(self) -> str:
-        """Hash (hex) of everything that decides the frames' bytes."""
+        """Hash (hex) of everything that determines the frames' bytes."""
         camera, pose = self.scene.cameras[self.camera_id]
         what = {
             "scene": self.scene.name,
@@ -148,7 +153,7 @@ class FrameCache:
             "renderer": renderer_version(),
             "phase_ns": self.phase_ns,
         }
-        # ``count`` decides which cameras there are, not what one sees.
+        # ``count`` determines which cameras there are, not what one of them sees.
         what["params"].pop("count")
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
@@ -232,14 +237,14 @@ def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
     if not scene.moving:
         return 1
     period = Fraction(round(scene.period_s / PERIOD_UNIT_S)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
-    # The numerator: so many frames take a whole number of periods.
+    # The numerator is the least number of frames that take a whole number of periods.
     frames = (period * fps).numerator
     return frames if frames <= MAX_FRAMES else None
 
 
 @cache
 def renderer_version() -> str:
-    """Hash of the source files and libraries that decide what a frame looks like."""
+    """Hash (hex) of the source files and library versions that determine what a frame looks like."""
     here = Path(__file__).parent
     files = [p for p in sorted(here.rglob("*.py")) if p.name not in _NOT_RENDERING]
     files += [Path(freshfield.geometry.__file__), Path(payload.__file__)]
@@ -250,7 +255,8 @@ def renderer_version() -> str:
 
 
 def _prune_now_and_then(root: Path, keep: Path, new_bytes: int) -> None:
-    """``prune`` at a process's first frame for ``root``, and each time so much more was written."""
+    """Call ``prune`` at the process's first frame for ``root``, and whenever _PRUNE_EVERY_BYTES more were
+    written."""
     written = _written.get(root, _PRUNE_EVERY_BYTES) + new_bytes
     if written >= _PRUNE_EVERY_BYTES:
         prune(root, keep)
@@ -259,8 +265,8 @@ def _prune_now_and_then(root: Path, keep: Path, new_bytes: int) -> None:
 
 
 def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTES) -> int:
-    """Delete the least recently used folders of ``root`` until it holds at most ``limit_bytes``; returns
-    the bytes freed. ``keep`` stays. Other processes may do the same at once."""
+    """Delete the least recently used folders of ``root``, except ``keep``, until it holds at most
+    ``limit_bytes``. Returns the bytes freed. Other processes may do the same at the same time."""
     folders: list[tuple[float, int, Path]] = []
     for folder in root.iterdir():
         if not _NAME.fullmatch(folder.name):

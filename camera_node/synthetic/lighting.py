@@ -1,7 +1,7 @@
-"""Light on surfaces: diffuse reflection and contact shadows always, and what effects add or take away.
+"""Light on surfaces: diffuse reflection and contact shadows always, others if effects add them.
 
-Effects may give a world a specular reflection, a shadow model and a medium. This file knows only the
-protocols that these follow.
+Effects may give a world a specular reflection, a shadow model, a medium and a light switch. This file defines
+only their protocols.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from camera_node.synthetic.placement import MovingBody, PlacedParts
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array
 
-# Of contact shadows: distance (meters) from the body's middle at which they end, and their darkest.
+# Contact shadows end at this distance (metres) from the body's middle, and take away at most this share.
 _REACH_M, _MOST_DARKENING = 0.8, 0.75
 
 
 @dataclass(frozen=True)
 class Light:
-    """A soft overhead light of points (S, 3), each visible or not, and an ambient term from below to above.
-    falloff_m: distance at which a point's light has halved."""
+    """A soft overhead light made of point lights, and an ambient term that varies with a surface's direction.
+
+    points: (S, 3). strength: of all points together. falloff_m: distance at which a point's light has halved.
+    ambient_below, ambient_above: ambient color on surfaces that face down, up. tint: color of the points.
+    """
 
     points: Array
     strength: float
@@ -35,14 +38,18 @@ class Light:
 
     @property
     def point_color(self) -> Array:
-        """Light (3, 1) of one of the points."""
+        """Color times strength (3, 1) of each point."""
         return np.array(self.tint)[:, None] * (self.strength / len(self.points))
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points (3, N) of surfaces, their albedo, unit normals and the unit rays that met them (3, N each).
-    visible (S, N): 1 where no static part stands between a light point and a surface point, else 0."""
+    """N surface points.
+
+    points, albedo, normals: (3, N); normals are unit vectors.
+    rays: (3, N), unit directions of the rays that hit the points.
+    visible: (S, N), 0 if a static part stands between light point and surface point, else 1.
+    """
 
     points: Array
     albedo: Array
@@ -51,6 +58,7 @@ class SurfacePoints:
     visible: Array
 
     def select(self, chosen: NDArray[np.intp] | slice) -> SurfacePoints:
+        """The points at some indices."""
         fields = (self.points, self.albedo, self.normals, self.rays, self.visible)
         return SurfacePoints(*(values[:, chosen] for values in fields))
 
@@ -87,7 +95,7 @@ class ShadowModel(Protocol):
         moving: Sequence[PlacedParts],
         specular: SpecularReflection | None,
     ) -> Array:
-        """Part of the surface points' colors (3, N) that the moving parts take away."""
+        """Light (3, N) that moving parts take away from the surface points' colors."""
         ...
 
 
@@ -106,8 +114,11 @@ class Switch(Protocol):
 def shade_diffuse(
     light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None
 ) -> Array:
-    """Colors (3, N) of surface points (3, N) under ambient light and Lambert's law. visible (S, N): see
-    SurfacePoints; None replaces the light by one unshadowed point at its center."""
+    """Colors (3, N) of surface points under ambient light and Lambert's law.
+
+    albedo, points, normals: (3, N).
+    visible: (S, N), see ``SurfacePoints``; None replaces the light by one unshadowed point at its center.
+    """
     low, high = np.array(light.ambient_below)[:, None], np.array(light.ambient_above)[:, None]
     ambient = low + (high - low) * (0.5 + 0.5 * normals[2])
     sources = light.points if visible is not None else light.points.mean(axis=0, keepdims=True)
@@ -149,17 +160,18 @@ def _lambert(source: Array, falloff_m: float, points: Array, normals: Array) -> 
     to = source[:, None] - points
     distance2 = (to * to).sum(axis=0)
     cosine = np.maximum((to * normals).sum(axis=0), 0.0) / np.sqrt(np.maximum(distance2, 1e-12))
-    # Gentler than the inverse square: a room that its walls light as well has no black corners.
+    # Softer than the inverse square law: indirect light from walls leaves no black corners in a room.
     return cosine / (1.0 + distance2 / (falloff_m * falloff_m))
 
 
 def contact_shadow(
     body: MovingBody, placed: PlacedParts, floor_points: Array
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Which floor points a body darkens, so that it does not seem to float, and the share of their light that
-    is left. A point loses the share of its sky that each contact sphere covers, r^2 cos / d^2.
+    """Ambient occlusion of the floor beneath a body, so that it does not seem to float. A point loses the
+    share of its sky that each contact sphere covers, r^2 cos / d^2.
 
-    placed: the body's parts at an instant. floor_points: (3, N). Returns indices (K,) and shares (K,).
+    placed: the body's parts at an instant. floor_points: (3, N).
+    Returns the indices (K,) of the darkened points, and the shares (K,) of their light that are left.
     """
     if not body.contact:
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.float32)
@@ -171,7 +183,7 @@ def contact_shadow(
     p = floor_points[:, near]
     covered = np.zeros(near.size)
     for x, y, z, r in spheres:
-        # A sphere half sunk in the floor would cover more than all of it: lift it to rest on it.
+        # A sphere that is half sunk in the floor would cover more than the whole sky: lift it onto the floor.
         h = np.maximum(z - p[2], r)
         d2 = (p[0] - x) ** 2 + (p[1] - y) ** 2 + h * h
         covered += r * r * h / (d2 * np.sqrt(d2))

@@ -1,7 +1,7 @@
 """Periodic analytic motion: phases, closed paths, footsteps and the two-bone limb.
 
-All motion is a function of a phase in [0, 1); nothing is integrated, so any instant can be asked for in
-any order, and a run of a year is as exact as a run of a second.
+All motion is a function of a phase in [0, 1) and nothing is integrated, so instants can be evaluated in any
+order, and a run of a year is as exact as a run of a second.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def phase_of(t_s: float, period_s: float) -> float:
 
 
 def period_for(path_m: float, speed_m_per_s: float) -> float:
-    """Period (s) of a loop of about ``path_m``, a multiple of PERIOD_UNIT_S."""
+    """Period (s) of a loop of ``path_m`` at about this speed, a multiple of PERIOD_UNIT_S."""
     return max(1, round(path_m / speed_m_per_s / PERIOD_UNIT_S)) * PERIOD_UNIT_S
 
 
@@ -44,9 +44,13 @@ def smoothstep(x: float) -> float:
 
 
 def footstep_phase(phase: float, cycles: int, offset: float) -> tuple[float, float]:
-    """A foot's position on the path (a phase) while the body is at ``phase``, and the progress of its swing
-    (0 while it stands). In each of ``cycles`` gait cycles a loop the foot rests for a share _STANCE at the
-    position that the body passes at mid-stance, then swings smoothly to the next."""
+    """A foot's position on the path (a phase) and the progress of its swing (0 while it stands), with the
+    body at ``phase``.
+
+    cycles: gait cycles in a loop. In each, the foot rests for a share _STANCE at the position that the body
+        passes at mid-stance, then swings smoothly to the next one.
+    offset: of this foot's cycle, in cycles.
+    """
     x = phase * cycles + offset
     whole = math.floor(x)
     swing = max(0.0, (x - whole - _STANCE) / (1.0 - _STANCE))
@@ -57,9 +61,10 @@ def footstep_phase(phase: float, cycles: int, offset: float) -> tuple[float, flo
 def two_bone_ik(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
     """The joint between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
 
-    The bones keep their lengths up to 9/10 of their reach. Beyond, both stretch a little, because the bend
-    goes as the square root of the remaining reach and the joint would snap straight. No distance straightens
-    them fully.
+    upper, lower: lengths of the bones. pole: unit vector.
+    The bones keep their lengths up to 9/10 of their reach. Beyond that both stretch a little: the bend is
+    proportional to the square root of the remaining reach, so the joint would snap straight. They are never
+    fully straight.
     """
     dx, dy, dz = (tip[k] - root[k] for k in range(3))
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)

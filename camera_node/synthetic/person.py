@@ -23,18 +23,25 @@ _CYCLES = 3  # gait cycles in one loop: strides of about 1.2 m
 _ANKLE_M = 0.07
 _THIGH_M, _SHIN_M = 0.42, 0.41
 _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
-# Largest differences of a drawn walk from the scene's own: shift of its center, factors of radii and speed.
-# Within these it stays clear of the furniture.
+# Bounds of a randomly drawn walk relative to the scene's own: shift of the center, factors of radii and
+# speed. Within them it stays clear of the furniture.
 _SHIFT_M, _RADIUS_FACTORS, _SPEED_FACTORS = 0.2, (0.75, 1.15), (0.7, 1.4)
 COURSES = ("loop", "stops", "reverses", "jumps")
 
 
 @dataclass(frozen=True)
 class Walk:
-    """An ellipse of ``radii`` times ``scale`` (meters), walked in ``period_s``. direction: seen from above,
-    1.0 is counterclockwise, -1.0 clockwise. start_s: time into the loop at instant 0. course: of ``COURSES``:
-    round and round; with a stop of PERIOD_UNIT_S after each PERIOD_UNIT_S; half a loop and backwards again;
-    half a loop and at once back to its start."""
+    """An elliptic walk.
+
+    center: on the floor, metres. radii: of the ellipse, metres, multiplied by ``scale``.
+    period_s: time for one loop.
+    still: the person stands still.
+    direction: 1.0 is counterclockwise from above, -1.0 clockwise.
+    start_s: time into the loop at instant 0.
+    course: one of ``COURSES``. loop: round and round; stops: a rest of PERIOD_UNIT_S after each
+        PERIOD_UNIT_S;
+        reverses: half a loop and backwards again; jumps: half a loop, then a jump back to its start.
+    """
 
     center: tuple[float, float]
     radii: tuple[float, float]
@@ -55,7 +62,7 @@ class Walk:
         return motion.phase_of(self._walked_s(t_s) + self.start_s, self.period_s)
 
     def _walked_s(self, t_s: float) -> float:
-        """Time of walking the loop that leads to where the course is at an instant."""
+        """Time of walking the plain loop after which one is where the course is at an instant."""
         if self.course == "stops":
             stops, rest_s = divmod(t_s, 2.0 * PERIOD_UNIT_S)
             return stops * PERIOD_UNIT_S + min(rest_s, PERIOD_UNIT_S)
@@ -177,7 +184,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
         if sign > 0 and wave > 0.0:
             raised = _direction((0.25, up), (0.9, right), (0.25, forward))
             waving = _direction((1.0, up), (0.55 * wave_side + 0.1, right), (0.2, forward))
-            # Through the side: a straight blend from hanging to raised would pass through the zero vector.
+            # Blend through the side: a straight blend from hanging to raised would pass through zero.
             keep, via = (1 - wave) ** 2, 2 * wave * (1 - wave)
             upper = _direction((keep, upper), (via, right), (wave * wave, raised))
             lower = _direction((keep, lower), (via, right), (via, forward), (wave * wave, waving))
@@ -227,7 +234,7 @@ def walking_person(walk: Walk) -> MovingBody:
     return MovingBody(tuple(part for _, part in _PARTS), matrices, contact)
 
 
-# The same walk is asked for by every process that builds a scene, several times: by truth, cameras, episodes.
+# Cached, because a process that builds scenes needs the same walk several times (truth, cameras, episodes).
 @lru_cache(256)
 def loop_length_m(walk: Walk) -> float:
     """Meters that the middles of the person's parts travel in one loop, averaged over the parts."""
@@ -243,9 +250,12 @@ def loop_length_m(walk: Walk) -> float:
 def make_walk(
     center: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int | None = None
 ) -> Walk:
-    """The walk whose parts move at ``speed_m_per_s`` on average; 0 stands still. The period is rounded to
-    PERIOD_UNIT_S, and the ellipse stretched to keep the speed. seed: draws another path about the same place,
-    its direction, start and a speed about this one; None walks the loop as it is."""
+    """The walk on which the person's parts move at ``speed_m_per_s`` on average; 0 stands still. The period
+    is rounded to a multiple of PERIOD_UNIT_S, and the ellipse scaled to keep the speed.
+
+    center, radii: of the ellipse, metres.
+    seed: draws a variation of the path, its direction, its start and the speed; None: no variation.
+    """
     if speed_m_per_s == 0.0:
         return Walk(center, radii, PERIOD_UNIT_S, still=True)
     if seed is not None:

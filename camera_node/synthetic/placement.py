@@ -44,8 +44,11 @@ class Part:
 
 @dataclass(frozen=True)
 class MovingBody:
-    """Parts that move together. matrices(t_s): their world-from-local matrices (M, 4, 4), which may scale.
-    contact: parts (index, radius in meters) that darken the floor beneath them."""
+    """Parts that move together.
+
+    matrices: returns their world-from-local matrices (M, 4, 4), which may scale, at an instant t_s.
+    contact: (index, radius in metres) of the parts that darken the floor beneath them.
+    """
 
     parts: tuple[Part, ...]
     matrices: Callable[[float], Array]
@@ -54,8 +57,11 @@ class MovingBody:
 
 @dataclass(frozen=True)
 class PlacedParts:
-    """Parts at one instant: world-from-local matrices (M, 4, 4), the inverses (M, 3, 3) of their linear
-    parts, and bounding spheres in world axes, centers (M, 3) and radii (M,)."""
+    """Parts at one instant.
+
+    matrices: (M, 4, 4), world-from-local. inverse: (M, 3, 3), inverses of their linear parts.
+    centers, radii: (M, 3) and (M,), bounding spheres in world axes.
+    """
 
     parts: Sequence[Part]
     matrices: Array
@@ -70,11 +76,11 @@ class PlacedParts:
 
 
 def place_parts(parts: Sequence[Part], matrices: Array) -> PlacedParts:
-    """Prepare ``parts`` at ``matrices`` (M, 4, 4) for casting."""
+    """Prepare parts with world-from-local ``matrices`` (M, 4, 4) for ray casting."""
     linear = matrices[:, :3, :3]
     spheres = [p.shape.bounding_sphere() for p in parts]
     centers = np.array([c for c, _ in spheres]).reshape(-1, 3, 1)
-    # The columns of rotation times scale are orthogonal, so the longest is the largest stretch.
+    # The columns of rotation times scale are orthogonal, so the length of the longest is the largest scale.
     stretch = np.sqrt((linear * linear).sum(axis=1).max(axis=1, initial=0.0))
     return PlacedParts(
         parts,
@@ -86,5 +92,5 @@ def place_parts(parts: Sequence[Part], matrices: Array) -> PlacedParts:
 
 
 def place_static(parts: Sequence[Part]) -> PlacedParts:
-    """Prepare parts that do not move for casting."""
+    """Prepare parts that do not move for ray casting."""
     return place_parts(parts, np.array([p.matrix for p in parts]).reshape(-1, 4, 4))

@@ -19,7 +19,7 @@ from freshfield.untrusted import UntrustedError, read_yaml
 
 
 def contact_sheet(scene: Scene, t_s: float) -> Image:
-    """All cameras side by side, named, uint8 RGB; as square as it gets."""
+    """Images of all cameras at an instant, labeled, in a nearly square grid: uint8 RGB."""
     names = list(scene.cameras)
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

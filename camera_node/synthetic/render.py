@@ -1,11 +1,12 @@
-"""Ray casting of a world of analytic shapes, at any instant, through any pinhole with any lens.
+"""Ray casting of a world of analytic shapes, at any instant, through any pinhole camera with lens distortion.
 
 Static parts are cast, textured, lit and shadowed once per camera and kept. A frame then costs only the rays
-within the moving parts' bounding spheres. Shading is Lambert under a soft light and a sky-to-ground ambient
-term: it depends on the surface point alone, never on the viewer.
+within the moving parts' bounding spheres. Shading is Lambertian under a soft light and a sky-to-ground
+ambient
+term: it depends only on the surface point, not on the viewer.
 
-Effects may add specular reflection, shadows of moving parts and a medium (camera_node.synthetic.effects).
-Without them nothing of these is computed.
+Effects may add specular reflection, shadows of moving parts and a medium (camera_node.synthetic.effects),
+which are computed only then.
 """
 
 from __future__ import annotations
@@ -36,15 +37,18 @@ from freshfield.geometry import Array, Pinhole, world_rays
 
 Image = NDArray[np.uint8]
 Colors = NDArray[np.float32]  # (N, 3), of rays
-Rows = tuple[int, int]  # of an image: the first, and the one after the last
+Rows = tuple[int, int]  # rows of an image: the first, and the one after the last
 
-# Shadow rays stop this share short of the surface they light, so that it does not shadow itself.
+# Shadow rays end this share of their length before the surface, so that it does not shadow itself.
 _SHADOW_BIAS = 2e-3
 
 
 @dataclass(frozen=True)
 class World:
-    """Everything that can be seen, without cameras. background: color in [0, 1] of rays that meet nothing."""
+    """Everything that can be seen, without cameras. background: color in [0, 1] of rays that hit nothing.
+
+    specular, shadows, medium, switch: set by effects; see ``lighting``.
+    """
 
     static_parts: tuple[Part, ...]
     moving_bodies: tuple[MovingBody, ...]
@@ -59,11 +63,11 @@ class World:
 def cast_rays(
     origin: Array, directions: Array, placed: PlacedParts, limit: Array
 ) -> tuple[Array, NDArray[np.int16]]:
-    """Nearest hits of unit rays from one origin (3,) along directions (3, N) within ``limit`` (N,).
+    """Nearest hits of unit rays from one origin (3,) along directions (3, N) within distances ``limit`` (N,).
 
-    Returns distances (N,), equal to ``limit`` where nothing is nearer, and part numbers (N,), -1 there. Each
-    part is tried only on the rays within the cone around its bounding sphere; this holds for any lens and
-    needs no projection.
+    Returns distances (N,) and part indices (N,); a ray without a hit has its ``limit`` and -1. Each part is
+    tested only with the rays in the cone around its bounding sphere, which works for any lens and needs no
+    projection.
     """
     t = limit.copy()
     which = np.full(directions.shape[1], -1, dtype=np.int16)
@@ -82,7 +86,7 @@ def cast_rays(
 
 
 def rays_near_sphere(origin: Array, directions: Array, center: Array, radius: float) -> NDArray[np.intp]:
-    """Indices of the rays that can meet the sphere: all, if the origin is inside it."""
+    """Indices of the unit rays (3, N) that can hit the sphere; all, if the origin (3,) is inside it."""
     to = center - origin
     tangent2 = float(to @ to) - radius * radius
     if tangent2 <= 0.0:
@@ -93,8 +97,11 @@ def rays_near_sphere(origin: Array, directions: Array, center: Array, radius: fl
 def surface_properties(
     placed: PlacedParts, which: NDArray[np.int16], points: Array, rays: Array
 ) -> tuple[Array, Array]:
-    """Albedo (3, N) and unit normals (3, N), turned against the rays (3, N), of world points (3, N) on the
-    parts numbered ``which`` (N,)."""
+    """Albedo (3, N) and unit normals (3, N) of surface points.
+
+    which: (N,), index of the part that each point is on.
+    points, rays: (3, N), in world axes; normals are turned to face against the rays.
+    """
     albedo, normals = np.empty_like(points), np.empty_like(points)
     for k in np.unique(which):
         of = np.flatnonzero(which == k)
@@ -110,16 +117,18 @@ def surface_properties(
 
 
 def blocked(source: Array, rays: Array, distance: Array, casters: PlacedParts) -> NDArray[np.bool_]:
-    """Whether (N,) the casters hide points from a light point (3,). rays (3, N): from it to the points.
-    distance (N,): lengths of the rays. Starting at the light, they share an origin, and each part is tried on
-    few of them."""
+    """Whether the casters hide each point from a light point, (N,).
+
+    source: (3,), the light point. rays: (3, N), from it to the points. distance: (N,), lengths of the rays.
+    Because rays start at the light, they share an origin, and each part is tested with few of them.
+    """
     far = np.maximum(distance, 1e-12)
     _, hit = cast_rays(source, rays / far, casters, far * (1.0 - _SHADOW_BIAS))
     return hit >= 0
 
 
 def light_visibility(world: World, points: Array) -> Array:
-    """(S, N): 1 where no static part hides a light point from a surface point, else 0."""
+    """(S, N): 0 if a static part hides the light point from the surface point (3, N), else 1."""
     casters = place_static([p for p in world.static_parts if p.casts_shadow])
     out = np.ones((len(world.light.points), points.shape[1]))
     for k, source in enumerate(world.light.points):
@@ -129,14 +138,15 @@ def light_visibility(world: World, points: Array) -> Array:
 
 
 def _switched_off(world: World) -> World:
-    """The world while lamps are out, for good."""
+    """The world with its lamps out, without a switch."""
     light = world.light if world.switch is None else world.switch.without(world.light)
     return replace(world, light=light, switch=None)
 
 
 class CameraRenderer:
-    """Renders one camera of a world; holds what does not change between frames.
+    """Renders one camera of a world, and keeps what does not change between frames.
 
+    camera_to_world: (4, 4).
     supersample: every pixel is the mean of supersample x supersample rays.
     """
 
@@ -150,13 +160,13 @@ class CameraRenderer:
         self._directions = np.ascontiguousarray(directions.reshape(-1, 3).T)
         self._render_static()
         self._static_image = self._to_image(self._through_medium(self._static_colors, self._transmittance))
-        self._dim: CameraRenderer | None = None  # while lamps are out
+        self._dim: CameraRenderer | None = None  # renders while lamps are out
         if world.switch is not None:
             self._dim = CameraRenderer(_switched_off(world), camera, camera_to_world, supersample)
 
     def for_world(self, world: World) -> CameraRenderer:
-        """A renderer of ``world``, which may differ from this one's only in how its bodies move. Static parts
-        are not rendered again."""
+        """A renderer of ``world``, which may differ from this one's world only in its moving bodies. Static
+        parts are not rendered again."""
         other = copy.copy(self)
         other.world = world
         if self._dim is not None:
@@ -179,15 +189,15 @@ class CameraRenderer:
         moving = [place_parts(body.parts, body.matrices(t_s)) for body in self.world.moving_bodies]
         if self.world.shadows is not None:
             self._shadow_static(self.world.shadows, moving, colors, low)
-        for body, placed in zip(self.world.moving_bodies, moving):  # before any of them hides the floor
+        for body, placed in zip(self.world.moving_bodies, moving):  # before one of them hides the floor
             self._darken_floor(body, placed, colors, low)
         for placed in moving:
             limit = self._draw(placed, colors, limit, transmittance, low, moving)
         return self._to_image(self._through_medium(colors, transmittance))
 
     def distance(self) -> Array:
-        """Distance (height', width') along each ray to the nearest static part, inf without one, at the
-        supersampled resolution."""
+        """Distance along each ray to the nearest static part, inf without one, at the supersampled
+        resolution: (height * supersample, width * supersample)."""
         return self._distance.reshape(self._shape)
 
     def _render_static(self) -> None:
@@ -239,8 +249,8 @@ class CameraRenderer:
         low: int,
         moving: Sequence[PlacedParts],
     ) -> Array:
-        """Draw one moving body over ``colors`` (N, 3), which belong to the rays from index ``low`` on.
-        Returns the distance (N,) to the nearest surface so far along each ray."""
+        """Draw one moving body over ``colors`` (N, 3), those of the rays from index ``low`` on. Returns the
+        distance (N,) to the nearest surface so far along each ray."""
         directions = self._directions[:, low : low + len(colors)]
         chosen = rays_near_sphere(self._origin, directions, *placed.bounding_sphere())
         if not chosen.size:
@@ -281,7 +291,7 @@ class CameraRenderer:
         return colors
 
     def _through_medium(self, colors: Colors, transmittance: NDArray[np.float32] | None) -> Colors:
-        """Colors (N, 3) as they arrive through the medium: attenuated, with airlight for the rest."""
+        """Colors (N, 3) seen through the medium: attenuated, plus airlight."""
         if transmittance is None or self.world.medium is None:
             return colors
         air = np.array(self.world.medium.airlight, dtype=np.float32)

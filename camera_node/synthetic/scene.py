@@ -30,7 +30,7 @@ MAX_CAMERAS = 19
 FOV_DEG = (5.0, 150.0)
 # Parameters that do not change static parts.
 _MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "course", "people")
-# Renderers kept to be shared by scenes with the same static parts: of two sets of cameras.
+# Number of renderers kept for scenes with the same static parts: enough for two sets of cameras.
 _MAX_STATIC_RENDERERS = 2 * MAX_CAMERAS
 _STATIC_RENDERERS: dict[tuple[str, str], CameraRenderer] = {}
 
@@ -73,12 +73,14 @@ class MovingParams(BaseParams):
 class Scene:
     """A world seen by posed cameras.
 
-    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out. target: the point (3,) that cameras
-    look at, or away from. bounds (2, 3): lower and upper corner in meters of everything that can be seen,
-    except an occluder. period_s: frames repeat after this time, a multiple of 0.6 s. moving: False if every
-    instant is the same. object_parts: so many of the world's static parts, from the first, are the object
-    that is looked at; None: all of them. static_key: identifies the static parts of scenes with a
-    motion_seed, whose renderers share what they hold of these; None otherwise.
+    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out.
+    target: (3,), the point that cameras look at, or away from.
+    bounds: (2, 3), lower and upper corner in metres of everything that can be seen, except an occluder.
+    period_s: time after which frames repeat, a multiple of 0.6 s.
+    moving: False if all instants look the same.
+    object_parts: number of static parts, from the first, that form the object of interest; None: all.
+    static_key: identifies the static parts of scenes with a motion_seed, whose renderers share their static
+        images; None for others.
     """
 
     name: str
@@ -98,7 +100,8 @@ class Scene:
         return self.renderer(camera_id).image(t_s)
 
     def renderer(self, camera_id: str) -> CameraRenderer:
-        """The camera's renderer, made on first use (in tenths of a second) and kept."""
+        """The camera's renderer, made on first use (which takes tenths of a second) and kept. Raises
+        SceneError for an unknown camera."""
         if camera_id not in self._renderers:
             if camera_id not in self.cameras:
                 known = ", ".join(self.cameras)
@@ -119,12 +122,12 @@ class Scene:
         return _STATIC_RENDERERS[at].for_world(self.world)
 
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
-        """A renderer for any other camera."""
+        """A renderer for any camera. camera_to_world: (4, 4)."""
         return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
 
     def object_mask(self, camera: Pinhole, camera_to_world: Array) -> NDArray[np.bool_]:
         """Which pixels (H, W) of a camera show the object (``object_parts``), by the rays through their
-        centres; what moves hides nothing here."""
+        centers; moving parts are ignored."""
         origin, rays = world_rays(camera, camera_to_world)
         rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
         placed = place_static(self.world.static_parts)
@@ -133,7 +136,7 @@ class Scene:
         return np.asarray(((which >= 0) & (which < count)).reshape(camera.height, camera.width))
 
     def with_world(self, world: World, period_s: float | None = None, moving: bool | None = None) -> Scene:
-        """The same cameras in another world (an effect adds to it). None: as before."""
+        """The same cameras in another world, as effects need it. period_s, moving: None keeps them."""
         period_s = self.period_s if period_s is None else period_s
         moving = self.moving if moving is None else moving
         return dataclasses.replace(
@@ -141,12 +144,12 @@ class Scene:
         )
 
     def with_cameras(self, cameras: PosedCameras) -> Scene:
-        """The same world through other cameras (an effect changes their lenses)."""
+        """The same world with other cameras, as effects on lenses need it."""
         return dataclasses.replace(self, cameras=cameras, static_key=None, _renderers={})
 
 
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
-    """The scene ``name`` with ``params`` over its defaults.
+    """Make the scene ``name``, one of SCENES. params: override its defaults.
 
     Raises SceneError, listing what is valid, for an unknown scene or parameter or a value out of range.
     """

@@ -1,11 +1,11 @@
 """Analytic shapes: where a ray enters and leaves them, their normals and surface coordinates.
 
 Every shape is defined in local axes and placed by a (4, 4) world-from-local matrix, which may scale. Arrays
-are component-first, (3, N), so that each component is contiguous. Distances are along the ray in units of
-the direction's length, which a linear map preserves; directions need not be unit.
+are component-first, (3, N), so that each component is contiguous. Distances along a ray are in units of its
+direction's length, so a linear map preserves them; directions need not be unit vectors.
 
 ``interval`` returns (entry, exit), each (N,); a ray that misses has entry = +inf and exit = -inf. All shapes
-are convex, so two numbers are enough, and a camera inside one sees its far side.
+are convex, so two numbers are enough, and a camera inside a shape sees its far side.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from freshfield.geometry import Array
 
-# A hit counts from this distance (meters) on, so that a ray does not meet the surface it starts on.
+# Least distance (metres) of a hit, so that a ray does not hit the surface on which it starts.
 T_MIN = 1e-6
 # Replaces zero in a denominator; its reciprocal is finite, so 0 * inf cannot make a NaN.
 _TINY = 1e-30
@@ -40,7 +40,7 @@ class Shape(Protocol):
 
 
 def nearest_hit(shape: Shape, origin: Array, direction: Array) -> Array:
-    """Distance (N,) to the first surface in front of the origin; inf where there is none."""
+    """Distance (N,) to the first surface in front of the origin; inf if there is none."""
     entry, leave = shape.interval(origin, direction)
     t = np.where(entry > T_MIN, entry, leave)
     return np.where((t > T_MIN) & (entry <= leave), t, np.inf)
@@ -61,7 +61,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _quadratic(a: Array, half_b: Array, c: Array) -> tuple[Array, Array]:
-    """Interval where a t^2 + 2 half_b t + c <= 0, for a >= 0; everywhere or nowhere where a = 0."""
+    """Interval of t with a t^2 + 2 half_b t + c <= 0, for a >= 0; for a = 0, all t or none."""
     disc = half_b * half_b - a * c
     flat = a < _TINY
     root = np.sqrt(np.maximum(disc, 0.0))
@@ -122,7 +122,7 @@ class Box:
         n = points.shape[1]
         normal = np.zeros_like(points)
         normal[axis, np.arange(n)] = np.sign(points[axis, np.arange(n)])
-        # The vertical axis, where the face has one, is the second coordinate.
+        # The vertical axis, if the face contains it, is the second coordinate.
         u = np.where(axis == 0, points[1], points[0])
         v = np.where(axis == 2, points[1], points[2])
         return normal, np.stack([u, v])
@@ -180,9 +180,9 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class RoundCone:
-    """The hull of a ball of radius r0 at the origin and one of radius r1 at (0, 0, length): a capsule
-    where the radii are equal, a limb where they are not. Surface coordinates: turns about z and meters
-    along it. Needs length > |r0 - r1|, or one ball would swallow the other.
+    """The convex hull of a ball of radius r0 at the origin and one of radius r1 at (0, 0, length); a capsule
+    if the radii are equal. Surface coordinates: turns about z and metres along it. Raises ValueError unless
+    length > |r0 - r1|, because otherwise one ball contains the other.
 
     The cone between the two tangent circles is quadratic in t; ``_d2`` and ``_along`` place a point
     between those circles (0 < along < d2) or on one of the balls.

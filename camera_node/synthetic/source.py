@@ -1,4 +1,4 @@
-"""Cameras in the synthetic world: exact at any instant, rendered ahead if the scene repeats."""
+"""Cameras in the synthetic world: exact at any instant, rendered ahead if the scene is periodic."""
 
 from __future__ import annotations
 
@@ -25,14 +25,17 @@ log = logging.getLogger("camera-node")
 Stopped = Callable[[], bool]  # whether to stop
 
 WORLD_FPS = 15.0
-# Casting takes about 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so
-# that this one stays small.
+# Casting takes about 350 bytes a ray at its peak. For more rays than this another process renders ahead, so
+# that this one's memory stays small.
 _MAX_RAYS = 200_000
 _POLL_S = 0.1
 
 
 class WorldSource(Source):
-    """One camera of a scene, with its frames in a ``FrameCache``."""
+    """One camera of a scene, with its frames in a ``FrameCache``.
+
+    render_in_subprocess: fills the cache from another process, for large images.
+    """
 
     def __init__(
         self,
@@ -66,7 +69,7 @@ class WorldSource(Source):
         self._frames.fill(stop=stopped)
 
     def release(self) -> None:
-        # The same scene without its renderers.
+        # Replace the scene by the same one without its renderers.
         self._frames.scene = self._frames.scene.with_world(self._frames.scene.world)
 
 
@@ -102,7 +105,7 @@ def open_sources(
 def frame_caches(
     scenario: Scenario, config: WorldConfig, cameras: Sequence[str], effects: Mapping[str, Effects | None]
 ) -> dict[str, FrameCache]:
-    """The frames of each camera, none rendered yet. Raises ScenarioError."""
+    """The frame cache of each camera; nothing is rendered yet. Raises ScenarioError."""
     with errors_of(f"{scenario.path}: source"):
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
     names = _scene_cameras(scenario, scene)
@@ -115,7 +118,7 @@ def frame_caches(
                 effects=effects.get(camera) or NO_EFFECTS,
                 codec=config.codec,
                 quality=config.quality,
-                # A training draws hundreds of motions, each used once.
+                # Training of a scheduler draws hundreds of motions, each used once.
                 on_disk=config.motion_seed is None,
                 phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
             )
@@ -124,7 +127,7 @@ def frame_caches(
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:
-    """Scene camera of each scenario camera: the same name if all are known, else in order."""
+    """Scene camera of each scenario camera: by name if the scene has all of them, else in order."""
     known = list(scene.cameras)
     if all(camera in known for camera in scenario.cameras):
         return {camera: camera for camera in scenario.cameras}
@@ -134,9 +137,9 @@ def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:
 
 
 def render_in_subprocess(scenario: Scenario, config: WorldConfig, camera: str, stopped: Stopped) -> None:
-    """Render one camera's frames in another process, which returns its memory when it ends: casting a large
+    """Render one camera's frames in another process, which frees its memory when it ends: casting a large
     image takes hundreds of megabytes. Returns when the frames are cached, when ``stopped`` returns True, or
-    if the process fails; missing frames are then rendered as needed."""
+    if the process fails; frames that are still missing are rendered on demand."""
     log.info("%s: rendering its frames ahead, once: they are kept for next time", camera)
     begin = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-m", "camera_node.synthetic.source"], stdin=subprocess.PIPE)

@@ -1,7 +1,7 @@
 """Procedural textures: colors (3, N) in [0, 1] as functions of surface coordinates (2, N).
 
-All have soft edges or are sums of few sinusoids, so that images of a hundred pixels a side alias little;
-``supersample`` does the rest. Widths are in the surface's units (meters, or turns around a round shape).
+All have soft edges or are sums of a few sinusoids, so that images of a hundred pixels a side alias little;
+``supersample`` reduces it further. Widths are in the surface's units (metres, or turns around a round shape).
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Plain:
 
 @dataclass(frozen=True)
 class Noise:
-    """Smooth noise: a fixed sum of plane waves no shorter than ``wavelength``, scaled to about +-1.
-    Multiplies ``base`` by 1 + amount * noise."""
+    """Multiplies ``base`` by 1 + amount * noise, where the noise, about +-1, is a fixed sum of plane waves no
+    shorter than ``wavelength``."""
 
     base: Texture
     wavelength: float

@@ -3,8 +3,8 @@
 The Bayesian information criterion BIC = k log n - 2 log L (Schwarz, Annals of Statistics 6(2), 1978) chooses
 between one state (exponential delays, periodic or Poisson arrivals) and two (``hmm``). Intervals are 95 %:
 for the chain, delays and rates from the observed information of the parameters' logarithms; for shares and
-runs from means of twenty batches of equal length (Schmeiser, Operations Research 30(3), 1982), because
-losses in bursts are not independent.
+run lengths from the means of twenty batches of equal length (Schmeiser, Operations Research 30(3), 1982),
+because losses in bursts are not independent.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from channel_emu.model.link import EventKind
 from freshfield.scenario import ScenarioError
 
 MIN_DELAYS = 20
-# A state with fewer frames or fewer visits is taken for outliers.
+# A state with fewer frames or fewer visits counts as outliers.
 _MIN_FRAMES, _MIN_VISITS = 10.0, 3.0
-# Exponential gaps are within a quarter of their median with probability .17, a camera's own nearly always.
+# Exponential gaps are within a quarter of their median with probability .17, a periodic camera's nearly
+# always.
 _NEAR_MEDIAN, _PERIODIC_SHARE = 0.25, 0.5
 _CONSTANT_CV = 0.01
 # Kolmogorov-Smirnov distance times sqrt(n), for parameters fitted to the same data: above the 1 % level of
@@ -50,7 +51,7 @@ Interval = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class IntervalEstimate:
-    """An estimate with its 95 % interval, None if the recording does not determine one."""
+    """An estimate with its 95 % interval; ``interval`` is None if the recording does not determine one."""
 
     value: float
     interval: Interval
@@ -64,8 +65,13 @@ class IntervalEstimate:
 class Fit:
     """A fitted channel.
 
-    parameters: by name, in 1/ms and ms. bic: by number of states. bursts: statistics of undelivered frames.
-    channel: the section for a scenario. estimate, lines: the two-state fit and its data, if it was chosen.
+    states: number of states of the chain, 1 or 2. chosen_by: "BIC" or "asked".
+    arrivals: periodic, poisson or as-offered.
+    parameters: by name, in 1/ms and ms.
+    bic: by number of states.
+    bursts: statistics of undelivered frames, by name.
+    channel: the ``channel:`` section for a scenario.
+    estimate: the two-state fit if it was chosen. lines: the observations, one timeline a chain.
     """
 
     recording: Recording
@@ -81,7 +87,7 @@ class Fit:
     lines: list[Timeline] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
-        """What the command prints with --json."""
+        """The fit as plain values, as the command prints it with --json."""
         cameras = self.recording.cameras
         span_ms = max(c.offered_ms[-1] for c in cameras) - min(c.offered_ms[0] for c in cameras)
         return {
@@ -103,12 +109,12 @@ class Fit:
 
 
 def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared") -> Fit:
-    """Fit the recording in ``path``.
+    """Fit a channel to the recording in ``path`` (``recording`` describes the format).
 
-    states: "1", "2" or "auto" (BIC decides).
-    discipline: of the link, for rows (default drop-new).
-    scope: the cameras have one chain (shared) or one each (per-camera), with equal parameters.
-    Raises RecordingError, TraceError (both ValueError) if there is nothing to fit.
+    states: number of states: "1", "2" or "auto" (BIC decides).
+    discipline: queue discipline of the recorded link, for rows only; None: drop-new.
+    scope: one chain for all cameras (shared), or one each with equal parameters (per-camera).
+    Raises RecordingError or TraceError (both ValueError) if the recording cannot be read or fitted.
     """
     if states not in ("1", "2", "auto"):
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
@@ -182,7 +188,7 @@ def _require_libraries(path: Path) -> None:
 
 
 def _arrivals(recording: Recording) -> tuple[str, float]:
-    """(periodic or poisson, the median gap in ms)."""
+    """The arrival process, and the median gap between offers in ms."""
     gaps = np.concatenate([np.diff(camera.offered_ms) for camera in recording.cameras])
     if not len(gaps):
         return "as-offered", 0.0
@@ -230,7 +236,7 @@ def _observation_count(lines: list[Timeline]) -> int:
 
 
 def _reject_two_states(estimate: Estimate, lines: list[Timeline]) -> str | None:
-    """Why two states are rejected whatever their likelihood, or None."""
+    """The reason to reject two states whatever their likelihood, or None."""
     frames = np.zeros(2)
     time_ms = np.zeros(2)
     for line, states in zip(lines, estimate.states):
@@ -283,8 +289,8 @@ def _misfit_warnings(
 
 
 def _loss_statistics(cameras: list[Camera]) -> dict[str, IntervalEstimate]:
-    """Shares of dropped and lost frames, runs of undelivered frames, gaps between deliveries. Skipped frames
-    and those still inside are not counted."""
+    """Shares of dropped and lost frames, lengths of runs of undelivered and of delivered frames, gaps between
+    deliveries. Skipped frames and those still inside the link are not counted."""
     found: dict[str, IntervalEstimate] = {}
     kept = [
         camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras
@@ -318,7 +324,7 @@ def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _batch_share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]]) -> IntervalEstimate:
-    """Share of ``counted`` in ``among``, with an interval by batch means."""
+    """Number of ``counted`` over the number of ``among``, with an interval by batch means."""
     top, bottom = np.zeros(_BATCHES), np.zeros(_BATCHES)
     for some, every in zip(counted, among):
         stretch = np.arange(len(some)) * _BATCHES // max(len(some), 1)
@@ -329,10 +335,10 @@ def _batch_share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]
         return IntervalEstimate(0.0, None)
     share = float(top.sum()) / total
     if not 0 < share < 1:
-        # None, or all, of n: the exact 95 % bound.
+        # None or all of n were counted: the exact 95 % bound.
         bound = 1 - 0.05 ** (1 / total)
         return IntervalEstimate(share, (0.0, bound) if share == 0 else (1 - bound, 1.0))
-    # Ratio estimator: its variance is that of the batches' residuals.
+    # Ratio estimator; its variance comes from the batches' residuals.
     reach = _T_95 * float(np.sqrt(((top - share * bottom) ** 2).sum() * _BATCHES / (_BATCHES - 1))) / total
     return IntervalEstimate(share, (max(share - reach, 0.0), min(share + reach, 1.0)))
 

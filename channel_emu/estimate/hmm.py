@@ -1,9 +1,11 @@
 """Two-state hidden Markov model in continuous time: likelihood, maximum, intervals (thesis 6.24 to 6.27).
 
-The state is a hidden continuous-time chain Q (6.26). Two kinds of observations depend on it: the delay of a
-frame, exponential with the mean of the state in which it started, and the arrivals, Poisson with the rate of
-the state (MMPP). While ``c`` cameras wait for arrivals, the state and the absence of arrivals evolve by
-exp((Q - c L) u), L the diagonal of rates; an arrival multiplies by its rate. There is no grid of slots.
+The hidden state is a continuous-time Markov chain with generator Q (6.26). Two kinds of observations depend
+on
+it: a frame's delay, exponential with the mean of the state in which it started, and the arrivals, Poisson
+with the rate of the state (MMPP). While ``c`` cameras wait for arrivals, the joint probability of the state
+and of no arrival evolves by exp((Q - c L) u), with L the diagonal matrix of rates; an arrival multiplies it
+by the rate. There is no grid of slots.
 
 scipy maximizes the likelihood over the logarithms of the parameters; the observed information at the maximum
 gives the intervals.
@@ -22,9 +24,9 @@ Array = NDArray[np.float64]
 
 MOST_STEPS, _START_STEPS = 300, 15
 _START_EVENTS = 20_000
-# Step in a logarithm for differences: second ones keep four digits of a log likelihood of 1e5.
+# Finite-difference step of a logarithm: second differences keep four digits at a log likelihood of 1e5.
 _STEP = 1e-3
-# Gain in log likelihood of one more step at which the maximum counts as reached.
+# The maximum counts as reached when one more step gains less log likelihood than this.
 _TOLERANCE = 1e-6
 _IMPOSSIBLE = 1e15
 # Bound of the parameters' logarithms (1e-15 to 1e15): no product over- or underflows.
@@ -36,10 +38,12 @@ Z_95 = 1.959964
 
 @dataclass(frozen=True)
 class Timeline:
-    """The observations of one chain, in order of time.
+    """The observations of one chain: N events in the order of time.
 
-    span_ms (N,): since the event before. waiting (N,): cameras waiting for an arrival during that span.
-    arrived (N,) bool: the event is an arrival. delay_ms (N,): of the frame that starts here, NaN if none.
+    span_ms: (N,), time since the previous event.
+    waiting: (N,), number of cameras that wait for an arrival during that span.
+    arrived: (N,), whether the event is an arrival.
+    delay_ms: (N,), delay of the frame whose transmission starts here; NaN if none does.
     origin_ms: instant of the first event.
     """
 
@@ -50,10 +54,11 @@ class Timeline:
     origin_ms: float = 0.0
 
     def at_ms(self) -> Array:
-        """Instants of the events."""
+        """Instants of the events, (N,)."""
         return self.origin_ms + np.cumsum(self.span_ms)
 
     def head(self, events: int) -> Timeline:
+        """The first ``events`` events."""
         return Timeline(self.span_ms[:events], self.waiting[:events], self.arrived[:events],
                         self.delay_ms[:events], self.origin_ms)  # fmt: skip
 
@@ -67,12 +72,12 @@ class TwoStateModel:
     rate_per_ms: Array | None
 
     def log_parameters(self) -> Array:
-        """Logarithms of all parameters."""
+        """Logarithms (P,) of all parameters: leaving rates, then means, then arrival rates, if present."""
         parts = [p for p in (self.leave_per_ms, self.mean_ms, self.rate_per_ms) if p is not None]
         return np.log(np.concatenate(parts))
 
     def with_logs(self, log_parameters: Array) -> TwoStateModel:
-        """A model with the same parameters, of the given logarithms."""
+        """A model of the same kind, with parameters of the given logarithms (P,), clipped to +-_MAX_LOG."""
         pairs = iter(np.exp(np.clip(log_parameters, -_MAX_LOG, _MAX_LOG)).reshape(-1, 2))
         return TwoStateModel(
             next(pairs),
@@ -81,7 +86,7 @@ class TwoStateModel:
         )
 
     def ordered(self) -> TwoStateModel:
-        """The state of shorter delays first; without delays, the state of fewer arrivals."""
+        """The same model with the state of shorter delays first; without delays, of fewer arrivals first."""
         key = self.mean_ms if self.mean_ms is not None else self.rate_per_ms
         if key is None or key[0] <= key[1]:
             return self
@@ -94,8 +99,11 @@ class TwoStateModel:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The maximum likelihood model. log_sd: standard deviations of ``model.log_parameters()``; None if the
-    data do not determine them all. states: see ``state_probabilities``."""
+    """The maximum likelihood model.
+
+    log_sd: (P,), standard deviations of ``model.log_parameters()``; None if the data do not determine all.
+    states: of ``state_probabilities``.
+    """
 
     model: TwoStateModel
     log_likelihood: float
@@ -104,11 +112,11 @@ class Estimate:
 
     @property
     def finite(self) -> bool:
-        """Whether the likelihood has its maximum where it can be computed."""
+        """Whether the likelihood and the state probabilities at the maximum are finite."""
         return math.isfinite(self.log_likelihood) and all(np.isfinite(s).all() for s in self.states)
 
     def interval(self, place: int) -> tuple[float, float] | None:
-        """95 % interval of the parameter at ``place`` in ``log_parameters``."""
+        """95 % interval of parameter number ``place`` in ``log_parameters``; None if undetermined."""
         if self.log_sd is None or not self.log_sd[place] < _MAX_LOG_SD:
             return None
         at, reach = self.model.log_parameters()[place], Z_95 * self.log_sd[place]
@@ -116,7 +124,8 @@ class Estimate:
 
 
 class _Propagator:
-    """exp(G u) of G = Q - c L = slow * P_slow + fast * P_fast; both eigenvalues are real and at most 0."""
+    """Spectral decomposition for exp(G u), where G = Q - c L = slow * P_slow + fast * P_fast; both
+    eigenvalues are real and at most 0."""
 
     def __init__(self, model: TwoStateModel, waiting: int) -> None:
         a, b = (float(x) for x in model.leave_per_ms)
@@ -124,7 +133,7 @@ class _Propagator:
         half, skew = (a + la + b + lb) / 2, (a + la - b - lb) / 2
         self.root = math.sqrt(skew * skew + a * b)
         self.fast = -(half + self.root)
-        # The product of the eigenvalues is the determinant: no difference of nearly equal numbers.
+        # Determinant over the other eigenvalue, which avoids a difference of nearly equal numbers.
         self.slow = (a * lb + b * la + la * lb) / self.fast
         near = self.root + abs(skew)
         small = a * b / near
@@ -145,8 +154,8 @@ def _propagators(model: TwoStateModel, line: Timeline) -> Array:
 
 
 def _emissions(model: TwoStateModel, line: Timeline) -> tuple[Array, float]:
-    """Likelihood (N, 2) of each event by state, each row scaled to a largest of 1, and the log of the
-    scales' product."""
+    """Likelihood (N, 2) of each event by state, with rows scaled to a maximum of 1, and the sum of the
+    scales' logarithms."""
     from channel_emu.estimate import hmm_kernels
 
     none = np.full(2, np.nan)
@@ -159,7 +168,7 @@ _UNIFORM = np.array([0.5, 0.5])
 
 
 def log_likelihood(model: TwoStateModel, lines: Sequence[Timeline]) -> float:
-    """Of all timelines, which are independent; either initial state has probability 1/2."""
+    """Log likelihood of all timelines, which are independent; each initial state has probability 1/2."""
     from channel_emu.estimate import hmm_kernels
 
     total = 0.0
@@ -170,7 +179,7 @@ def log_likelihood(model: TwoStateModel, lines: Sequence[Timeline]) -> float:
 
 
 def state_probabilities(model: TwoStateModel, lines: Sequence[Timeline]) -> list[Array]:
-    """The state's distribution at each event given all observations, one array (N, 2) a timeline."""
+    """Probability of each state at each event given all observations, one array (N, 2) a timeline."""
     from channel_emu.estimate import hmm_kernels
 
     return [
@@ -179,14 +188,14 @@ def state_probabilities(model: TwoStateModel, lines: Sequence[Timeline]) -> list
 
 
 def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> TwoStateModel:
-    """The model of the highest likelihood near ``model``, after at most so many steps."""
+    """Climb from ``model`` to a maximum of the likelihood, in at most ``steps`` iterations of L-BFGS."""
     from scipy.optimize import minimize
 
     moves = _STEP * np.eye(len(model.log_parameters()))
 
     def lost(at: Array) -> tuple[float, Array]:
         tried = [log_likelihood(model.with_logs(at + move), lines) for move in (0.0 * at, *moves, *-moves)]
-        # Impossible parameters, which a long step may try, have a finite loss, so that it comes back.
+        # Impossible parameters, which a long step may try, get a finite loss, so the search returns.
         value, *beside = -np.maximum(tried, -_IMPOSSIBLE)
         up, down = np.reshape(beside, (2, -1))
         return value, (up - down) / (2 * _STEP)
@@ -199,7 +208,10 @@ def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> Two
 
 
 def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> list[TwoStateModel]:
-    """Models to start from: sojourns of 5, 50 and 500 frames, arrivals faster in either state."""
+    """Models to start from: sojourns of 5, 50 and 500 frames, with the faster arrivals in either state.
+
+    delays, arrivals: see ``fit``.
+    """
     has_delay = np.concatenate([line.delay_ms[~np.isnan(line.delay_ms)] for line in lines])
     mean = float(has_delay.mean()) if len(has_delay) else 1.0
     arrived = sum(int(line.arrived.sum()) for line in lines)
@@ -217,10 +229,11 @@ def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> l
 
 
 def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> Estimate:
-    """Maximum likelihood. delays, arrivals: what the states may differ in; at least one of them.
+    """Maximum likelihood fit of the two-state model.
 
-    Deterministic: a few steps from several models on the first part of the data, then from the best of them
-    to the maximum.
+    delays, arrivals: whether the states differ in delays, in arrivals; at least one of them.
+    Deterministic: a few steps from several initial models on the first part of the data, then from the best
+    of them to the maximum.
     """
     first = [line.head(_START_EVENTS) for line in lines]
     candidates = [maximize(each, first, _START_STEPS) for each in initial_models(lines, delays, arrivals)]
@@ -231,8 +244,8 @@ def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> Estimate:
 
 
 def _deviations(model: TwoStateModel, lines: Sequence[Timeline], best: float) -> Array | None:
-    """Standard deviations (P,) of the parameters' logarithms by the observed information, None where it
-    leaves one open."""
+    """Standard deviations (P,) of the parameters' logarithms by the observed information; None if that is not
+    positive definite."""
     at = model.log_parameters()
     count = len(at)
     moves = _STEP * np.eye(count)
@@ -242,7 +255,7 @@ def _deviations(model: TwoStateModel, lines: Sequence[Timeline], best: float) ->
 
     up, down = np.array([value(m) for m in moves]), np.array([value(-m) for m in moves])
     if not np.isfinite([best, *up, *down]).all():
-        return None  # what lies beside is impossible
+        return None  # neighboring parameters are impossible
     hessian = np.diag(up + down - 2 * best)
     for i in range(count):
         for j in range(i):

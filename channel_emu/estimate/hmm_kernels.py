@@ -10,9 +10,11 @@ from numba import njit
 
 @njit(cache=True)
 def propagate(eigenvalues, p_slow, p_fast, span_ms, waiting):
-    """exp(G u) (N, 2, 2) of spans u (N,), for the G of as many cameras as wait (N,).
+    """exp(G u) (N, 2, 2) for each span u.
 
-    eigenvalues (W, 3): slow, fast, half of their distance; p_slow, p_fast (W, 2, 2): see ``hmm._Propagator``.
+    eigenvalues: (W, 3), slow, fast and half of their distance, by number of waiting cameras.
+    p_slow, p_fast: (W, 2, 2), see ``hmm._Propagator``.
+    span_ms: (N,). waiting: (N,), number of waiting cameras, which selects G.
     """
     out = np.empty((len(span_ms), 2, 2))
     for k in range(len(span_ms)):
@@ -27,8 +29,12 @@ def propagate(eigenvalues, p_slow, p_fast, span_ms, waiting):
 
 @njit(cache=True)
 def emit(mean_ms, rate_per_ms, delay_ms, arrived):
-    """Likelihood (N, 2) of each event by state, each row scaled to a largest of 1, and the log of the scales'
-    product. mean_ms, rate_per_ms (2,): NaN where they are not part of the model."""
+    """Likelihood (N, 2) of each event by state, with rows scaled to a maximum of 1, and the sum of the
+    scales' logarithms.
+
+    mean_ms, rate_per_ms: (2,) by state; NaN if not part of the model.
+    delay_ms, arrived: (N,), see ``hmm.Timeline``.
+    """
     delays, rates = not np.isnan(mean_ms[0]), not np.isnan(rate_per_ms[0])
     log_mean, log_rate = np.log(mean_ms), np.log(rate_per_ms)
     out, total = np.empty((len(delay_ms), 2)), 0.0
@@ -48,11 +54,13 @@ def emit(mean_ms, rate_per_ms, delay_ms, arrived):
 
 @njit(cache=True)
 def forward(initial, steps, emissions):
-    """The forward recursion: log p(all observations), and for each observation k the filtered state just
-    before its step (N, M) and its probability given those before it (N,).
+    """The forward recursion.
 
-    initial (M,): the state before the first step; steps (N, M, M): step ``k`` leads from observation k-1 to
-    k; emissions (N, M): likelihood of observation k in each state. -inf where observations are impossible.
+    initial: (M,), distribution of the state before the first step.
+    steps: (N, M, M); step k leads from observation k - 1 to k.
+    emissions: (N, M), likelihood of observation k in each state.
+    Returns log p(all observations), -inf if they are impossible; the filtered distribution before each step
+    (N, M); and the probability of each observation given the earlier ones (N,).
     """
     n, m = emissions.shape
     before = np.empty((n, m))
@@ -80,16 +88,18 @@ def forward(initial, steps, emissions):
 
 @njit(cache=True)
 def smooth(initial, steps, emissions):
-    """Probability (N, M) of each state at each observation, given all of them; 0 where they are impossible.
+    """Probability (N, M) of each state at each observation, given all observations; 0 if these are
+    impossible.
 
-    Baum, Petrie, Soules and Weiss 1970, with the scaling of Rabiner, Proc. IEEE 77(2), 1989.
+    Arguments as in ``forward``. Baum, Petrie, Soules and Weiss 1970, with the scaling of Rabiner, Proc. IEEE
+    77(2), 1989.
     """
     n, m = emissions.shape
     total, before, mass = forward(initial, steps, emissions)
     states = np.zeros((n, m))
     if total == -math.inf:
         return states
-    after = np.ones(m)  # p(what follows | state), scaled
+    after = np.ones(m)  # p(later observations | state), scaled
     nxt = np.empty(m)
     for k in range(n - 1, -1, -1):
         nxt[:] = 0.0

@@ -1,14 +1,14 @@
 """Reads a recording of a channel: frames, delays, arrivals and losses.
 
-A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored, or rows of any
+A recording is either a trace of this emulator (``trace.py``; its recorded states are ignored), or rows of any
 other link, one frame a line::
 
     # offered_ms, delivered_ms (blank: it never came), camera (optional)
     0.0, 41.5, cam00
     33.3, , cam00
 
-separated by commas, semicolons or tabs, the same in all lines. Lines that start with # and a first line of
-names are skipped.
+The separator is a comma, semicolon or tab, the same in all lines. Lines that start with # and a first line of
+column names are skipped.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 
-# Longer than any stream lives; a frame with a longer delay counts as not delivered.
+# Longer than any stream lives; longer delays are left out.
 MAX_DELAY_MS = 1e9
 _MAX_ROWS_MS = 1e12
-_MOST_OVERLAPPING = 0.02  # share of the frames of a drop-new link that may seem to have been sent together
+_MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
 
 
 class RecordingError(ValueError):
@@ -38,10 +38,11 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera's frames in order of offering; every array has one entry a frame.
+    """One camera's frames in the order of their offers; all arrays are (N,), one entry a frame.
 
-    started_ms, delay_ms: NaN where transmission did not start, or is not known to have started.
-    arrived_ms: when the link's arrival process sampled the frame, NaN where it did not.
+    arrived_ms: when the link's arrival process sampled the frame; NaN if it did not.
+    started_ms: start of transmission; NaN if it did not start, or is not known to have started.
+    delay_ms: from the start to the delivery; NaN likewise.
     outcome: a ``link.EventKind``, or "" for a frame that was still inside.
     """
 
@@ -53,34 +54,43 @@ class Camera:
     outcome: NDArray[np.str_]
 
     def delivered(self) -> NDArray[np.bool_]:
+        """Whether each frame was delivered, (N,)."""
         return self.outcome == EventKind.DELIVERED
 
 
 @dataclass(frozen=True)
 class Recording:
-    """discipline: of the link. sampled: an arrival process sampled frames later than they were offered, or
-    not at all (``skipped``)."""
+    """A recording of one or several cameras.
+
+    discipline: the link's queue discipline.
+    sampled: whether an arrival process sampled the offered frames, and skipped some.
+    """
 
     path: Path
     cameras: list[Camera]
     discipline: str
     sampled: bool
     too_long: int = 0
-    """Delays left out because they exceed MAX_DELAY_MS."""
+    """Number of delays left out because they exceed MAX_DELAY_MS."""
 
     @property
     def frames(self) -> int:
+        """Number of frames of all cameras."""
         return sum(len(camera.offered_ms) for camera in self.cameras)
 
     def delays_ms(self) -> NDArray[np.float64]:
-        """All delays, in no particular order."""
+        """All known delays, one camera after the other."""
         values = np.concatenate([camera.delay_ms for camera in self.cameras])
         return values[~np.isnan(values)]
 
 
 def read_recording(path: Path, discipline: str | None = None) -> Recording:
-    """Read a trace or rows. ``discipline``: how the link of the rows treats a frame while it is busy (default
-    drop-new); a trace knows its own. Raises RecordingError, TraceError."""
+    """Read a trace or rows.
+
+    discipline: queue discipline of the link of the rows; None assumes drop-new and refuses rows that
+        contradict it. A trace contains its own.
+    Raises RecordingError or TraceError.
+    """
     try:
         begin = path.read_text()[:1]
     except (OSError, UnicodeDecodeError) as error:
@@ -94,7 +104,8 @@ def read_recording(path: Path, discipline: str | None = None) -> Recording:
 
 
 def from_trace(path: Path, found: trace.Trace) -> Recording:
-    """The emulator's own trace, with the delay of every frame that started."""
+    """The recording in a trace of the emulator. path: for error messages. Raises RecordingError if it is
+    empty."""
     if not found.records:
         raise RecordingError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
@@ -150,15 +161,15 @@ def _from_rows(path: Path, discipline: str) -> Recording:
         tables[name] = table
     instants = np.concatenate([table.ravel() for table in tables.values()])
     delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
-    # On a parallel link, frames offered after this may still be in service.
+    # On a parallel link, frames offered from this instant on may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
     cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
     return Recording(path, cameras, discipline, False, too_long)
 
 
 def _check_drop_new(recording: Recording) -> None:
-    """Refuse rows of another kind of link: their waits would be counted as delays. A few frames may be out of
-    order where clocks are coarse."""
+    """Refuse rows of a link with another discipline, whose waiting times would count as delays. A few frames
+    may overlap because clocks are coarse."""
     came = meanwhile = 0
     for camera in recording.cameras:
         went = ~np.isnan(camera.delay_ms)
@@ -180,8 +191,8 @@ def _camera_of_rows(
 ) -> Camera:
     """Infer starts and outcomes. Transmission starts at the offer, or when the link becomes free.
 
-    An undelivered frame met a busy link if an earlier one was in service, and was lost otherwise. After the
-    last delivery, and on a parallel link from ``sure_ms`` on, it may still be in service: outcome unknown.
+    An undelivered frame was dropped if an earlier one was in service, and lost otherwise. After the last
+    delivery, and on a parallel link from ``sure_ms`` on, it may still be in service: outcome unknown.
     """
     n = len(offered)
     started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
@@ -206,10 +217,11 @@ def _camera_of_rows(
 
 
 def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
-    """One timeline of all cameras if they share a chain, else one each.
+    """The observations for ``hmm``, without empty timelines.
 
-    arrivals: whether arrivals count as observations. A sampling process waits from a frame's offer on; a
-    process that generates frames waits from the camera's first frame to its last.
+    shared: one timeline of all cameras, which share a chain; otherwise one a camera.
+    arrivals: whether arrivals count as observations. A process that samples frames waits from a frame's offer
+        on; one that generates frames waits from the camera's first frame to its last.
     """
     groups = [recording.cameras] if shared else [[camera] for camera in recording.cameras]
     return [line for group in groups if len((line := _timeline(group, recording.sampled, arrivals)).span_ms)]
@@ -246,7 +258,7 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
             add(camera.offered_ms[1:-1], 0, True)
             add(camera.offered_ms[-1:], -1, len(camera.offered_ms) > 1)
     when = np.concatenate(at)
-    # At one instant the waiting begins first, so that an arrival finds its camera waiting.
+    # Among events of one instant, waiting begins first, so that an arrival finds its camera waiting.
     order = np.lexsort((-np.concatenate(change), when))
     when = when[order]
     waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order

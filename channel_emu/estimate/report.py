@@ -1,4 +1,4 @@
-"""A fitted channel for people: figures, a scenario's YAML, a plot."""
+"""Presents a fitted channel: as text, as a scenario's YAML, as a plot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLORS, _GRAY = ("#0072B2", "#D55E00"), "#777777"
 
 
 def format_fit(fit: Fit) -> str:
-    """Figures with intervals, warnings, and the section to copy into a scenario."""
+    """Text with the estimates and their intervals, warnings, and the section to copy into a scenario."""
     summary = fit.summary()
     lines = [
         f"{summary['file']}: {summary['frames']:,} frames of {summary['cameras']} cameras in "
@@ -41,7 +41,7 @@ def format_fit(fit: Fit) -> str:
 
 
 def scenario_text(fit: Fit) -> str:
-    """A scenario file with the fitted channel, for ``simulate --scenario`` and to add a source to."""
+    """Text of a scenario file with the fitted channel, for ``simulate --scenario``; it has no source."""
     cameras = [camera.name for camera in fit.recording.cameras]
     head = (
         f"# Fitted to {fit.recording.path.name}: {fit.recording.frames} frames, states by {fit.chosen_by}\n"
@@ -51,10 +51,8 @@ def scenario_text(fit: Fit) -> str:
 
 
 def plot(fit: Fit, path: Path) -> None:
-    """Plot delays and the second state's probability over time, for the first part of a long recording.
-
-    Raises PlotError.
-    """
+    """Plot delays and the second state's probability over time to ``path``; only the first part of a long
+    recording. Raises PlotError."""
     cameras = fit.recording.cameras
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
     delay_ms = np.concatenate([c.delay_ms for c in cameras])
@@ -78,7 +76,7 @@ def plot(fit: Fit, path: Path) -> None:
 
 
 def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
-    """Number of frames: about forty visits to each state, so that single visits are visible."""
+    """Number of frames to plot: about forty visits to each state, so that single visits are visible."""
     if fit.states == 1 or not len(start_s):
         return _MAX_FRAMES
     cycle_s = sum(1 / fit.parameters[f"mu{i}_per_ms"].value for i in (1, 2)) / 1e3
@@ -87,7 +85,7 @@ def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
 
 
 def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
-    """Delays colored by the state's probability, means, and below the probability over time."""
+    """Draw delays colored by the state's probability, the means, and below the probability over time."""
     assert fit.estimate is not None
     names, (top, bottom) = fit.channel["chain"]["states"], axes
     bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({names[1]})")

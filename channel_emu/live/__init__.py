@@ -1,1 +1,2 @@
-"""The emulator on the wall clock: a gRPC proxy, and our frame stream as its hook."""
+"""The emulator on the wall clock: a gRPC proxy for any service, with freshfield's frame stream as its
+hook."""

@@ -1,10 +1,11 @@
 """Measures the live emulator from outside: cameras, emulator and sink are separate processes on loopback.
 
-Two errors are reported, both from the instant a frame was due. ``delay_error_ms``, the emulator's own, ends
-when the frame is handed to gRPC. ``arrival_error_ms``, what a receiver sees, ends when the sink's handler has
-the frame: it adds gRPC at both ends and the sink's scheduling. ``floor_ms`` is how late this machine wakes a
-process that only sleeps, at the emulator's priority, during the same seconds; no emulator on it can do
-better. ``stolen`` is the share of processor time that a hypervisor kept to itself.
+Two errors are reported, both counted from the instant at which a frame was due. ``delay_error_ms``, the
+emulator's own error, ends when the frame is handed to gRPC. ``arrival_error_ms``, the error that a receiver
+sees, ends when the sink's handler has the frame: it adds gRPC at both ends and the sink's scheduling.
+``floor_ms`` is how late this machine wakes a process that only sleeps, at the emulator's priority and during
+the same seconds; no emulator on it can be better. ``stolen`` is the share of processor time that a hypervisor
+took away.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from freshfield.machine_load import cpu_s, machine_ticks, rss_mb
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 
-# Every frame is let out (no server limit), so that "nothing lost" can be read off the counts.
+# No frame waits or is dropped, so that the counts show whether any was lost.
 _CHANNEL = {"service": {"law": "exponential", "mean_ms": 60.0}, "discipline": "parallel"}
 _DRAIN_S = 10.0
 _START_S = 20.0
@@ -50,7 +51,11 @@ def bench(
 ) -> dict[str, Any]:
     """Drive ``cameras`` streams at ``rate_hz`` for ``seconds`` through a real emulator to a real sink.
 
-    load: processes that compute on the same cores meanwhile. Returns plain values; see the module.
+    frame_bytes: payload of each frame.
+    load: number of processes that compute on the same cores meanwhile.
+    priority: whether the emulator asks for a higher priority.
+    Returns plain values; the module describes the errors. Raises ValueError for values out of range,
+    RuntimeError if a process does not start or finish.
     """
     if not (1 <= cameras <= 1000 and rate_hz > 0 and seconds > 0 and 0 <= frame_bytes <= 8_000_000):
         raise ValueError("bench: expected 1 to 1000 cameras, rate and seconds above 0, at most 8 MB a frame")
@@ -118,7 +123,7 @@ def bench(
 
 
 def show(result: dict[str, Any]) -> str:
-    """The result for a person, with the histogram of the delay error."""
+    """The result of ``bench`` as text, with the histogram of the delay error."""
     late = [
         {"ms": name.removesuffix("_ms").replace("_", " "),
          **{k: "-" if figures[k] is None else figures[k] for k in ("p50", "p95", "p99", "max")}}
@@ -227,7 +232,7 @@ async def _camera(
     payload: bytes,
     totals: dict[str, Any],
 ) -> None:
-    """One camera: a frame each period, at most one unanswered. It skips periods in which it still waits."""
+    """Send as one camera: a frame each period, at most one unanswered; it skips periods while it waits."""
     call = channel.stream_stream(PUSH)()
     clock = WallClock()
     frame = 0
@@ -249,8 +254,8 @@ async def _camera(
 
 
 def _probe(pipe: Connection, priority: bool, seconds: float) -> None:
-    """Send how late, in ms, a process that only sleeps is at each instant of a 2 ms grid. A pause of the
-    machine counts for every instant within it, as it does for messages."""
+    """Send how late, in ms, a process that only sleeps wakes at each instant of a 2 ms grid. A pause of the
+    machine counts for every instant within it, as it would for messages."""
     if priority:
         raise_priority()
     late = []

@@ -1,4 +1,4 @@
-"""One direction of one gRPC call on its way through a link, whatever its messages mean."""
+"""Passes the messages of one direction of one gRPC call through a link, without parsing them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
 from channel_emu.model.link import EventKind
 from freshfield.streams import ServedCall
 
-# Messages that are read ahead of the one being written, at most; then the sender waits. Behind a message that
-# is still in the link any number are read, because the link decides about each at once. Those it drops are
-# held without their bytes.
+# Maximum number of messages read ahead of the one being written; then the sender waits. Behind a message that
+# is still in the link any number are read, because the link must decide about each at its arrival. Dropped
+# ones are kept without their bytes.
 _MOST_READY = 64
 
 Read = Callable[[], Awaitable[Any]]
@@ -25,10 +25,10 @@ Write = Callable[[bytes], Awaitable[None]]
 class CallFlow:
     """Reads one side's messages, passes them through a link and writes them to the other side.
 
-    Nothing overtakes on one stream: a message that is due before its predecessor waits for it.
+    Messages of one stream keep their order: one that is due before its predecessor waits for it.
 
-    number: the call's. call: what a reset of the link ends. link: None passes messages straight on. now_ns:
-    the channel's clock.
+    number: of the call. call: ended by a reset of the link. link: None passes all messages on at once.
+    now_ns: the channel's clock.
     """
 
     def __init__(
@@ -51,11 +51,12 @@ class CallFlow:
 
     @property
     def lost_its_only_message(self) -> bool:
-        """The sender sent one message and no more, and the link dropped it."""
+        """Whether the sender sent exactly one message and the link dropped it."""
         return self._ended and self._read == 1 and self._dropped == 1
 
     async def carry(self, read: Read, write: Write) -> None:
-        """Run until the sender is done and every message has been written or dropped."""
+        """Run until the sender is done and every message has been written or dropped. Raises what ``read`` or
+        ``write`` raises, except that a broken read ends the messages."""
         reader = asyncio.create_task(self._fill(read))
         try:
             while not (self._ended and not self._messages):
@@ -71,6 +72,7 @@ class CallFlow:
             reader.cancel()
 
     def settle(self, message: Message, kind: EventKind) -> None:
+        """See ``Receiver``."""
         if kind is EventKind.DUPLICATED:
             return  # ``_pass`` writes the second copy
         message.delivered = kind is EventKind.DELIVERED
@@ -81,7 +83,7 @@ class CallFlow:
         self._wake.set()
 
     def close(self) -> None:
-        """The call is over: what the link still delivers is counted as cancelled."""
+        """End the flow: messages that the link still delivers are counted as cancelled."""
         self._closed = True
         if self._link is not None:
             self._link.calls.discard(self._call)
@@ -128,7 +130,7 @@ class CallFlow:
             if self._link is not None:
                 self._link.hand_on(message, self._now_ns())
             await write(message.raw)
-            # A unary method takes one message: the only message of a call is not written twice.
+            # A unary method takes one message, so the only message of a call is not written twice.
             if message.duplicated and self._read > 1:
                 await write(message.raw)
         if len(self._messages) < _MOST_READY:

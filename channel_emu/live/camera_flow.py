@@ -1,4 +1,4 @@
-"""One camera's frames on their way through a link to the edge: answers to the node, ledger, upstream."""
+"""Passes one camera's frames through a link to the edge, answers the node, and writes the ledger."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from freshfield.v1 import frames_pb2 as pb
 
 
 class CameraFlow:
-    """Offers a camera's frames to its link as they come in and sends them to the edge when they are due.
+    """Offers a camera's frames to its link as they come in, and sends them to the edge when they are due.
 
-    Held-out frames pass beside the link and are not in its figures.
+    Held-out frames bypass the link and are not in its statistics.
 
     origin_ns: the clock's reading at the channel's instant zero.
     edge, metadata, jitter: of the stream to the edge, see ``Upstream``.
@@ -41,7 +41,7 @@ class CameraFlow:
         self._ledger = ledger
 
     def take(self, raw: bytes, header: pb.FrameHeader) -> pb.PushResponse:
-        """A frame came in: let the link decide, and answer the node."""
+        """Let the link decide about a frame that came in. Returns the answer to the node."""
         now_ns = self._clock.now_ns()
         message = Message(raw, header.session_id, header.sequence, self)
         self._write(message, "received", now_ns)
@@ -54,13 +54,14 @@ class CameraFlow:
         return pb.PushResponse(sequence=header.sequence, outcome=outcome)
 
     def settle(self, message: Message, kind: EventKind) -> None:
+        """See ``Receiver``."""
         if kind is not EventKind.DELIVERED:
             self._write(message, str(kind), self._clock.now_ns())
         if kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
             self.upstream.send(message)
 
     def close(self) -> None:
-        """The emulator ends: enter what is inside the link in the ledger as ``in_flight``."""
+        """At the emulator's end: record frames inside the link as ``in_flight`` in the ledger."""
         for transit in self.link.model.pending():
             self._write(transit.item, "in_flight", self._clock.now_ns())
 
@@ -73,7 +74,7 @@ class CameraFlow:
             self.link.hand_on(message, now_ns - self._origin_ns)
 
     def _on_broken(self, message: Message) -> None:
-        """The edge was away, or its stream ended before it answered."""
+        """The edge was not connected, or its stream ended before it answered."""
         self.broken += 1
         self._write(message, "broken", self._clock.now_ns())
         self.link.record(message)

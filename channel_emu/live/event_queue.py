@@ -1,4 +1,4 @@
-"""When each link's next event is due on the wall clock: one exact timer for any number of links."""
+"""Schedules the links' events on the wall clock, with one exact timer for any number of links."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from channel_emu.live.timer import LoopTimer
 from channel_emu.model.nanoseconds import NEVER_NS
 from freshfield.clock import Clock
 
-# Beyond four entries a link and these, outdated entries are removed.
+# Outdated entries are removed once there are more than four entries a link plus this many.
 _SLACK = 16
 
 
 class Scheduled(Protocol):
-    """What the queue holds. scheduled_ns belongs to the queue and is -1 to begin with."""
+    """An entry's link. ``scheduled_ns`` belongs to the queue; it is -1 at first."""
 
     scheduled_ns: int
 
@@ -23,23 +23,24 @@ class Scheduled(Protocol):
     def next_event_ns(self) -> int: ...
 
     def advance(self, now_ns: int) -> None:
-        """Do what is due up to the channel's instant ``now_ns``."""
+        """Process the events up to the channel's instant ``now_ns``."""
 
 
 class EventQueue:
-    """Calls ``advance`` on each link that has an event due. Must be made with an event loop running.
+    """Calls ``advance`` on each link that has an event due. Needs a running event loop.
 
     origin_ns: the clock's reading at the channel's instant zero.
-    failed: told of what ``advance`` raises. An exception in the timer's callback would only be logged, and no
-        later message would leave.
-    shared: the links compete for one server, so an event of one may change the next event of all.
+    failed: called with what ``advance`` raises. An exception in the timer's callback would only be logged,
+        and later messages would not leave.
+    shared: whether the links compete for one server, so that an event of one may change the next event of
+        all.
     """
 
     def __init__(
         self, clock: Clock, origin_ns: int, failed: Callable[[BaseException], None], shared: bool = False
     ) -> None:
         self.entries: list[tuple[int, int, Scheduled]] = []
-        """Heap of (instant, order, link); outdated where the link is no longer scheduled for the instant."""
+        """Heap of (instant, order, link). An entry is outdated if its link is no longer scheduled for it."""
         self._clock = clock
         self._origin_ns = origin_ns
         self._failed = failed
@@ -50,11 +51,11 @@ class EventQueue:
         self._most = _SLACK
 
     def now_ns(self) -> int:
-        """The channel's present instant."""
+        """The channel's current instant."""
         return self._clock.now_ns() - self._origin_ns
 
     def schedule(self, link: Scheduled) -> None:
-        """Note the link's next event. Its earlier entry, if any, is ignored when it comes up."""
+        """Schedule the link's next event. An earlier entry of the link, if any, becomes outdated."""
         if self._sharing is not None:
             self._sharing.setdefault(id(link), link)
         next_ns = link.next_event_ns
@@ -72,8 +73,7 @@ class EventQueue:
             self._timer.arm(next_ns - self.now_ns())
 
     def reschedule(self, link: Scheduled) -> None:
-        """After something happened to the link: note its next event, and those of links that share its
-        server."""
+        """After a change of the link: schedule its next event, and those of links that share its server."""
         self.schedule(link)
         for other in tuple((self._sharing or {}).values()):
             self.schedule(other)
@@ -82,7 +82,7 @@ class EventQueue:
         self._timer.close()
 
     def _remove_outdated(self) -> None:
-        """Where messages preempt each other, outdated entries would stay until instants far ahead."""
+        """Keep only current entries. Preemption would otherwise leave entries for instants far ahead."""
         current: dict[int, tuple[int, int, Scheduled]] = {}
         for entry in self.entries:
             if entry[0] == entry[2].scheduled_ns:

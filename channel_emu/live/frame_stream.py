@@ -1,7 +1,7 @@
-"""Our frame stream as a hook of the proxy: cameras stream to the emulator, the emulator streams to the edge.
+"""freshfield's frame stream as a hook of the proxy: nodes stream to the emulator, the emulator to the edge.
 
-Frames are opaque bytes: only their headers are read. A node is answered with its link's decision. What the
-edge answers stays here and is counted.
+Frames are opaque bytes: only their headers are read. A node's answer is its link's decision. The edge's
+answers are counted here and not passed on.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _EXCHANGE = f"/{CLOCK_SERVICE}/Exchange"
 _EXCHANGE_TIMEOUT_S = 5.0
 # After this long without the edge, warn once.
 _WARN_AFTER_NS = 3 * 10**9
-# Cameras are let in when the streams to the edge are open, or after this long without them.
+# Nodes are admitted when the streams to the edge are open, or after this long without them.
 _FIRST_WAIT_S = 2.0
 
 
 class FrameStream:
-    """Give it to ``Proxy``.
+    """The ``Hook`` of the frame stream, for ``Proxy``.
 
-    cameras: of the scenario; others are refused.
+    cameras: ids of the scenario's cameras; others are refused.
     out: folder of ``channel.json`` and the ledger.
-    priority: what ``priority.raise_priority`` reached, for the status.
+    priority: result of ``priority.raise_priority``, for the status.
     """
 
     client_options = CLIENT_OPTIONS
@@ -67,6 +67,7 @@ class FrameStream:
         self._sessions = SessionStreams(self.cameras)
 
     def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
+        """See ``Hook``. Raises OSError if the ledger cannot be created."""
         self._proxy = proxy
         self._ledger = Ledger(self._out, "emulator", "channel", proxy.origin_ns)
         self._exchange = proxy.service_channel.unary_unary(_EXCHANGE)
@@ -83,21 +84,21 @@ class FrameStream:
         }
 
     async def start(self, server: grpc.aio.Server) -> None:
-        """Look for the edge; return when it is found or a moment has passed."""
+        """Connect to the edge. Returns when all streams are open, or after _FIRST_WAIT_S."""
         await serve_health(server, (SERVICE, CLOCK_SERVICE))
         for flow in self.flows.values():
             self._proxy.spawn(flow.upstream.run())
-        # Frames that come before the streams to the edge would be broken, and not by the channel.
+        # Frames that came before the streams to the edge were open would be broken, but not by the channel.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_FIRST_WAIT_S):
                 for flow in self.flows.values():
                     await flow.upstream.opened.wait()
-        # The collector's long pauses come from old objects, and nearly all of those are made by now.
+        # Scanning old objects makes the garbage collector's long pauses, and nearly all of them exist by now.
         gc.collect()
         gc.freeze()
 
     async def refresh(self) -> None:
-        """Write the status; warn once if the edge is not there."""
+        """Write the status; warn once if the edge is not connected."""
         if self._warn_at_ns and self._proxy.clock.now_ns() > self._warn_at_ns:
             self._warn_at_ns = 0
             if not any(flow.upstream.connected for flow in self.flows.values()):
@@ -116,10 +117,12 @@ class FrameStream:
 
     @property
     def pending(self) -> int:
+        """See ``Hook``."""
         return sum(flow.upstream.pending for flow in self.flows.values())
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
-        """One stream of a node. Every message is answered once, as soon as the link has decided."""
+        """Handle one stream of a node. Each message is answered as soon as the link has taken or dropped
+        it."""
         flow: CameraFlow | None = None
         async with self.streams.open(context) as call:
             try:
@@ -135,7 +138,8 @@ class FrameStream:
     def _take(
         self, raw: bytes, flow: CameraFlow | None, call: ServedCall
     ) -> tuple[frames_pb2.PushResponse, CameraFlow | None]:
-        """One frame, after one of ``flow`` on the same stream: the answer, and the frame's own flow."""
+        """Take one frame. flow: of the previous frame on the same stream. Returns the answer and the frame's
+        flow."""
         try:
             header = parse(raw).header
         except FrameRejected as error:
@@ -172,7 +176,7 @@ class FrameStream:
         )
 
     async def _pass_exchange(self, request: bytes, context: grpc.aio.ServicerContext) -> bytes:
-        """The clock exchange is part of the instrument, not of the emulated network: it passes undelayed."""
+        """Pass a clock exchange on without delay: it is for measuring, not part of the emulated network."""
         try:
             return await self._exchange(
                 request, timeout=_EXCHANGE_TIMEOUT_S, metadata=self._proxy.options.transport.metadata()
@@ -182,8 +186,8 @@ class FrameStream:
             raise AssertionError("abort raises") from None
 
     def _write_status(self, state: dict[str, Any]) -> None:
-        with self._status_lock, contextlib.suppress(OSError):  # a full disk costs a status, not the emulator
-            if not self._status_is_final:  # a thread may still hold an earlier one when the last is written
+        with self._status_lock, contextlib.suppress(OSError):  # a full disk must not end the emulator
+            if not self._status_is_final:  # a thread may still hold an earlier status than the last
                 self._status_is_final = not state["running"]
                 write_json(self._out / "channel.json", state)
 
@@ -195,7 +199,7 @@ class FrameStream:
 
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:
-    """The message with bytes of its payload flipped. The checksum stays the sender's: so the edge notices."""
+    """A PushRequest with damaged payload bytes; the checksum stays the sender's, so the edge notices."""
     from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
 
     request = frames_pb2.PushRequest.FromString(raw)

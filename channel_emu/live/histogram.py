@@ -12,7 +12,10 @@ _FLOOR_MS = 1e-4
 
 
 class Histogram:
-    """Durations in ms: logarithmic bins, exact count, mean and maximum. total: counts them as well."""
+    """Durations in ms: logarithmic bins, exact count, mean and maximum.
+
+    total: another histogram that counts every duration of this one too.
+    """
 
     def __init__(self, total: Histogram | None = None) -> None:
         self._bins = [0] * (_PER_DECADE * _DECADES + 2)
@@ -38,6 +41,7 @@ class Histogram:
 
     @property
     def mean_ms(self) -> float | None:
+        """Exact mean; None if empty."""
         return self.sum_ms / self.count if self.count else None
 
     def percentile_ms(self, percent: float) -> float | None:
@@ -54,13 +58,13 @@ class Histogram:
         return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
     def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
-        """The histogram in equal bins, for drawing: edges (count + 1,) in ms up to the 99.5th percentile, and
-        counts (count,)."""
+        """The histogram in ``count`` equal bins up to the 99.5th percentile, for drawing: edges (count + 1,)
+        in ms, and counts (count,); both empty without durations."""
         top = self.percentile_ms(99.5)
         if not top:
             return [], []
         edges = np.linspace(0.0, top, count + 1)
         upper = _FLOOR_MS * 10.0 ** (np.arange(len(self._bins)) / _PER_DECADE)
-        # The cumulative count is known at the logarithmic edges; between them frames are spread evenly.
+        # The cumulative count is known at the logarithmic edges; between them it is interpolated linearly.
         below = np.interp(edges, np.append(0.0, upper), np.append(0.0, np.cumsum(self._bins)))
         return edges.round(4).tolist(), np.diff(below).round(2).tolist()

@@ -1,7 +1,7 @@
-"""A link on the wall clock: it offers messages to the link model, acts on each decision and measures it.
+"""A link on the wall clock: offers messages to the link model, acts on each decision and measures delays.
 
-It is the same for our frame stream and for any other service. What differs is done by the message's
-``Receiver``.
+It is the same for freshfield's frame stream and for any other service; the message's ``Receiver`` does what
+differs.
 """
 
 from __future__ import annotations
@@ -24,22 +24,26 @@ from freshfield.limits import MAX_QUEUED_BYTES
 from freshfield.streams import ServedCall
 
 STREAM_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
-"""How gRPC says that a stream is over."""
+"""Exceptions by which gRPC reports that a stream is over."""
 Flips = tuple[tuple[float, int], ...]
-"""Damage: (place as a fraction of the message, byte to exclusive-or with)."""
+"""Damage: (position as a fraction of the message, byte to XOR with)."""
 
 
 class Receiver(Protocol):
-    """Passes messages on when the link has decided: one direction of a call, or a camera's frames."""
+    """Carries out the link's decisions for one direction of a call, or for one camera's frames."""
 
     def settle(self, message: Message, kind: EventKind) -> None:
-        """DELIVERED: pass the message on. DUPLICATED: pass it on once more. Any other kind: it is dropped."""
+        """DELIVERED: pass the message on. DUPLICATED: pass it on again. Any other kind: it was dropped."""
 
 
 @dataclass(slots=True)
 class Message:
-    """sequence: its place in its session. delivered: None until the link has decided. traced: it has its
-    record in the trace."""
+    """One message in a link.
+
+    raw: its bytes. session, sequence: of the frame; of another service, the call and the index in the call.
+    delivered: None until the link has decided.
+    traced: whether its trace record was written.
+    """
 
     raw: bytes
     session: str
@@ -54,8 +58,10 @@ class Message:
 class DelayStats:
     """Histograms of one link, or of all links together.
 
-    drawn: the delay that the link drew. latency: from receiving a message to handing it on. error: how long
-    after it was due a message was handed on. total: counts what this one counts.
+    drawn: delay drawn by the link.
+    latency: from receiving a message to handing it on.
+    error: from the instant at which a message was due to handing it on.
+    total: further statistics that count every message of these too.
     """
 
     def __init__(self, total: DelayStats | None = None) -> None:
@@ -66,16 +72,20 @@ class DelayStats:
 
 @dataclass
 class Room:
-    """held_bytes: of the messages inside some links."""
+    """The space that several links share. held_bytes: size of all messages inside them."""
 
     held_bytes: int = 0
 
 
 class LiveLink:
-    """``offer`` messages; the event queue calls ``advance`` when something is due.
+    """Usage: ``offer`` messages; the event queue calls ``advance`` when an event is due.
 
-    name: decides the link's draws, together with the channel's seed. stats: its messages are counted there.
-    damage: how the bytes of a message are flipped. room: for the bytes inside, shared with other links.
+    name: selects the link's random numbers, together with the channel's seed.
+    model: makes the decisions. events: schedules the model's events.
+    stats: counts the link's messages.
+    damage: applies flips to the bytes of a message.
+    trace: None records nothing.
+    room: limits the bytes inside, shared with other links; None: this link's own.
     """
 
     def __init__(
@@ -96,13 +106,13 @@ class LiveLink:
         self.stats = stats
         self.age = RunningAge()
         self.last_ns = 0
-        """When a message last came in or was handed on."""
+        """Instant at which a message last came in or was handed on."""
         self.forwarded = 0
-        """Messages handed on."""
+        """Number of messages handed on."""
         self.cancelled = 0
-        """Messages that the link delivered after their call was over."""
+        """Number of messages that the link delivered after their call was over."""
         self.overfull = 0
-        """Messages dropped before the link, because there was no room for their bytes."""
+        """Number of messages dropped before the link because there was no room for their bytes."""
         self._room = Room() if room is None else room
         self._events = events
         self._damage = damage
@@ -114,11 +124,11 @@ class LiveLink:
         return self.model.next_event_ns
 
     def has_room(self, raw: bytes) -> bool:
-        """Whether a message may be offered: what is inside all links is bounded in bytes as well."""
+        """Whether a message may be offered: the bytes inside all links are limited (MAX_QUEUED_BYTES)."""
         return self._room.held_bytes + len(raw) <= MAX_QUEUED_BYTES
 
     def offer(self, message: Message, at_ns: int) -> Transit:
-        """A message came in at the channel's instant ``at_ns``: let the link decide, and act on it."""
+        """Offer a message that came in at the channel's instant ``at_ns``, and act on all decisions due."""
         self.last_ns = at_ns
         self._room.held_bytes += len(message.raw)
         transit, events = self.model.offer(at_ns, message, len(message.raw))
@@ -128,11 +138,11 @@ class LiveLink:
         return transit
 
     def advance(self, now_ns: int) -> None:
-        """Do what is due up to the channel's instant ``now_ns``."""
+        """Act on all decisions due up to the channel's instant ``now_ns``."""
         self._act(self.model.advance(now_ns))
 
     def hand_on(self, message: Message, at_ns: int) -> None:
-        """The message is being handed to gRPC: this instant counts as its actual delivery."""
+        """Record that the message is being handed to gRPC at ``at_ns``, which counts as its delivery."""
         transit = message.transit
         assert transit is not None and transit.ended_ns is not None
         self.last_ns = at_ns
@@ -143,7 +153,10 @@ class LiveLink:
         self.record(message, at_ns)
 
     def record(self, message: Message, actual_ns: int | None = None) -> None:
-        """Write the message's trace record: one for each message, however many copies of it left."""
+        """Write the message's trace record, once, however many copies of it were handed on.
+
+        actual_ns: when it was handed to gRPC; None if it was not.
+        """
         if self._trace is not None and message.transit is not None and not message.traced:
             message.traced = True
             self._trace.write(
@@ -151,7 +164,7 @@ class LiveLink:
             )
 
     def close(self) -> None:
-        """Record what is still inside."""
+        """Write the trace records of the messages still inside."""
         for transit in self.model.pending():
             self.record(transit.item)
 
@@ -165,7 +178,7 @@ class LiveLink:
             if kind is EventKind.STARTED:
                 self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
-            # Without a reference cycle, which would keep the bytes until the next garbage collection.
+            # Break the reference cycle, which would keep the bytes until the next garbage collection.
             message.transit = replace(event.transit, item=None)
             if kind is not EventKind.DUPLICATED:
                 self._room.held_bytes -= len(message.raw)

@@ -1,8 +1,10 @@
-"""Asks the system to run the emulator when a message is due, even while other processes compute.
+"""Asks the system to run the emulator as soon as a message is due, even while other processes compute.
 
-Measured on two cores with two processes computing on each, lateness of a timer at 50 / 90 / 99 %: untouched
-0.19 / 2.8 / 9.9 ms; niceness -15 no better (schedulers that group by session or container compare niceness
-within a group only); a short slice 0.21 / 0.5 / 4.4 ms; real-time round robin 0.20 / 0.25 / 0.6 ms.
+Lateness of a timer at the 50th / 90th / 99th percentile, measured on two cores with two computing processes
+on
+each: by default 0.19 / 2.8 / 9.9 ms; with niceness -15 no better (schedulers that group by session or
+container compare niceness only within a group); with a short slice 0.21 / 0.5 / 4.4 ms; with real-time round
+robin 0.20 / 0.25 / 0.6 ms.
 """
 
 from __future__ import annotations
@@ -35,11 +37,12 @@ class _Attributes(ctypes.Structure):
 
 
 def raise_priority() -> str:
-    """Take the best that the system permits: ``realtime``, ``short-slice``, ``nice`` or ``normal``.
+    """Take the best scheduling that the system permits; returns which: ``realtime``, ``short-slice``,
+    ``nice`` or ``normal``.
 
-    Threads started later inherit it. Call it before gRPC starts its own: a thread that is preempted while it
-    holds the interpreter's lock delays the others. Real time needs CAP_SYS_NICE; the kernel
-    still keeps 5 % of each core from it.
+    Threads started later inherit it. Call it before gRPC starts its threads: one that is preempted while it
+    holds the interpreter's lock delays the others. Real time needs CAP_SYS_NICE; the kernel still reserves 5
+    % of each core for other processes.
     """
     if hasattr(os, "sched_setscheduler"):
         with contextlib.suppress(OSError):
@@ -53,8 +56,8 @@ def raise_priority() -> str:
 
 
 def return_freed_memory() -> None:
-    """Have the C library give blocks of 1 MB and more back to the system once they are free. Otherwise it
-    keeps those below the largest that was ever freed: after a flood of 8 MB messages, hundreds of MB."""
+    """Make the C library return freed blocks of 1 MB and more to the system. By default it keeps blocks up to
+    the size of the largest ever freed: after many 8 MB messages, hundreds of MB."""
     with contextlib.suppress(OSError, AttributeError):  # not glibc
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1 << 20)
 

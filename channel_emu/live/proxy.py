@@ -1,14 +1,15 @@
 """A gRPC proxy that passes every message through a seeded link, on one event loop woken by an exact timer.
 
-Without a hook it serves any service and parses nothing. Each method has a link of its own in each delayed
-direction, or one link carries all. On the wire all four kinds of call are streams, so one handler serves
-them. Metadata, deadline, status, trailers and cancellation are passed on undelayed, the status after the
-messages that came before it. A dropped message of a stream is left out. Where the only message of a direction
-is dropped there would be nothing to pass on, so the call ends UNAVAILABLE: that is what a dropped unary
-request or answer looks like (and a stream that consists of one message: on the wire they are the same).
+Without a hook it serves any service and parses nothing. Each method has its own link in each delayed
+direction, or one link carries all methods. On the wire all four kinds of call are streams, so one handler
+serves them. Metadata, deadline, status, trailers and cancellation are passed on without delay, the status
+after the messages that came before it. A dropped message of a stream is left out. If the only message of a
+direction is dropped, the call ends UNAVAILABLE: so does a dropped unary request or answer (and a stream of
+one message, which is the same on the wire).
 
-With a hook, the hook answers the methods it names, and no others are served. ``frame_stream`` is the hook for
-our frame stream. Links, event queue, delay figures, trace, replay and shutdown are the same.
+With a hook, the hook answers the methods that it names, and no others are served. ``frame_stream`` is the
+hook for freshfield's frame stream. Links, event queue, delay statistics, trace, replay and shutdown are the
+same.
 """
 
 from __future__ import annotations
@@ -44,26 +45,29 @@ _NOT_PASSED_ON = ("user-agent", "content-type", "te")
 _MOST_METHODS = 1000
 _STOP_GRACE_S = 0.5
 _REFRESH_EVERY_S = 0.5
-# How much of the chain's path before the present is kept; no event is later than this.
+# How much of the chain's past path is kept; no event is processed later than this.
 _KEEP_PATH_NS = 60 * 10**9
-# The service at the other end has not agreed to the project's keepalive pings, and would hang up.
+# Any other service has not agreed to the project's keepalive pings, and would close the connection.
 _CLIENT_OPTIONS = [
     (key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key
 ]
 
 
 class EmulatorFailed(RuntimeError):
-    """The emulator cannot go on: its trace or ledger cannot be written, or a part of it broke."""
+    """The emulator cannot continue: its trace or ledger cannot be written, or a part of it failed."""
 
 
 @dataclass(frozen=True)
 class ProxyOptions:
-    """How a proxy runs.
+    """How a proxy runs. Raises ValueError for an unknown direction.
 
-    listen, to: HOST:PORT; port 0 takes any free one.
+    listen: HOST:PORT for clients; port 0 takes any free one.
+    to: HOST:PORT of the service.
+    transport: TLS and tokens of both sides.
     direction: the messages that are delayed: up (to the service), down (its answers) or both.
-    shared: one link for all methods of a direction.
-    trace: record to this file. replay: repeat these decisions instead of making new ones.
+    shared: one link for all methods of a direction, instead of one each.
+    trace: record to this file; None: no trace.
+    replay: repeat the decisions of this trace instead of making new ones.
     """
 
     listen: str
@@ -83,27 +87,31 @@ class Hook(Protocol):
     """Answers a service's methods itself, with the proxy's links."""
 
     client_options: list[tuple[str, Any]]
-    """Of the gRPC channel to the service."""
+    """Options of the gRPC channel to the service."""
 
     def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
-        """Called once, by the proxy's constructor: the handlers by method path."""
+        """Called once, by the proxy's constructor. Returns the handlers by method path."""
 
     async def start(self, server: grpc.aio.Server) -> None:
-        """Before the server takes calls."""
+        """Called before the server accepts calls."""
 
     async def refresh(self) -> None:
         """Called twice a second."""
 
     def close(self) -> None:
-        """After the last message: close what the hook writes. Raises OSError where that fails."""
+        """Called after the last message: close the hook's files. Raises OSError if that fails."""
 
     @property
     def pending(self) -> int:
-        """Messages that left their link and are not done with."""
+        """Number of messages that left their link and are still being handed on."""
 
 
 class Proxy(grpc.GenericRpcHandler):
-    """``start``, then ``stop``; or ``run`` until told. Must be made with an event loop running."""
+    """Usage: ``start``, then ``stop``; or ``run``. Needs a running event loop.
+
+    config, seed: of the emulated channel. hook: answers the methods itself; None: any service is passed on.
+    Raises OSError if the trace or a file of the hook cannot be created, and TransportError.
+    """
 
     def __init__(
         self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None
@@ -114,7 +122,7 @@ class Proxy(grpc.GenericRpcHandler):
         """The clock's reading at the channel's instant zero."""
         self.channel = Channel(config, seed)
         self.stats = DelayStats()
-        """Of all links together."""
+        """Delays of all links together."""
         self._room = Room()
         self.links: dict[str, LiveLink] = {}
         self.port = 0
@@ -132,7 +140,7 @@ class Proxy(grpc.GenericRpcHandler):
         self._hooked = {} if hook is None else hook.attach(self)
 
     async def start(self) -> int:
-        """Listen; the port. Raises TransportError if the address cannot be had."""
+        """Start to listen. Returns the port. Raises TransportError if the address cannot be used."""
         self._server.add_generic_rpc_handlers((self,))
         self.port = self.options.transport.bind(self._server, self.options.listen)
         self.spawn(self._refresh())
@@ -142,7 +150,7 @@ class Proxy(grpc.GenericRpcHandler):
         return self.port
 
     async def run(self, stop: asyncio.Event) -> Report:
-        """From start to ``stop``; the report. Raises EmulatorFailed."""
+        """Start, run until ``stop`` is set, and return the report. Raises EmulatorFailed, TransportError."""
         await self.start()
         log.info("listening on port %d, sending to %s", self.port, self.options.to)
         stopping = asyncio.ensure_future(stop.wait())
@@ -159,9 +167,9 @@ class Proxy(grpc.GenericRpcHandler):
         return self.report()
 
     async def stop(self) -> None:
-        """End what is open and close every file, each even if another fails. What is inside the links stays
-        ``in_flight``. Raises OSError if a file cannot be closed. Once is enough."""
-        with contextlib.ExitStack() as closing:  # closes the last one named first
+        """End open calls and close every file, each even if another fails. Messages inside the links remain
+        ``in_flight``. Raises OSError if a file cannot be closed. Call it once."""
+        with contextlib.ExitStack() as closing:  # runs the callbacks in reverse order
             if self._hook is not None:
                 closing.callback(self._hook.close)
             if self._trace is not None:
@@ -172,7 +180,7 @@ class Proxy(grpc.GenericRpcHandler):
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            # A camera's stream has no end of its own that the grace period could wait for.
+            # A node's stream does not end by itself, so the grace period would wait in vain.
             for call in {call for link in self.links.values() if self._hook for call in link.calls}:
                 call.task.cancel()
             await self._server.stop(_STOP_GRACE_S)
@@ -185,11 +193,11 @@ class Proxy(grpc.GenericRpcHandler):
         if not isinstance(error, OSError):
             log.error("a part of the emulator broke", exc_info=error)
         self._failure.set_exception(error)
-        # Whoever runs the proxy asks; where nobody does, asyncio need not complain at exit.
+        # Mark the exception as retrieved, or asyncio complains at exit if nobody called ``check``.
         self._failure.exception()
 
     def check(self) -> None:
-        """Raise EmulatorFailed if anything broke."""
+        """Raise EmulatorFailed if any part failed."""
         failure = self._failure.exception() if self._failure.done() else None
         if failure is None:
             return
@@ -198,26 +206,26 @@ class Proxy(grpc.GenericRpcHandler):
         raise EmulatorFailed(f"stopped, it could not go on: {kind}{failure}{hint}") from failure
 
     async def settled(self) -> None:
-        """Wait until no message is inside a link, nor on its way out of one."""
+        """Wait until no message is inside a link or being handed on. Raises EmulatorFailed."""
         while any(link.model.in_flight for link in self.links.values()) or self._pending():
             self.check()
             await asyncio.sleep(0.002)
 
     def report(self) -> Report:
-        """Everything so far."""
+        """Outcomes, ages and delays so far."""
         found = {name: figures_of([link], link.stats) for name, link in self.links.items()}
         total = asdict(figures_of(list(self.links.values()), self.stats))
         return Report(**total, seed=self.channel.seed, direction=self.options.direction,
                       seconds=self.events.now_ns() / 1e9, by_method=found)  # fmt: skip
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run in the background until the proxy stops; what it raises ends the proxy."""
+        """Run ``work`` in the background until the proxy stops; an exception in it ends the proxy."""
         task = asyncio.create_task(work)
         task.add_done_callback(self._ended)
         self._tasks.append(task)
 
     def link(self, name: str, damage: Callable[[bytes, Flips], bytes] | None = None) -> LiveLink:
-        """The link of this name, made when first asked for. damage: see ``LiveLink``; None flips any byte."""
+        """The link of this name, made at the first call. damage: see ``LiveLink``; None damages any byte."""
         if name in self.links:
             return self.links[name]
         model: Link | ReplayLink = self.channel.link(name)
@@ -234,7 +242,7 @@ class Proxy(grpc.GenericRpcHandler):
         return link
 
     def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
-        """gRPC asks: who handles this method?"""
+        """The handler of a method, as gRPC asks for it; None: not served."""
         if self._hook is not None:
             return self._hooked.get(details.method)
 
@@ -245,7 +253,7 @@ class Proxy(grpc.GenericRpcHandler):
         return grpc.stream_stream_rpc_method_handler(carry)
 
     async def _carry(self, method: str, context: grpc.aio.ServicerContext, served: ServedCall) -> None:
-        """One call, of any kind."""
+        """Pass one call of any kind on."""
         self._calls += 1
         up = CallFlow(self._calls, served, self._link_of("up", method), self.events.now_ns)
         down = CallFlow(self._calls, served, self._link_of("down", method), self.events.now_ns)
@@ -258,7 +266,7 @@ class Proxy(grpc.GenericRpcHandler):
         try:
             done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
             if parts[1] not in done:
-                parts[0].result()  # what broke here ends the call
+                parts[0].result()  # an exception here ends the call
                 if up.lost_its_only_message:
                     await context.abort(grpc.StatusCode.UNAVAILABLE, self._dropped("request", "up", method))
             await parts[1]
@@ -295,7 +303,7 @@ class Proxy(grpc.GenericRpcHandler):
         )
 
     def _pending(self) -> int:
-        """Messages that the links let out and that are neither handed on nor cancelled."""
+        """Number of messages that the links delivered and that are neither handed on nor cancelled."""
         if self._hook is not None:
             return self._hook.pending
         return sum(
@@ -322,7 +330,7 @@ class Proxy(grpc.GenericRpcHandler):
 async def _carry_up(
     flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall
 ) -> None:
-    with contextlib.suppress(*STREAM_ENDED):  # the service ended the call: its status says how
+    with contextlib.suppress(*STREAM_ENDED):  # the service ended the call; its status is passed on
         await flow.carry(context.read, call.write)
         if not flow.lost_its_only_message:
             await call.done_writing()
@@ -336,7 +344,7 @@ async def _carry_down(
 
 
 def _passed_on(metadata: Any) -> tuple[tuple[str, str | bytes], ...]:
-    """Metadata without what each hop says for itself."""
+    """Metadata without the keys that each hop sets itself."""
     return tuple(
         (key, value)
         for key, value in metadata or ()

@@ -1,4 +1,4 @@
-"""Repeats a recorded trace's decisions live."""
+"""Repeats the decisions of a recorded trace live."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from channel_emu.model.trace import Record, TraceError
 
 
 class ReplayLink:
-    """A link that repeats a recording. Same interface as ``model.link.Link``.
+    """A link that repeats a recording, with the interface of ``model.link.Link``.
 
-    Offer ``n`` gets the recorded outcome of offer ``n``, as long after its own offer as in the recording.
-    Offered at the recorded instants it reproduces the recording exactly. After the last record it starts
-    again at the first.
+    Offer ``n`` gets the recorded outcome of offer ``n``, with the recorded delay after its offer. Offers at
+    the recorded instants reproduce the recording exactly. After the last record it continues with the first.
+
+    records: of this camera, in the order of their numbers. Raises TraceError if there are none.
     """
 
     def __init__(self, camera: str, records: list[Record]) -> None:
@@ -57,7 +58,7 @@ class ReplayLink:
             self._schedule(record.started_ns + shift, EventKind.STARTED, transit)
         outcome, ended_ns = record.outcome, record.ended_ns
         if outcome is None or ended_ns is None:
-            # How it ended was not recorded. When it was due was recorded if transmission had started.
+            # The outcome was not recorded. The due instant was recorded if transmission had started.
             outcome = EventKind.SUPERSEDED if record.due_ns is None else EventKind.DELIVERED
             ended_ns = record.due_ns if record.due_ns is not None else record.offered_ns
         self._schedule(ended_ns + shift, EventKind(outcome), transit)

@@ -1,4 +1,4 @@
-"""Outcomes, ages and delays of the messages that passed the links, for a program or a person."""
+"""Outcomes, ages and delays of the messages that passed the links, as data or as text."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ DROPPED = (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED, Even
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one link, or of all links together: offered = delivered + dropped + in_flight.
+    """Statistics of one link, or of all links together. offered = delivered + dropped + in_flight.
 
-    outcomes: by ``link.EventKind``, with ``forwarded`` (handed on) and ``cancelled`` (delivered after the
-        call was over) and ``overfull`` (dropped before the link: no room for more bytes, not in offered).
-    mean_age_ms, peak_age_ms: age of the newest message handed on, counted from when the proxy received it,
-        between the first one handed on and the last that came in or went out; the mean over links, None where
-        there is none.
-    delay_ms: what the link drew. latency_ms: from receiving a message to handing it on.
-    error_ms: how long after the link's decision a message was handed on.
+    outcomes: counts by ``link.EventKind``, and ``forwarded`` (handed on), ``cancelled`` (delivered after the
+        call was over) and ``overfull`` (dropped before the link for lack of room; not in ``offered``).
+    mean_age_ms, peak_age_ms: age of the newest message handed on, from its arrival at the proxy, between the
+        first one handed on and the last that came in or was handed on. Mean over the links that have a value,
+        None if none has.
+    delay_ms: delay drawn by the link.
+    latency_ms: from receiving a message to handing it on.
+    error_ms: from the instant at which a message was due to handing it on.
     """
 
     offered: int
@@ -41,7 +42,11 @@ class Figures:
 
 @dataclass(frozen=True)
 class Report(Figures):
-    """All links together; ``by_method`` has each link's figures under ``up /pkg.Service/Method``."""
+    """All links together.
+
+    seed, direction: of the proxy. seconds: since its start.
+    by_method: statistics of each link, under a name such as ``up /pkg.Service/Method``.
+    """
 
     seed: int
     direction: str
@@ -49,12 +54,12 @@ class Report(Figures):
     by_method: dict[str, Figures] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
-        """As JSON takes it."""
+        """The report as plain values, for JSON."""
         return asdict(self)
 
 
 def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
-    """The figures of links whose delays are in ``stats``."""
+    """Statistics of ``links``, whose delays are counted in ``stats``."""
     outcomes: Counter[str] = Counter()
     for link in links:
         outcomes.update({str(kind): count for kind, count in link.model.counts.items()})
@@ -74,7 +79,7 @@ def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
 
 
 def show(report: Report) -> str:
-    """The report for a person: every link's figures in two lines."""
+    """The report as text, two lines a link."""
     lines = []
     for name, figures in report.by_method.items():
         outcomes = ", ".join(f"{count} {kind}" for kind, count in figures.outcomes.items())

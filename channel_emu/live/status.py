@@ -27,11 +27,14 @@ def snapshot(
 ) -> dict[str, Any]:
     """The status as plain values, at the channel's instant ``now_ns``.
 
-    flows: of all cameras. stats: of all links together. rejected: frames refused here, by reason.
-    priority: see ``priority.raise_priority``. final: the emulator is ending.
+    flows: of all cameras.
+    stats: delays of all links together.
+    rejected: frames refused by the emulator, by reason.
+    priority: see ``priority.raise_priority``.
+    final: whether the emulator is ending.
 
-    ``state`` and ``series`` are those of the shared chain; with a chain for each camera, ``by_camera`` has
-    its state. ``counts`` are over all cameras; ``broken`` counts frames that a reset or an absent edge broke.
+    ``state`` and ``series`` are of the shared chain; with one chain a camera, ``by_camera`` has the states.
+    ``counts`` are sums over all cameras; ``broken`` counts frames broken by a reset or a missing edge.
     """
     now = max(now_ns, 0)
     names = channel.config.state_names
@@ -78,7 +81,7 @@ def _counts(flow: CameraFlow) -> dict[str, int]:
         "held_out": flow.held_out,
         "forwarded": flow.forwarded,
         **{str(kind): link.counts[kind] for kind in EventKind if kind is not EventKind.STARTED},
-        # Both a stream reset by the channel and an edge that was away break frames.
+        # Frames are broken by a reset of the stream, and by an edge that is not connected.
         "broken": link.counts[EventKind.BROKEN] + flow.broken,
         "in_flight": link.in_flight + flow.upstream.pending,
         "clock_backwards": link.clock_backwards,
@@ -97,7 +100,7 @@ def _shares(channel: Channel, flows: Sequence[CameraFlow], now_ns: int) -> dict[
 
 
 def _series(channel: Channel, now_ns: int) -> list[tuple[float, str]]:
-    """(seconds, state entered) over the last minute."""
+    """(seconds, state entered) of the shared chain over the last minute."""
     if channel.chain is None:
         return []
     names = channel.config.state_names

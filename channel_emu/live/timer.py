@@ -27,7 +27,7 @@ class _Itimerspec(ctypes.Structure):
 
 
 class LoopTimer:
-    """Calls ``fire()`` on the running loop once the armed time has passed. One instant at a time."""
+    """Calls ``fire()`` on the running event loop once the armed time has passed. Holds one instant only."""
 
     def __init__(self, fire: Callable[[], None]) -> None:
         self._fire = fire
@@ -35,7 +35,7 @@ class LoopTimer:
         self._handle: asyncio.TimerHandle | None = None
         self._fd = -1
         if sys.platform == "linux":
-            # PyDLL keeps the interpreter lock: these calls take a microsecond, handing it over takes more.
+            # PyDLL keeps the interpreter lock: these calls take a microsecond, releasing it takes longer.
             self._libc = ctypes.PyDLL(None, use_errno=True)
             self._fd = self._libc.timerfd_create(_CLOCK_MONOTONIC, _NONBLOCK_CLOEXEC)
         if self._fd >= 0:
@@ -43,7 +43,7 @@ class LoopTimer:
             self._loop.add_reader(self._fd, self._readable)
 
     def arm(self, in_ns: int) -> None:
-        """Fire ``in_ns`` from now (at once if not positive), instead of what was armed before."""
+        """Fire ``in_ns`` from now (at once if not positive). Replaces what was armed before."""
         if self._fd < 0:
             if self._handle is not None:
                 self._handle.cancel()

@@ -1,4 +1,4 @@
-"""One camera's stream from the emulator to the edge: several credits, no queue, reconnects forever."""
+"""One camera's stream from the emulator to the edge: up to CREDITS unanswered frames, reconnects for ever."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ from freshfield.v1 import frames_pb2 as pb
 log = logging.getLogger("channel-emu")
 
 PUSH = "/freshfield.v1.FrameStreamService/Push"
-# Frames at the edge without an answer yet, at most. More than one, so that the time an answer takes is not
-# added to the next frame's delay; few, so that a stalled edge shows at once.
+# Maximum number of unanswered frames. More than one, so that waiting for an answer does not delay the next
+# frame; few, so that a stalled edge is noticed at once.
 CREDITS = 8
 FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 1.0
 
 
 class Upstream:
-    """Sends frames as they are given. A frame is ``broken`` if the edge is away, or if CREDITS frames are
-    unanswered and a newer frame took its place.
+    """Sends frames as they are given. While CREDITS frames are unanswered, one more is held. A frame is
+    broken if the edge is not connected, or if a newer frame replaces it while it is held.
 
-    forwarded, broken: called once for each frame, on the event loop. A forwarded frame whose stream ends
-    before its answer is broken as well (the edge's ledger decides whether it arrived).
+    channel, metadata: of the calls to the edge.
+    forwarded: called with a frame that is about to be handed to gRPC.
+    broken: called with a broken frame, also with a forwarded one whose stream ends before the answer (the
+        edge's ledger tells whether it arrived).
+    jitter: random generator for the pauses before reconnecting.
     """
 
     def __init__(
@@ -52,7 +55,7 @@ class Upstream:
         self.opened = asyncio.Event()
         """Set when the first stream is open."""
         self.rejected: Counter[str] = Counter()
-        """The edge's refusals, by reason."""
+        """Number of the edge's refusals, by reason."""
         self._channel = channel
         self._metadata = metadata
         self._forwarded = forwarded
@@ -77,17 +80,17 @@ class Upstream:
             self._wake.set()
 
     def _full(self, frame: Message) -> bool:
-        """Whether the credits are used up, which hold for bytes as well as for frames."""
+        """Whether the credits are used up: CREDITS frames, or MAX_MESSAGE_BYTES in more than one frame."""
         out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
         return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
 
     @property
     def pending(self) -> int:
-        """Frames handed over and not answered yet."""
+        """Number of frames given to ``send`` and neither answered nor broken yet."""
         return len(self._outbox) + len(self._unanswered) + (self._held is not None)
 
     async def run(self) -> None:
-        """Keep a stream open until cancelled. What ``forwarded`` and ``broken`` raise ends it."""
+        """Keep a stream open until cancelled. Raises what ``forwarded`` or ``broken`` raises."""
         failures = 0
         while True:
             answered = False
@@ -102,7 +105,7 @@ class Upstream:
             await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
 
     async def _session(self) -> bool:
-        """One stream, until it fails; True if the edge answered anything on it."""
+        """Run one stream until it fails. Returns whether the edge answered anything on it."""
         call = self._channel.stream_stream(PUSH)(metadata=self._metadata)
         reader = asyncio.create_task(self._read(call))
         writer = asyncio.create_task(self._write(call))
@@ -112,7 +115,7 @@ class Upstream:
         try:
             done, _ = await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                # The stream itself may still be open: asking how it ended would take forever.
+                # The stream itself may still be open, and then asking for its status would wait for ever.
                 error = task.exception()
                 if isinstance(error, DecodeError):
                     self._log_trouble("the edge sent bytes that are no answer")
@@ -149,9 +152,9 @@ class Upstream:
                     return answered
                 response = pb.PushResponse.FromString(data)
                 if not any(frame.sequence == response.sequence for frame in self._unanswered):
-                    continue  # an answer to nothing that was asked
+                    continue  # an answer to no frame that was sent
                 while self._unanswered.popleft().sequence != response.sequence:
-                    pass  # answers come in order: what lies before was answered too
+                    pass  # answers come in order, so earlier frames were answered too
                 if not answered:
                     answered, self._trouble = True, ""
                 if response.outcome == pb.OUTCOME_REJECTED:
@@ -176,7 +179,7 @@ class Upstream:
             self._broken(frame)
 
     def _log_trouble(self, trouble: Any) -> None:
-        """Log what broke, once per kind of trouble and not once per attempt."""
+        """Log what failed, once per kind of trouble and not once per attempt."""
         if isinstance(trouble, grpc.aio.AioRpcError):
             trouble = f"{trouble.code().name}: {peer_text(trouble.details())}"
         if str(trouble) != self._trouble:

@@ -1,7 +1,8 @@
-"""Metrics of age, each a function of one sample path: what was delivered when (thesis 5.1 to 5.6).
+"""Age metrics, each a function of one link's deliveries over time (thesis 5.1 to 5.6).
 
-``METRICS`` has them by the name that people type; ``measure`` reads such a spelling. A metric that needs a
-process at the sender (what the frames are about, how urgent it is) is given its path.
+``METRICS`` maps command-line names to metrics; ``measure`` evaluates one from its text, such as
+``query:100ms``. Metrics that depend on a process at the sender (the source's state, its urgency) also get a
+sample path of that process.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ Instants = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Sawtooth:
-    """Deliveries that made the receiver's newest frame newer: instants and generation times, int64 ns (K,).
+    """The age over time, given by the deliveries that lowered it.
 
-    From ``delivered_ns[k]`` on the age is ``t - generated_ns[k]``, up to the next delivery or ``end_ns``.
+    From ``delivered_ns[k]`` until the next delivery or ``end_ns``, the age at time t is
+    ``t - generated_ns[k]``. Both arrays are (K,), int64 ns, ascending.
     """
 
     delivered_ns: Instants
@@ -35,7 +37,10 @@ class Sawtooth:
 
 
 def sawtooth(delivered_ns: Instants, generated_ns: Instants, end_ns: int) -> Sawtooth:
-    """From all deliveries in any order; a delivery of an older frame does not change the age (5.4)."""
+    """Keep only the deliveries that lower the age: an older frame than the newest one does not (5.4).
+
+    delivered_ns, generated_ns: (N,) of all deliveries, in any order. end_ns: end of the observation.
+    """
     due, born = delivered_ns, generated_ns
     if (due[1:] < due[:-1]).any():  # only where frames overtake each other
         order = np.argsort(due, kind="stable")
@@ -49,23 +54,25 @@ def sawtooth(delivered_ns: Instants, generated_ns: Instants, end_ns: int) -> Saw
 
 
 def mean_age_ms(saw: Sawtooth) -> float | None:
-    """Continuous time average from the first delivery to the end; None where nothing arrived."""
+    """Continuous time average from the first delivery to the end; None if nothing arrived before the end."""
     return _time_average_ms(saw, saw.delivered_ns[:0], np.ones(1))
 
 
 def urgency_ms(saw: Sawtooth, changes_ns: Instants, weights: NDArray[np.float64]) -> float | None:
     """Urgency of information (Zheng, Zhou, Niu, IEEE Trans. Commun. 68(12), 2020): time average of weight
-    times age, which is the expected squared error of a Wiener process of unit variance a ms.
+    times age, where the age is the expected squared error of a Wiener process with unit variance per ms.
 
-    weights: of the context, (S + 1,): before the first of ``changes_ns`` (S,), and from each of them on.
+    changes_ns: (S,), ascending instants at which the weight changes.
+    weights: (S + 1,), the weight before the first change, then after each change.
     """
     return _time_average_ms(saw, changes_ns, weights)
 
 
 def query_age_ms(saw: Sawtooth, every_ms: float) -> float | None:
-    """Mean of the age at multiples of ``every_ms``, just after deliveries, from the first delivery to the
-    end: the age that queries meet, or at slot boundaries (5.2). Deliveries that fall on them lower it by half
-    of ``every_ms``."""
+    """Mean age seen by queries at multiples of ``every_ms`` (or at slot boundaries, 5.2), from the first
+    delivery to the end. A query sees a delivery of the same instant; if all deliveries fall on such instants,
+    the mean is half of ``every_ms`` below the time average. Raises ValueError if ``every_ms`` is below 1 ns.
+    """
     every_ns = to_ns(every_ms)
     if every_ns < 1:
         raise ValueError(f"queries: expected at least a nanosecond apart, got {every_ms:g} ms")
@@ -79,8 +86,8 @@ def query_age_ms(saw: Sawtooth, every_ms: float) -> float | None:
 
 
 def shown_age_ms(saw: Sawtooth, computing_ms: float, refresh_ms: float) -> float | None:
-    """Age of what is shown: each frame is computed on for ``computing_ms`` after its delivery, and a screen
-    shows the newest one that is ready at each multiple of ``refresh_ms``, until the next."""
+    """Age of what a screen shows: a frame is ready ``computing_ms`` after its delivery, and at each multiple
+    of ``refresh_ms`` the screen switches to the newest frame that is ready."""
     ready = Sawtooth(saw.delivered_ns + to_ns(computing_ms), saw.generated_ns, saw.end_ns)
     at_refresh = query_age_ms(ready, refresh_ms)
     return None if at_refresh is None else at_refresh + refresh_ms / 2
@@ -88,9 +95,10 @@ def shown_age_ms(saw: Sawtooth, computing_ms: float, refresh_ms: float) -> float
 
 def incorrect_age_ms(saw: Sawtooth, changes_ns: Instants, states: Instants) -> float | None:
     """Age of incorrect information (Maatouk et al., IEEE/ACM Trans. Netw. 28(5), 2020): time average of how
-    long the receiver has been wrong, which takes the newest frame's state for the present one.
+    long the receiver, which assumes the state in its newest frame, has been wrong.
 
-    states: of the source, (S + 1,): before the first of ``changes_ns`` (S,), and from each of them on.
+    changes_ns: (S,), ascending instants at which the source's state changes.
+    states: (S + 1,), the source's state before the first change, then after each change.
     """
     if not len(saw.delivered_ns) or saw.end_ns <= saw.delivered_ns[0]:
         return None
@@ -114,7 +122,8 @@ def peak_age_ms(saw: Sawtooth) -> float | None:
 
 
 def newest_at(saw: Sawtooth, at_ns: Instants) -> Instants:
-    """When the newest frame delivered by each instant (T,) was generated, int64 ns; -1 before the first."""
+    """Generation time (T,), int64 ns, of the newest frame delivered by each instant ``at_ns`` (T,); -1 before
+    the first delivery."""
     if not len(saw.delivered_ns):
         return np.full(np.shape(at_ns), -1, np.int64)
     k = np.searchsorted(saw.delivered_ns, at_ns, side="right") - 1
@@ -122,14 +131,19 @@ def newest_at(saw: Sawtooth, at_ns: Instants) -> Instants:
 
 
 def mean_of_known(values: list[float | None]) -> float | None:
-    """Over cameras or links; None where none has a value."""
+    """Mean of the values that are not None, one a camera or link; None if there are none."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 class Metric(NamedTuple):
-    """about: one line, with what follows the name. values: readers of what follows. of: the metric, given a
-    path, these values and, where it is ``drawn``, the random numbers of a process at the sender."""
+    """An age metric as named on the command line, ``NAME:VALUE:VALUE``.
+
+    about: one line of help, with an example of the values.
+    values: one parser for each value.
+    of: computes the metric in ms from a Sawtooth, the values and, if ``drawn``, a CounterRng.
+    drawn: the metric draws a random process at the sender.
+    """
 
     about: str
     values: tuple[Callable[[str], float], ...]
@@ -138,7 +152,8 @@ class Metric(NamedTuple):
 
 
 def _two_states(saw: Sawtooth, away: float, back: float, rng: CounterRng) -> tuple[Instants, Instants]:
-    """Changes and states of a process that leaves state 0 at the rate ``away`` and state 1 at ``back``."""
+    """Changes (S,) and states (S + 1,) of a process that leaves state 0 at the rate ``away`` and state 1 at
+    ``back``, both per ms."""
     path = Chain(two_state_generator(away, back), rng, initial=0).recent(0, saw.end_ns)
     starts, states = np.array(path, np.int64).T
     return starts[1:], states
@@ -180,7 +195,11 @@ METRICS = {
 
 
 def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:
-    """A metric as people type it, in ms; None where nothing arrived. Raises SpellingError."""
+    """Evaluate a metric given as on the command line, such as ``query:100ms``.
+
+    saw: the deliveries of ``camera``. seed: of the run; with ``camera`` it fixes the sender's process.
+    Returns ms, None if nothing arrived. Raises SpellingError for an unknown metric or a bad value.
+    """
     name, *words = text.split(":")
     if name not in METRICS:
         raise SpellingError(f"metric {text!r}: expected one of {', '.join(METRICS)}")
@@ -193,7 +212,7 @@ def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:
 
 
 class RunningAge:
-    """``mean_age_ms`` and ``peak_age_ms`` of deliveries added in order of time, in constant memory."""
+    """Computes ``mean_age_ms`` and ``peak_age_ms`` in constant memory from deliveries added in time order."""
 
     def __init__(self) -> None:
         self._first_ns = self._delivered_ns = self._generated_ns = 0
@@ -214,7 +233,7 @@ class RunningAge:
         self._delivered_ns, self._generated_ns = delivered_ns, generated_ns
 
     def mean_age_ms(self, end_ns: int) -> float | None:
-        """From the first delivery to ``end_ns``; None where nothing arrived."""
+        """Time average from the first delivery to ``end_ns``; None if nothing arrived before it."""
         if not self._teeth or end_ns <= self._first_ns:
             return None
         return (self._area + self._tooth(end_ns)) / 2 / (end_ns - self._first_ns) / 1e6
@@ -230,7 +249,7 @@ class RunningAge:
 
 
 def _time_average_ms(saw: Sawtooth, changes_ns: Instants, weights: NDArray[np.float64]) -> float | None:
-    """Of the age times a weight that changes; see ``urgency_ms``."""
+    """Time average of the age times a piecewise constant weight; arguments as in ``urgency_ms``."""
     if not len(saw.delivered_ns) or saw.end_ns <= saw.delivered_ns[0]:
         return None
     starts, born = saw.delivered_ns, saw.generated_ns

@@ -1,8 +1,8 @@
 """The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
 
-Every jump of the chain has its own instant, so a chain that switches many times during a frame's transit is
-exact too. With ``slot_ms`` the state is drawn at slot boundaries only and kept in between, as in the thesis
-(6.27): the same distribution at the boundaries, without the jumps between them.
+Every jump has its own instant, so sampling is exact even if the chain switches many times during a frame's
+transit. With ``slot_ms`` the state is drawn at slot boundaries and kept in between, as in the thesis (6.27):
+the same distribution at the boundaries, without the jumps between them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ def two_state_generator(mu1_per_ms: float, mu2_per_ms: float) -> NDArray[np.floa
 
 
 def check_generator(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A generator (6.25): square, rates >= 0 off the diagonal, rows summing to zero. Raises ChainError."""
+    """Return the generator (M, M), in 1/ms, with its diagonal set to minus the row's rates (6.25).
+
+    Raises ChainError unless it is square, finite, >= 0 off the diagonal, and its rows sum to zero.
+    """
     q = np.asarray(generator_per_ms, float)
     if q.ndim != 2 or q.shape[0] != q.shape[1] or q.shape[0] < 1:
         raise ChainError(f"a generator is a square matrix, got shape {q.shape}")
@@ -47,10 +50,11 @@ def check_generator(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
-    """P(u) = exp(Q u), u in ms (6.27): closed form for two states, else uniformisation and squaring.
+    """Transition probabilities exp(Q u), (M, M), over u = ``span_ms`` (6.27).
 
-    Uniformisation adds only non-negative terms, so nothing cancels; rows are renormalised after each
-    squaring, so a stiff chain keeps its probabilities.
+    Closed form for two states, else uniformisation and squaring. Uniformisation adds only non-negative terms,
+    so nothing cancels; rows are renormalised after each squaring, so a stiff chain keeps its probabilities.
+    Raises ChainError for an invalid generator or a negative span.
     """
     q = check_generator(generator_per_ms)
     if span_ms < 0:
@@ -114,17 +118,19 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
 
 
 def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Probability of leaving each state in one step, (M,): the sum of the row's other entries, which keeps
-    digits that one minus the diagonal has lost."""
+    """Probability (M,) of leaving each state in one step of the transition matrix (M, M): the sum of the
+    row's other entries, because one minus the diagonal would lose digits."""
     return np.minimum((transitions - np.diag(np.diag(transitions))).sum(1), 1.0)
 
 
 class Chain:
     """A path of the chain, extended on demand. Instants may be queried in any order until forgotten.
 
-    generator_per_ms: (M, M). initial: the first state; drawn from the stationary distribution if None.
-    slot_ms: None follows every jump; a number samples the state every so many ms. A state then lasts a
-    geometric number of slots, which is one draw and the same in law as a draw a slot.
+    generator_per_ms: (M, M), in 1/ms.
+    initial: index of the first state; None draws it from the stationary distribution.
+    slot_ms: None follows every jump; a number draws the state at multiples of it. A sojourn is then one
+        geometric number of slots, equal in distribution to one draw a slot.
+    Raises ChainError for an invalid generator or slot, or a chain that jumps too often to be followed.
     """
 
     def __init__(
@@ -147,8 +153,8 @@ class Chain:
         leave = leaving(q) if self.slot_ns else off.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
             jumps = np.cumsum(off / off.sum(1)[:, None], 1)
-            # Parameter of the sojourn's length by state: the leaving rate in 1/ms; in slots, the logarithm of
-            # the probability to stay for one more.
+            # Parameter of the sojourn time by state: the leaving rate in 1/ms or, with slots, the logarithm
+            # of the probability to stay for one more slot.
             self.sojourn_rate = np.log1p(-leave) if self.slot_ns else leave
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
         last = np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])
@@ -160,13 +166,16 @@ class Chain:
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
-        # Of the last sojourn: the random pair of this number gives its length and the jump at its end.
+        # Number of the last sojourn; the random pair of this number gives its length and its closing jump.
         self._number = 0
         self._until = self._sojourn_end(0, self.initial)
         self._spent_ns = [0] * self.states  # in the forgotten part of the path
 
     def segment(self, at_ns: int) -> tuple[int, int]:
-        """State at ``at_ns`` and the end of its sojourn (NEVER_NS if it has none)."""
+        """State at ``at_ns`` and the end of its sojourn (NEVER_NS if it never ends).
+
+        Raises ChainError if that part of the path was forgotten, or if the chain jumps too often.
+        """
         if self._until <= at_ns:
             self._extend(at_ns)
         starts = self._starts
@@ -181,7 +190,7 @@ class Chain:
         return self.segment(at_ns)[0]
 
     def recent(self, since_ns: int, until_ns: int) -> list[tuple[int, int]]:
-        """(start, state) of the sojourns that touch [since, until], as far as the path is still known."""
+        """(start in ns, state) of the sojourns that overlap [since, until], as far as the path is kept."""
         self.segment(until_ns)
         first = max(0, bisect_right(self._starts, since_ns) - 1)
         last = bisect_right(self._starts, until_ns)
@@ -200,7 +209,7 @@ class Chain:
         return [ns / until_ns for ns in spent]
 
     def forget(self, before_ns: int) -> None:
-        """Drop the path before an instant, so that a live chain does not grow."""
+        """Drop the path before an instant, to bound the memory of a live chain."""
         first = bisect_right(self._starts, before_ns) - 1
         if first < 1024:  # not worth the copy
             return
@@ -214,7 +223,7 @@ class Chain:
         while self._until <= at_ns:
             start = self._until
             if self._number - mark == _CHECK_EVERY:
-                # The stationary distribution does not show this rate, as before an absorbing state.
+                # The constructor's check misses this rate: e.g. fast jumps before an absorbing state.
                 if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
                     raise ChainError(
                         "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
@@ -244,7 +253,7 @@ class Chain:
         return min(int(np.searchsorted(shares, self._rng.uniform(0, 1), side="right")), self.states - 1)
 
     def _refuse_too_fast(self) -> None:
-        """ChainError if it would switch more often than can be followed."""
+        """Raise ChainError if the long-run jump rate exceeds MAX_JUMPS_PER_MS."""
         rates_per_ms = -self.generator_per_ms.diagonal()
         if not rates_per_ms.all():
             return  # it has an absorbing state

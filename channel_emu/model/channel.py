@@ -1,4 +1,4 @@
-"""Makes links from a configuration and a seed: shared chain and server, the random stream of each draw."""
+"""Makes links from a configuration and a seed, with the chain and the server that they share."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ class Channel:
         self._server = QueueServer(config.queue_limit) if config.server.shared else None
 
     def chain_of(self, camera: str) -> Chain | None:
-        """A new chain if each camera has its own, else the shared chain (None: one state)."""
+        """A new chain if the scope is per-camera, else the shared one; None if the channel has no chain."""
         own = self.config.chain is not None and self.config.chain.scope == "per-camera"
         return self._chain(camera) if own else self.chain
 
     def link(self, camera: str, *, sampled: bool = True) -> Link:
-        """A new link; at most one a camera where the server is shared.
+        """Make the link of a camera. Raises ValueError for a second link of a camera to a shared server.
 
-        sampled: the arrival process samples offered frames. False: the caller offers frames at the arrivals.
+        sampled: the arrival process samples the offered frames. False: every offer is an arrival, because the
+            caller offers frames at the instants of the arrival process.
         """
         chain = self.chain_of(camera)
         arrivals = self.arrivals(camera, chain) if sampled else None
@@ -56,12 +57,14 @@ class Channel:
             self.chain.forget(before_ns)
 
     def arrivals(self, camera: str, chain: Chain | None) -> PoissonArrivals | None:
+        """The camera's Poisson arrival process; None if frames arrive as they are offered."""
         rates = self.config.arrivals.rate_per_ms
         if rates is None:
             return None
         return PoissonArrivals(per_state(rates), chain, CounterRng(self.seed, camera, "channel.arrivals"))
 
     def service(self, camera: str, chain: Chain | None) -> ServiceTime:
+        """The camera's service times. chain: as ``chain_of`` returned it."""
         config = self.config.service
         means = [1.0] if config.mean_ms is None else per_state(config.mean_ms)
         modulated = self.config.service_state == "modulated"

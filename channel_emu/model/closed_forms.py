@@ -1,8 +1,8 @@
 """Exact mean age with periodic arrivals under drop-new (thesis 5.2 to 5.5).
 
-Renewal argument over periods: a frame that starts in state i keeps the link for K periods, then the next one
-starts; over that cycle the age is the earlier frame's delay plus the time since its delivery.
-``accuracy_cost`` compares the simulator with this; ``slot_ms`` gives the bias of sampling the chain at slot
+Renewal argument over periods: a frame that starts in state i occupies the link for K periods, then the next
+one starts; from its delivery to the next one, the age is the frame's delay plus the time since its delivery.
+``accuracy_cost`` compares the simulator with this; ``slot_ms`` shows the bias of sampling the chain at slot
 boundaries.
 """
 
@@ -22,12 +22,15 @@ def drop_new_age_ms(
 ) -> float:
     """Time average of the age in ms: exponential service modulated by the chain, one frame every period.
 
-    generator_per_ms (M, M); means_ms (M,), mean delay while in each state; M = 1 is the plain D/M/1/0, with
-    1/mu + (C/2) coth(mu C/2). slot_ms: the chain's state is drawn at these boundaries and kept in between;
-    None: continuous time. Raises ValueError where slots do not divide the period.
+    generator_per_ms: (M, M), in 1/ms. M = 1 is the plain D/M/1/0 queue, with 1/mu + (C/2) coth(mu C/2).
+    means_ms: (M,), mean delay while in each state.
+    period_ms: C, the time between two frames.
+    slot_ms: the chain's state is drawn at multiples of it and kept in between; None: continuous time.
+    Raises ValueError for an invalid generator, or if the period is not a whole number of slots.
 
-    With B: still in service after a period, A: the chain's change over a period, R = (I - B)^-1, m: mean time
-    of service, alpha = alpha R (A - B) the state at a start: E[K] = alpha R 1, E[K²] = alpha (I + B) R² 1 and
+    Let A be the chain's transition matrix over a period, B the part of it with the service unfinished,
+    R = (I - B)^-1, m the mean service time by state, and alpha = alpha R (A - B) the state in which a service
+    starts. Then E[K] = alpha R 1, E[K²] = alpha (I + B) R² 1 and
     age = [C² E[K²]/2 + C alpha R² (A - B) m] / (C E[K]).
     """
     q = check_generator(generator_per_ms)
@@ -57,8 +60,8 @@ def drop_new_age_ms(
 
 
 def _unfinished(q: NDArray[np.float64], rates: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
-    """Transition probabilities (M, M) within ``span_ms`` with the service unfinished; a finished service is
-    an additional, absorbing state."""
+    """Transition probabilities (M, M) over ``span_ms`` with the service unfinished, computed with an
+    additional, absorbing state for the finished service."""
     with_end = np.zeros((len(q) + 1, len(q) + 1))
     with_end[:-1, :-1] = q - np.diag(rates)
     with_end[:-1, -1] = rates

@@ -43,15 +43,16 @@ class ArrivalsConfig:
     """When frames enter the link.
 
     as-offered: whenever the camera offers one.
-    periodic: the same on a live link (the camera sets the period); one every ``period_ms`` in simulations.
-    poisson: a Poisson process samples the newest offered frame; with a rate for each state this is an MMPP.
+    periodic: one every ``period_ms`` in simulations; on a live link, where the camera sets the period, the
+        same as as-offered.
+    poisson: a Poisson process samples the newest offered frame; with one rate a chain state it is an MMPP.
     """
 
     process: str = "as-offered"
     period_ms: float | None = None
     rate_per_ms: float | list[float] | None = None
     spread: bool = False
-    """Simulations: periodic cameras capture evenly spread over the period, not at one instant."""
+    """In simulations, spread the captures of periodic cameras evenly over the period, not at one instant."""
 
     def __post_init__(self) -> None:
         _one_of("process", self.process, PROCESSES)
@@ -69,8 +70,12 @@ class ArrivalsConfig:
 
 @dataclass(frozen=True)
 class ChainConfig:
-    """The network's state (6.25). Two states by mu1_per_ms and mu2_per_ms (6.26), or any number by
-    ``generator_per_ms``, row by row. ``shared`` by all cameras, or each has its own (``per-camera``)."""
+    """The Markov chain of the network's state (6.25).
+
+    mu1_per_ms, mu2_per_ms: rates of leaving the first and the second of two states (6.26).
+    generator_per_ms: instead of them, the generator (M, M) of any number of states, row by row.
+    scope: ``shared`` by all cameras, or ``per-camera``: an independent chain for each.
+    """
 
     mu1_per_ms: float | None = None
     mu2_per_ms: float | None = None
@@ -78,7 +83,7 @@ class ChainConfig:
     states: list[str] = field(default_factory=list)
     """Names of the states; s1, s2, ... if not given."""
     initial: str | None = None
-    """The state it starts in; drawn from the stationary distribution if not given."""
+    """Name of the first state; drawn from the stationary distribution if not given."""
     scope: str = "shared"
     sampled: str = "continuous"
     """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
@@ -120,7 +125,8 @@ class ChainConfig:
         return check_generator(np.array(self.generator_per_ms, float))
 
     def switches_per_ms(self) -> float:
-        """How often the sampled state changes in the long run. Raises ChainError where there is none."""
+        """Long-run rate of state changes, as sampled. Raises ChainError without a unique long-run
+        distribution."""
         generator = self.generator()
         shares = stationary(generator)
         if self.slot_ms is None:
@@ -134,8 +140,13 @@ class ChainConfig:
 
 @dataclass(frozen=True)
 class ServiceConfig:
-    """How long a frame takes. gamma: ``shape`` k (coefficient of variation 1/sqrt(k)); lognormal: ``sigma``
-    of the logarithm; both have the given mean. trace: ``delays_ms`` in turn, again and again."""
+    """The distribution of service times: how long the link takes to transmit a frame.
+
+    mean_ms: mean of every law but none and trace; one number, or one a chain state.
+    shape: of gamma; the coefficient of variation is 1/sqrt(shape).
+    sigma: of lognormal, the standard deviation of the logarithm.
+    delays_ms: of trace, used in turn and repeated from the start after the last.
+    """
 
     law: str = "none"
     mean_ms: float | list[float] | None = None
@@ -163,28 +174,28 @@ class ServiceConfig:
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """By default every camera has a server of its own. ``shared``: all cameras compete for one server;
-    ``queue_server`` explains the disciplines. Cameras that capture at one instant arrive in the order of
-    their names: under drop-new the first of them is served."""
+    """shared: all cameras compete for one server (``queue_server`` explains the disciplines); otherwise each
+    has its own. Cameras that capture at the same instant arrive in the order of their names, so under
+    drop-new the first of them is served."""
 
     shared: bool = False
 
 
 @dataclass(frozen=True)
 class ChannelConfig:
-    """One channel; see ``presets`` for the thesis's."""
+    """The whole ``channel:`` section; ``presets`` holds the channels of the thesis."""
 
     preset: str | None = None
     arrivals: ArrivalsConfig = field(default_factory=ArrivalsConfig)
     chain: ChainConfig | None = None
     service: ServiceConfig = field(default_factory=ServiceConfig)
     service_state: str = "at-start"
-    """at-start: the delay is drawn for the state in which transmission starts. modulated: the rate follows
-    the state while the frame is on its way."""
+    """at-start: the state in which transmission starts sets the mean delay. modulated: the service rate
+    follows the chain's state during transmission."""
     discipline: str = "drop-new"
     server: ServerConfig = field(default_factory=ServerConfig)
     queue_limit: int = 1024
-    """Most frames waiting (fcfs) or in service (parallel), so that memory is bounded; for all cameras
+    """Maximum number of frames waiting (fcfs) or in service (parallel), which bounds memory; for all cameras
     together if the server is shared."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Parameters of the listed faults, by name."""
@@ -232,7 +243,7 @@ class ChannelConfig:
 
     @property
     def mean_delay_ms(self) -> float:
-        """Mean of the law, over the long-run shares of the states if it depends on them."""
+        """Mean service time; if it depends on the state, weighted by the states' long-run shares."""
         service = self.service
         if service.mean_ms is None:
             return float(np.mean(service.delays_ms or [0.0]))
@@ -249,11 +260,13 @@ class ChannelConfig:
 
 
 def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Path()) -> ChannelConfig:
-    """Read a ``channel:`` section. An empty one is the ideal channel.
+    """Read a ``channel:`` section; an empty one is the ideal channel.
 
-    Keys beside ``preset`` override the preset's: mappings are merged key by key, unless they name another
-    process or law, which replaces the preset's whole. ``arrivals``, ``service``, ``chain`` and each of
-    ``faults`` may be spelled as on the command line (``spelling``). folder: that files are relative to.
+    Keys beside ``preset`` override the preset's. Mappings are merged key by key, but one that names another
+    process or law replaces the preset's as a whole. ``arrivals``, ``service`` and ``chain`` may be written as
+    on the command line (``spelling``), and a fault as the value of its first parameter.
+
+    where: what error messages call the section. folder: what file names in the section are relative to.
     Raises ScenarioError (a ValueError), one line that names the key.
     """
     if mapping is None:
@@ -279,7 +292,10 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
 
 
 def spelled_out(key: Any, value: Any, where: str = "channel", folder: Path = Path()) -> Any:
-    """The value of a section's key, a short spelling as what it stands for. Raises ScenarioError."""
+    """The value of a key of the section, with a short spelling (``exp:60ms``) replaced by its mapping.
+
+    Other values are returned unchanged. Raises ScenarioError.
+    """
     names = {"arrivals": ("process", PROCESSES), "service": ("law", LAWS), "chain": ("", ())}
     if key not in names or not isinstance(value, str):
         return value

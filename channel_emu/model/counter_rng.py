@@ -20,7 +20,7 @@ _WORD = 0xFFFFFFFF
 
 
 def philox4x32(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Ten rounds of Philox4x32: four 32-bit counter words and two key words to four random words."""
+    """Ten rounds of Philox4x32: map four 32-bit counter words and two key words to four random words."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(10):
@@ -36,8 +36,10 @@ def _unit(low: int, high: int) -> float:
 
 
 def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
-    """The key of one camera's stream for one purpose, from ``freshfield.scenario.seed_sequence``. Seeds are
-    whole numbers from 0 to 2^63 - 1."""
+    """The key of one camera's stream for one purpose, from ``freshfield.scenario.seed_sequence``.
+
+    Raises ValueError unless the seed is within 0 to 2^63 - 1.
+    """
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed: expected a whole number from 0 to 2^63 - 1, got {seed}")
     low, high = seed_sequence(seed, purpose, camera).generate_state(2, np.uint32)
@@ -45,9 +47,9 @@ def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
 
 
 class CounterRng:
-    """One stream: ``pair(n)`` are two independent uniforms in (0, 1) for number ``n``.
+    """One stream: ``pair(n)`` gives the two independent uniforms in (0, 1) of number ``n``.
 
-    ``attempt`` indexes further pairs of the same number, for rejection sampling.
+    ``attempt`` selects further pairs of the same number, for rejection sampling.
     """
 
     __slots__ = ("key",)

@@ -21,10 +21,11 @@ from channel_emu.model.traffic import PoissonArrivals
 
 DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
 FITTED_DISCIPLINES = tuple(d for d in DISCIPLINES if d != "lcfs-preempt")
-"""Those that a recording can be fitted with: lcfs-preempt delivers only fast frames, which biases delays."""
+"""Disciplines that can be fitted to a recording. lcfs-preempt delivers only fast frames, which biases the
+delays."""
 
 MAX_SIZE_BYTES = 2**32 - 1
-"""Of a message: gRPC writes its length in 32 bits."""
+"""Largest size of a message: gRPC writes the length in 32 bits."""
 
 
 class EventKind(StrEnum):
@@ -36,20 +37,24 @@ class EventKind(StrEnum):
     DROPPED_BUSY = "dropped_busy"  # the server, or the queue, was full
     SUPERSEDED = "superseded"  # a newer frame took its place
     SKIPPED = "skipped"  # never sampled by the arrival process
-    LOST = "lost"
-    BROKEN = "broken"  # the stream was reset meanwhile
+    LOST = "lost"  # by a fault
+    BROKEN = "broken"  # the stream ended while the frame was inside the link
 
 
 @dataclass(slots=True)
 class Transit:
-    """One offered frame on its way. Instants are None until they are known."""
+    """One offered frame inside the link. Instants are None until they are known.
+
+    number: of the offer, from 0. item: the caller's object, not looked at.
+    due_ns: when transmission ends. ended_ns: when ``outcome`` was decided.
+    """
 
     number: int
     item: Any
     size_bytes: int
     offered_ns: int
     arrived_ns: int | None = None
-    """When it entered the link: at its offer, or when the arrival process sampled it."""
+    """When it arrived at the server: at its offer, or when the arrival process sampled it."""
     started_ns: int | None = None
     due_ns: int | None = None
     state: int = 0
@@ -57,7 +62,7 @@ class Transit:
     outcome: EventKind | None = None
     ended_ns: int | None = None
     ticket: int = 0
-    """The server numbers its arrivals; a frame that replaces a waiting one inherits its ticket."""
+    """Number of the arrival at the server; a frame that replaces a waiting one inherits its ticket."""
     flips: tuple[tuple[float, int], ...] = ()
     """Damaged bytes: (position as a fraction of the payload, non-zero byte to XOR with)."""
 
@@ -69,23 +74,26 @@ class Transit:
 
 @dataclass(frozen=True, slots=True)
 class Event:
+    """What happened to a frame, and when."""
+
     kind: EventKind
     at_ns: int
     transit: Transit
 
 
 class Fault:
-    """Base of the faults: a link without any."""
+    """Base class of the faults; as it stands, it changes nothing."""
 
     def extra_ns(self, transit: Transit) -> int:
-        """Added to the delay at the start of transmission."""
+        """Nanoseconds to add to the frame's delay; asked when transmission starts."""
         return 0
 
     def loses(self, transit: Transit) -> bool:
-        """Asked when the frame is due."""
+        """Whether the frame is lost; asked when it is due."""
         return False
 
     def duplicates(self, transit: Transit) -> bool:
+        """Whether a second copy follows; asked when the frame is delivered."""
         return False
 
     def flips(self, transit: Transit) -> tuple[tuple[float, int], ...]:
@@ -93,18 +101,23 @@ class Fault:
         return ()
 
     def next_reset_ns(self, after_ns: int) -> int:
-        """First reset of the camera's stream after an instant."""
+        """Instant of the first reset of the camera's stream after ``after_ns``; NEVER_NS if none."""
         return NEVER_NS
 
 
 class Link:
-    """``offer`` frames, ``advance`` to an instant, and ask for ``next_event_ns``.
+    """Usage: ``offer`` frames, ``advance`` to ``next_event_ns``, and handle the events that both return.
 
-    arrivals: a Poisson process samples the newest offered frame; a frame that a newer one replaces before the
+    camera: name of the link.
+    discipline: one of DISCIPLINES; ``queue_server`` explains them.
+    service: draws the delay of each frame.
+    arrivals: a Poisson process that samples the newest offered frame; a frame that is replaced before the
         next arrival is ``skipped``. None: every offer is an arrival.
+    faults: applied in this order.
     server: may be shared with other links; None makes one for this link alone. ``offer`` and ``advance``
-        advance all links of a shared server. Another link keeps its events until it is advanced itself; its
-        ``next_event_ns`` is then no later than now.
+        advance all links of a shared server. The other links keep their events until they are advanced
+        themselves; until then their ``next_event_ns`` is not later than now.
+    Raises ValueError for an unknown discipline, or if the server already has a link of this name.
     """
 
     def __init__(
@@ -144,11 +157,12 @@ class Link:
 
     @property
     def in_flight(self) -> int:
+        """Number of frames inside the link."""
         return len(self._serving) + len(self.waiting) + (self._unsampled is not None)
 
     @property
     def next_event_ns(self) -> int:
-        """Instant of the next known event that needs no offer of this camera; NEVER_NS if there is none."""
+        """Instant of the next event if this camera offers no further frame; NEVER_NS if there is none."""
         return min(self.own_event_ns, self._unread_since_ns)
 
     @property
@@ -162,10 +176,11 @@ class Link:
         return 2, self._unsampled.offered_ns
 
     def offer(self, at_ns: int, item: Any = None, size_bytes: int = 0) -> tuple[Transit, list[Event]]:
-        """Offer a frame. Returns its transit and all events up to and at this instant, in order.
+        """Offer a frame. Returns its transit and all events up to and including ``at_ns``, in order.
 
-        Events due at this instant come first: a frame that completes now makes room for the new one.
-        ``transit.outcome`` says at once whether the frame was dropped.
+        at_ns: now. item: any object of the caller. size_bytes: used by faults only.
+        Events due at ``at_ns`` are processed first, so a frame that completes now makes room for the new one.
+        ``transit.outcome`` is set at once if the frame was dropped.
         """
         at_ns = self._clamp(at_ns)
         self.server.advance_to(at_ns)
@@ -183,12 +198,13 @@ class Link:
         return transit, self._take_events()
 
     def advance(self, to_ns: int) -> list[Event]:
-        """All events up to and at ``to_ns``, in order."""
+        """Process and return all events up to and including ``to_ns``, in order."""
         self.server.advance_to(self._clamp(to_ns))
         return self._take_events()
 
     def flush(self, at_ns: int) -> list[Event]:
-        """Break all frames inside, after the events due up to ``at_ns``; returns all events in order."""
+        """Process the events up to ``at_ns``, then break all frames still inside. Returns all events in
+        order."""
         at_ns = self._clamp(at_ns)
         self.server.advance_to(at_ns)
         self._break_all(at_ns)
@@ -274,7 +290,7 @@ class Link:
         self.waiting.append(transit)
 
     def preempt(self, at_ns: int) -> None:
-        """End the frame in service for a newer one of any camera."""
+        """End the frame in service, because a newer one of any camera replaces it."""
         self.server.busy -= 1
         self._end(heapq.heappop(self._serving)[2], EventKind.SUPERSEDED, at_ns)
         self._update_next_event()

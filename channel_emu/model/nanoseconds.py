@@ -1,5 +1,8 @@
-"""Times of the emulator are int64 nanoseconds since the channel's origin; milliseconds (float) occur only in
-configurations and reports. Rounding stands here once, so that the kernel and the Python link agree."""
+"""Conversion and rounding of times.
+
+The emulator's times are int64 nanoseconds since the channel's origin; float milliseconds occur only in
+configurations and reports. All rounding is defined here, so the kernel and the Python link agree.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Channels with a name: the thesis's numbers and others, to be overridden key by key in a scenario; and
-channels in files of other tools."""
+"""Named channels (those of the thesis and others), which a scenario may override key by key, and channels
+read from files of other tools."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ PRESETS = {
         "as ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn",
         {**_CH6, "chain": _two_states(3000)},
     ),
-    # In both states of ch6 a buffer fills about equally fast (few frames and short delays, many and
-    # long ones), so that the best wait is the same. Here only delays differ, tenfold, and a state lasts 3 s:
-    # what is best depends on the state, which the ages tell.
+    # In both states of ch6 a buffer fills about equally fast (few frames with short delays, or many with
+    # long ones), so the best wait is the same. Here only the delays differ, tenfold, and a state lasts 3 s:
+    # the best wait depends on the state, which can be inferred from the frames' ages.
     "swing": Preset(
         "delays of 15 and 150 ms alternate, 3 s a state: what is best depends on the state",
         {**_CH6, "arrivals": "periodic:30ms", "service": "exp:15ms,exp:150ms", "chain": _two_states(3000)},
@@ -66,7 +66,11 @@ FROM_FILES = {
 
 
 def preset(name: str, folder: Path) -> dict[str, Any]:
-    """The section of a preset. folder: that files are relative to. Raises SpellingError."""
+    """The ``channel:`` section of a preset.
+
+    name: of PRESETS, or of the form of FROM_FILES. folder: what a file name in it is relative to.
+    Raises SpellingError if it is unknown, or its file cannot be read.
+    """
     if name in PRESETS:
         return dict(PRESETS[name].channel)
     kind, _, rest = name.partition(":")
@@ -81,12 +85,12 @@ def preset(name: str, folder: Path) -> dict[str, Any]:
     raise SpellingError(f"expected one of {', '.join([*PRESETS, *FROM_FILES])}, got {name!r}")
 
 
-_MOST_KBPS = 1e6  # more than any of its operators, and each 12 are a packet a second to be kept
+_MOST_KBPS = 1e6  # above any operator of ERRANT; bounds the trace, in which 12 kbps are a packet a second
 
 
 def _errant(path: Path, profile: str) -> dict[str, Any]:
-    """Gamma delays of half the profile's round trip (mean and standard deviation) behind a line of its upload
-    rate, on which packets queue."""
+    """Gamma delays with half the mean and standard deviation of the profile's round trip, followed by a line
+    of the profile's upload rate, on which packets queue."""
     try:
         rows = list(csv.DictReader(read_text(path).splitlines()))
         found = {"/".join(list(row.values())[:4]).lower(): row for row in rows}
@@ -101,7 +105,7 @@ def _errant(path: Path, profile: str) -> dict[str, Any]:
                 f"{path}: {profile}: upload_kbps is {upload_kbps:g}, expected up to {_MOST_KBPS:g}"
             )
         packets_per_s = upload_kbps / 12  # of 1500 bytes
-        span_s = 1 + int(1000 / packets_per_s)  # so that a whole number of packets fits well
+        span_s = 1 + int(1000 / packets_per_s)  # 1000 packets or more, so rounding to a whole one is harmless
         count = max(1, round(packets_per_s * span_s))
     except SpellingError:
         raise

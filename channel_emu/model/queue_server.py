@@ -1,20 +1,20 @@
 """The server that transmits frames, for one camera or shared by several.
 
-A server transmits one frame at a time (``parallel``: any number up to the limit). With several cameras the
-disciplines mean:
+A server transmits one frame at a time (``parallel``: any number up to the limit). If several cameras share
+it, the disciplines mean:
 
 - drop-new: a frame that finds the server busy with any camera's frame is dropped.
-- newest-waits: each camera has one waiting place, in which its newest frame replaces an older one.
+- newest-waits: each camera has a waiting place for one frame, where a newer frame replaces an older one.
 - fcfs: each camera has a queue; ``queue_limit`` bounds the waiting frames of all cameras together.
-- lcfs-preempt: a new frame of any camera ends the frame in service, whichever camera's it is.
-- parallel: nobody waits; ``queue_limit`` bounds the frames in service of all cameras together.
+- lcfs-preempt: a new frame of any camera ends the frame in service, of whichever camera.
+- parallel: no frame waits; ``queue_limit`` bounds the frames in service of all cameras together.
 
-When the server becomes free, the camera is next that has waited longest; within a camera frames keep their
-order. Under newest-waits a replacing frame inherits the ticket of the frame it replaces; otherwise a fast
-camera would lose its place with every frame.
+When the server becomes free, it serves the camera that has waited longest; frames of one camera keep their
+order. Under newest-waits a frame inherits the ticket of the one that it replaces; otherwise a fast camera
+would lose its place with every frame.
 
-Events of one instant happen in this order: frames complete, streams reset, frames arrive (earlier offers
-first, then by name).
+Events at the same instant are processed in this order: frames complete, streams reset, frames arrive (earlier
+offers first, then by camera name).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from channel_emu.model.nanoseconds import NEVER_NS
 
 
 class QueuedLink(Protocol):
-    """What the server uses of a ``link.Link``."""
+    """The part of ``link.Link`` that the server uses."""
 
     camera: str
     own_event_ns: int
@@ -44,7 +44,7 @@ class QueueServer:
     """Chooses among its links; each link decides the outcome of its own frames."""
 
     def __init__(self, queue_limit: int = 1024) -> None:
-        """queue_limit: most frames waiting (fcfs) or in service (parallel); more are dropped_busy."""
+        """queue_limit: maximum number of frames waiting (fcfs) or in service (parallel)."""
         self.queue_limit = queue_limit
         self.busy = 0
         """Frames in service."""
@@ -57,13 +57,13 @@ class QueueServer:
         self._tickets = 0
 
     def add(self, link: QueuedLink) -> None:
-        """Links are kept in the order of their cameras' names, in whatever order they are added."""
+        """Add a link, keeping them sorted by camera name. Raises ValueError for a second link of a camera."""
         if any(link.camera == other.camera for other in self.links):
             raise ValueError(f"{link.camera} has a link to this server already")
         self.links = sorted([*self.links, link], key=lambda each: each.camera)
 
     def advance_to(self, to_ns: int) -> None:
-        """Process the events of all links up to and at an instant, in order."""
+        """Process the events of all links up to and including ``to_ns``, in order."""
         if len(self.links) == 1:
             (link,) = self.links
             while (at_ns := link.own_event_ns) <= to_ns and at_ns < NEVER_NS:

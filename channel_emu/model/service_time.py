@@ -1,8 +1,8 @@
 """Service times: how long the link takes to transmit a frame, by the chain's state (thesis 6.23, 6.24).
 
-A law draws a frame's work, of mean one; the state sets the mean delay. ``at-start``: the state in which
-transmission starts sets the delay (the thesis). ``modulated``: the work is served at the rate of each state
-that the chain passes through (the closed form of the Gilbert-Elliott-modulated link).
+A law draws a frame's work, with mean one; the state sets the mean delay. ``at-start``: the state in which
+transmission starts counts (the thesis). ``modulated``: the work is served at the rate of whichever state the
+chain is in (the Gilbert-Elliott-modulated link of ``closed_forms``).
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def lognormal(rng: CounterRng, sigma: float) -> WorkSampler:
 
 
 def gamma(rng: CounterRng, shape: float) -> WorkSampler:
-    """Gamma of the given shape over its mean. Marsaglia and Tsang, ACM TOMS 26(3), 2000; shapes below one by
-    their boost. A rejected attempt uses the frame's next pairs, so frames stay independent."""
+    """Gamma of the given shape, scaled to mean one (Marsaglia and Tsang, ACM TOMS 26(3), 2000; shapes below
+    one by their boost). After a rejection the frame's next pairs are used, so frames stay independent."""
     boosted = shape if shape >= 1.0 else shape + 1.0
     d = boosted - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
@@ -58,7 +58,7 @@ def gamma(rng: CounterRng, shape: float) -> WorkSampler:
 
 
 def replayed(works: Sequence[float]) -> WorkSampler:
-    """The given works in turn, from the start again after the last: delays in ms where the mean is 1 ms."""
+    """The given works in turn, repeated from the start. With a mean of 1 ms they are delays in ms."""
     return lambda number: works[number % len(works)]
 
 
@@ -68,7 +68,10 @@ class ServiceTime:
     def __init__(
         self, draw_work: WorkSampler, means_ms: Sequence[float], chain: Chain | None, modulated: bool = False
     ) -> None:
-        """means_ms: mean delay, one for all states or one a state."""
+        """draw_work: frame number to work of mean one.
+        means_ms: mean delay, one for all states or one a state.
+        modulated: the chain's state counts during the whole transmission, not only at its start.
+        """
         self.draw_work = draw_work
         self.means_ms = list(means_ms)
         self.chain = chain
@@ -76,7 +79,7 @@ class ServiceTime:
         self._speeds_per_ns = [1.0 / (mean * 1e6) if mean > 0.0 else math.inf for mean in self.means_ms]
 
     def due_ns(self, start_ns: int, number: int) -> tuple[int, int]:
-        """Delivery instant of frame ``number`` that starts at ``start_ns``, and the chain's state then."""
+        """Delivery instant of frame ``number`` if it starts at ``start_ns``, and the state at the start."""
         state = 0 if self.chain is None else self.chain.state(start_ns)
         work = self.draw_work(number)
         if self.modulated:
@@ -86,5 +89,5 @@ class ServiceTime:
 
 
 def normal(u: float, v: float) -> float:
-    """Standard normal of two uniforms (Box and Muller)."""
+    """Standard normal from two uniforms in (0, 1) (Box and Muller)."""
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)

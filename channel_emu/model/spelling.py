@@ -1,4 +1,4 @@
-"""Reads short spellings, alike in a scenario and on the command line: ``exp:60ms``, ``poisson:1/30ms``."""
+"""Reads the short notation of scenarios and the command line, such as ``exp:60ms`` or ``poisson:1/30ms``."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from freshfield.untrusted import UntrustedError, read_yaml
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
          "trace": "trace", "none": "none"}  # fmt: skip
-_MAX_CHARS = 2**26  # of a file: millions of delays
+_MAX_CHARS = 2**26  # in a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
 
 class SpellingError(ValueError):
-    """A word that is not understood; the message says what was expected."""
+    """Text in the short notation that is invalid; the message says what was expected."""
 
 
 def span_ms(text: str) -> float:
-    """``30ms``, ``3s``, ``250us`` or a bare number of ms, in ms."""
+    """Parse ``30ms``, ``3s``, ``2min``, ``250us`` or a bare number of ms. Raises SpellingError."""
     found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(us|ms|s|min)?\s*", text)
     try:
         value = float(found[1]) * _UNITS_MS[found[2] or ""] if found else math.nan
@@ -35,7 +35,7 @@ def span_ms(text: str) -> float:
 
 
 def rate_per_ms(text: str) -> float:
-    """``1/30ms``, ``1/30`` or ``0.033/ms`` or a bare number per ms, in 1/ms."""
+    """Parse ``1/30ms``, ``1/30``, ``0.033/ms``, ``5/s`` or a bare number per ms. Raises SpellingError."""
     above, slash, below = text.partition("/")
     try:
         value = float(above)
@@ -50,9 +50,11 @@ def rate_per_ms(text: str) -> float:
 
 
 def section(key: str, text: str, folder: Path) -> dict[str, Any]:
-    """The mapping that a short ``text`` stands for: of ``arrivals``, ``service`` or ``chain``.
+    """Parse a section of ``channel:`` from its short notation.
 
-    A text in braces is the section as YAML writes it. folder: that files are relative to.
+    key: ``arrivals``, ``service`` or ``chain``.
+    text: as the function of that name takes it, or a YAML mapping in braces.
+    folder: what file names are relative to.
     Raises SpellingError.
     """
     if text.lstrip().startswith("{"):
@@ -71,7 +73,10 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
 
 
 def fault(text: str) -> dict[str, Any]:
-    """``NAME:VALUE`` of a fault, the value as YAML writes it: its parameters, or the first of them."""
+    """Parse a fault, ``NAME:VALUE``; the value is YAML, a mapping of parameters or the first parameter alone.
+
+    Raises SpellingError.
+    """
     name, colon, value = text.partition(":")
     try:
         return {name: read_yaml(value) if colon else {}}
@@ -82,8 +87,8 @@ def fault(text: str) -> dict[str, Any]:
 
 
 def arrivals(text: str) -> dict[str, Any]:
-    """``as-offered``, ``periodic:30ms``, ``poisson:1/30ms``, or by state ``mmpp:1/120ms,1/30ms``; bare
-    ``mmpp`` is that, the thesis's rates (6.4.2)."""
+    """Parse ``as-offered``, ``periodic:30ms``, ``poisson:1/30ms`` or, with one rate a chain state,
+    ``mmpp:1/120ms,1/30ms``. Bare ``mmpp`` has these two rates, the thesis's (6.4.2). Raises SpellingError."""
     kind, _, rest = text.partition(":")
     if kind == "as-offered" and not rest:
         return {"process": "as-offered"}
@@ -100,8 +105,11 @@ def arrivals(text: str) -> dict[str, Any]:
 
 
 def service(text: str, folder: Path) -> dict[str, Any]:
-    """``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE`` or none; for
-    each state of the chain the same law with another mean: ``exp:30ms,exp:60ms``."""
+    """Parse ``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE`` or
+    ``none``; or one law with a mean for each chain state, ``exp:30ms,exp:60ms``.
+
+    folder: what FILE is relative to. Raises SpellingError.
+    """
     short, _, rest = text.partition(":")
     law = _LAWS.get(short)
     if law == "trace" and rest:
@@ -129,8 +137,8 @@ def service(text: str, folder: Path) -> dict[str, Any]:
 
 
 def chain(text: str) -> dict[str, Any]:
-    """``mu1=1/30,mu2=1/30``, optionally ``states=low/high``, ``scope=per-camera``, ``initial=low``,
-    ``slots=1ms``."""
+    """Parse ``mu1=1/30,mu2=1/30``, optionally with ``states=low/high``, ``scope=per-camera``,
+    ``initial=low``, ``slots=1ms``. Raises SpellingError."""
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -149,7 +157,8 @@ def chain(text: str) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file that a spelling names. Raises SpellingError."""
+    """Read a file named on the command line or in a scenario. Raises SpellingError if it cannot be read or is
+    too long."""
     try:
         with path.open() as file:
             text = file.read(_MAX_CHARS + 1)
@@ -161,11 +170,11 @@ def read_text(path: Path) -> str:
 
 
 def delays_ms(path: Path) -> list[float]:
-    """One-way delays from a file.
+    """One-way delays from a file, in ms.
 
-    One number of ms a line; a CSV file whose first line names the columns, one of them ``delay_ms``,
-    ``delay_us`` or ``delay_s``; or a trace of this emulator (its drawn delays). Lines that start with # are
-    skipped. Raises SpellingError.
+    The file has one number of ms a line, or is CSV with a header that names a column ``delay_ms``,
+    ``delay_us`` or ``delay_s``, or is a trace of this emulator (its drawn delays). Lines that start with #
+    are skipped. Raises SpellingError.
     """
     text = read_text(path)
     if text.startswith("{"):

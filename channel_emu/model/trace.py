@@ -7,11 +7,12 @@ is known::
      "arrived_ns": ..., "outcome": "delivered", "state": 0, "started_ns": ..., "drawn_ns": ..., "due_ns": ...,
      "ended_ns": ..., "actual_ns": ..., "duplicated": false, "flips": []}
 
-Instants are nanoseconds since the emulator started. ``arrived_ns`` is when the message entered the link,
-later than its offer where an arrival process samples messages (null if it never did). ``due_ns`` is when the
-link releases the message, ``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a message that
-was still inside the link when the recording ended. For services other than the frame stream, ``camera`` is
-the link's name (``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the message's place in it.
+Instants are nanoseconds since the emulator started. ``arrived_ns`` is when the message arrived at the server:
+at its offer, or later if an arrival process samples messages (null if it was never sampled). ``due_ns`` is
+when the link releases the message, ``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a
+message that was still inside the link when the recording ended. For services other than the frame stream,
+``camera`` is the link's name (``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the
+message's index in the call.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class TraceError(ValueError):
 
 @dataclass(frozen=True)
 class Record:
-    """One offered message: a line of the file."""
+    """One offered message: a line of the file, whose fields the module describes."""
 
     camera: str
     session: str
@@ -59,6 +60,8 @@ class Record:
 
 @dataclass(frozen=True)
 class Trace:
+    """A trace file in memory."""
+
     seed: int
     config: ChannelConfig
     records: list[Record]
@@ -76,7 +79,7 @@ class Trace:
 
 
 class TraceWriter:
-    """Appends records to a file. If the process is killed, only the last few lines are lost."""
+    """Writes a trace file, replacing an older one. If the process is killed, only the last lines are lost."""
 
     def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,6 +95,7 @@ class TraceWriter:
         actual_ns: int | None = None,
         duplicated: bool = False,
     ) -> None:
+        """Write the line of one message; the module describes its fields."""
         self._line({
             "camera": camera, "session": session, "sequence": sequence, "number": transit.number,
             "bytes": transit.size_bytes, "offered_ns": transit.offered_ns, "arrived_ns": transit.arrived_ns,
@@ -109,7 +113,7 @@ class TraceWriter:
 
 
 def read(path: Path) -> Trace:
-    """Read a trace. An incomplete last line is left out. Raises TraceError."""
+    """Read a trace, without an incomplete last line. Raises TraceError if it is unreadable or invalid."""
     try:
         lines = path.read_text().split("\n")
     except (OSError, UnicodeDecodeError) as error:

@@ -1,8 +1,8 @@
 """Arrivals: periodic, Poisson or Markov-modulated Poisson (thesis 6.23, 6.24).
 
 A Poisson process, modulated or not, has no memory: given the chain's path, the next arrival after any instant
-is where the integral of the rate reaches a unit-mean exponential. It is looked up by the number of the
-waiting frame, so arrivals depend on (camera, offer number) only.
+is where the integral of the rate reaches a unit-mean exponential. That exponential is looked up by the number
+of the frame to be sampled, so arrivals depend on (camera, offer number) only.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_r
 
 
 def completion_ns(work: float, rates_per_ns: Sequence[float], chain: Chain | None, start_ns: int) -> int:
-    """Instant at which the integral of the chain's rate from ``start_ns`` on reaches ``work``, or NEVER_NS.
+    """Instant at which the rate, integrated from ``start_ns`` on, reaches ``work``; NEVER_NS if it does not.
 
-    rates_per_ns: one entry a state, or one for all.
+    rates_per_ns: one entry a chain state, or one for all.
     """
     if chain is None or len(rates_per_ns) == 1 or rates_per_ns.count(rates_per_ns[0]) == len(rates_per_ns):
         return _at_rate(work, rates_per_ns[0], start_ns)
@@ -40,7 +40,7 @@ def _at_rate(work: float, rate_per_ns: float, start_ns: int) -> int:
 
 
 class PoissonArrivals:
-    """Poisson arrivals, one rate a chain state (or one for all): MMPP where the chain has several states."""
+    """Poisson arrivals with one rate for all chain states, or one a state (an MMPP)."""
 
     def __init__(self, rates_per_ms: Sequence[float], chain: Chain | None, rng: CounterRng) -> None:
         self.rates_per_ns = [rate / 1e6 for rate in rates_per_ms]
@@ -48,12 +48,12 @@ class PoissonArrivals:
         self.rng = rng
 
     def next_ns(self, after_ns: int, number: int) -> int:
-        """First arrival after ``after_ns``, by the exponential of frame ``number``."""
+        """First arrival after ``after_ns``, drawn with the exponential of frame ``number``."""
         return completion_ns(self.rng.exponential(number), self.rates_per_ns, self.chain, after_ns)
 
 
 class PeriodicArrivals:
-    """One arrival every period, for simulations; live cameras keep their own time."""
+    """One arrival every period, for simulations; live cameras set their own period."""
 
     def __init__(self, period_ms: float, phase_ms: float = 0.0) -> None:
         self.period_ns = round(period_ms * 1e6)

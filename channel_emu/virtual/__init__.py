@@ -1,1 +1,1 @@
-"""The same links in virtual time, and what their accuracy costs."""
+"""The same links simulated in virtual time, and benchmarks of accuracy against cost."""

@@ -1,8 +1,8 @@
-"""The simulation's accuracy against its cost: two trade-offs, measured against exact ages.
+"""Two trade-offs between the simulation's accuracy and its cost, measured against exact ages.
 
-- ``duration``: error of the mean age against seconds simulated and seconds of computing (the thesis's chapter
-  5 channel, exact age by ``closed_forms``).
-- ``slots``: bias and speed of sampling the chain at slot boundaries against their length, exact and measured.
+- ``duration``: error of the mean age as a function of simulated seconds and of computing time (channel of the
+  thesis's chapter 5, exact age by ``closed_forms``).
+- ``slots``: bias and speed of sampling the chain at slot boundaries, as a function of the slot length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Rows = list[dict[str, Any]]
 
 CAMERAS = 18
 # (name, mu1, mu2 in 1/ms, mean delays in ms by state, period in ms, slots in ms). The fast chain switches
-# many times a period, where a grid is biased; the thesis's does not.
+# many times a period, so sampling at slots is biased; the thesis's does not.
 CHAINS = (
     ("fast", 5.0, 5.0, (0.2, 2.0), 2.0, (0.01, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
     ("thesis", 1 / 30, 1 / 30, (30.0, 60.0), 30.0, (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)),
@@ -32,8 +32,12 @@ CHAINS = (
 
 
 def measure(quick: bool = False, seed: int = 0) -> dict[str, Rows]:
-    """The two tables; seeds count from ``seed`` on. quick: fewer seeds and shorter runs, for seconds
-    instead of a minute. Raises SimulationError where numba is missing."""
+    """Measure both tables, by name.
+
+    quick: fewer seeds and shorter runs: seconds instead of a minute.
+    seed: the first one; the others follow it.
+    Raises SimulationError if numba or scipy is missing.
+    """
     return {
         "duration": duration(8 if quick else 24, 1000.0 if quick else 10_000.0, seed),
         "slots": chain_slots(6 if quick else 20, 100_000 if quick else 400_000, seed),
@@ -41,7 +45,8 @@ def measure(quick: bool = False, seed: int = 0) -> dict[str, Rows]:
 
 
 def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
-    """Root mean square error of the mean age of 18 cameras, over ``repeats`` seeds, against duration."""
+    """Root mean square error of the mean age of 18 cameras over ``repeats`` seeds, one row a duration from 1
+    s to ``longest_s``."""
     exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
     config = channel_from_mapping({"preset": "ch5"})
     _age(config, CAMERAS, 1.0, seed)  # compiles
@@ -60,8 +65,11 @@ def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
 
 
 def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
-    """Bias of sampling the chain at slot boundaries: exact, measured with its 95 % interval, and speed.
-    slot_ms 0 is continuous time."""
+    """Bias of sampling the chain at slot boundaries, exact and measured with its 95 % interval, and speed;
+    one row a chain and slot length, where ``slot_ms`` 0 means continuous time.
+
+    repeats: number of seeds. frames: number of frames of each run.
+    """
     rows = []
     for name, mu1, mu2, means_ms, period_ms, slots_ms in CHAINS:
         generator = two_state_generator(mu1, mu2)
@@ -94,12 +102,13 @@ _TITLES = {
 
 
 def show(tables: dict[str, Rows]) -> str:
-    """The tables for a person."""
+    """The tables as text."""
     return "\n\n".join(f"{_TITLES[name]}\n{format_table(rows)}" for name, rows in tables.items())
 
 
 def write(tables: dict[str, Rows], out: Path) -> list[Path]:
-    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises PlotError without matplotlib."""
+    """Write OUT/accuracy-NAME.csv for each table and OUT/accuracy.png. Returns the paths. Raises OSError, and
+    PlotError without matplotlib."""
     files = {out / f"accuracy-{name}.csv": rows for name, rows in tables.items()}
     for path, rows in files.items():
         write_csv(path, rows)
@@ -128,7 +137,7 @@ def _draw(tables: dict[str, Rows], left: Any, right: Any) -> None:
 
 
 def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> float:
-    """Mean age in ms over the cameras that had a delivery."""
+    """Mean age in ms over the cameras that had a delivery. Raises SimulationError if none had."""
     age = simulate(config, cameras, seconds, seed, engine="kernel").mean_age_ms()
     if age is None:
         raise SimulationError(f"nothing was delivered within {seconds:g} s")
@@ -136,7 +145,7 @@ def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> floa
 
 
 def _half_width(values: np.ndarray) -> float:
-    """Of the 95 % interval of the mean by Student's t."""
+    """Half width of the 95 % interval of the mean, by Student's t."""
     try:
         from scipy.stats import t
     except ImportError:

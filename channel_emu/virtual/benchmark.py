@@ -1,7 +1,7 @@
-"""Benchmarks the links in virtual time: speed against a plain loop, and the cost of a frame.
+"""Benchmarks the links in virtual time: their speed compared with a plain loop, and the cost of a frame.
 
-The loop steps every link in every slot, as the thesis describes. It is as fast as plain Python allows, so
-that the comparison is fair.
+The loop steps every link in every slot, as the thesis describes. It is as fast as plain Python allows, for a
+fair comparison.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ FAULTS: dict[str, dict[str, Any]] = {
     "bandwidth": {"megabits_per_s": 1000.0}, "mahimahi": {"opportunities_ms": [1] * 20},
 }  # fmt: skip
 _PERIOD_NS = 10**6
-PERIOD_MS, MEAN_MS = 30.0, 60.0  # of captures and delays in the thesis's chapter 5
+PERIOD_MS, MEAN_MS = 30.0, 60.0  # period of captures and mean delay in the thesis's chapter 5
 
 
 def periodic_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 1.0) -> float:
-    """Mean age in ms at slot boundaries, after deliveries, of D/M/1/0 stepped slot by slot (5.2, 5.5)."""
+    """Mean age in ms at slot boundaries, just after deliveries, of D/M/1/0 links stepped slot by slot (5.2,
+    5.5)."""
     draw = random.Random(seed).expovariate
     every, rate = round(PERIOD_MS / slot_ms), slot_ms / MEAN_MS
     left, sending, newest = [0] * cameras, [0] * cameras, [0] * cameras
@@ -55,9 +56,12 @@ def bench_simulate(
     rounds: int = 5,
     loop_seconds: float = 60.0,
 ) -> dict[str, Any]:
-    """Link-slots (of 1 ms) a wall second: links in virtual time, with and without their ages, and the loop.
+    """Speed in link-slots (of 1 ms) a second of wall time: simulator with and without ages, and plain loop.
 
-    Simulator and loop alternate, so that both see the same machine load. Medians, without compile time.
+    cameras: number of links. seconds: simulated in each round. rounds: number of seeds.
+    loop_seconds: simulated by the loop in each round.
+    Simulator and loop alternate, so that both see the same machine load. Speeds are medians, without compile
+    time.
     """
     config = channel_from_mapping({"preset": "ch5"})
     simulate(config, cameras, 1.0, engine="kernel")
@@ -85,10 +89,11 @@ def bench_simulate(
 
 
 def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
-    """ns a frame of one ideal Python link, and what each option of a channel adds.
+    """Time per frame of an ideal Python link, and the time that each option of a channel adds, in ns.
 
-    Every round measures all of them, and ``added_ns`` is a difference within its round, so that other load on
-    the machine affects both sides. Medians. Rows: what, ns_per_frame, added_ns.
+    frames: number of frames of each measurement.
+    Every round measures all options, and ``added_ns`` is the difference to the ideal link in the same round,
+    so that other load affects both sides. Rows of medians: what, ns_per_frame, added_ns.
     """
     cases: dict[str, ChannelConfig] = {"ideal link": channel_from_mapping({})}
     for name, params in FAULTS.items():

@@ -1,7 +1,7 @@
-"""Runs the kernels for whole deployments: what ``simulate`` does with ``engine="kernel"``.
+"""The engine ``kernel`` of ``simulate``: runs the compiled kernels for all cameras.
 
-Cameras with a server of their own do not interact: each is one task of a thread pool (the kernels release the
-GIL), and the result does not depend on the number of threads. A shared server is one task.
+Cameras with their own servers do not interact: each is one task of a thread pool (the kernels release the
+GIL), and results do not depend on the number of threads. A shared server is one task.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from channel_emu.virtual.kernels import chain_path, philox, service, work
 from channel_emu.virtual.link_run import OUTCOME_CODES, LinkRun, camera_period_ms, name_ranks
 from freshfield.machine_load import usable_cores
 
-# Virtual time of all cameras together below which a thread pool costs more than it saves.
+# Below this virtual time of all cameras together, a thread pool costs more than it saves.
 _MIN_THREADED_NS = 300 * 10**9
 
 Path = tuple[NDArray[np.int64], NDArray[np.int64]]
-# When frames are offered, and when they arrive at the link (-1: never sampled).
+# Instants at which frames are offered, and at which they arrive at the server (-1: never sampled).
 Offers = tuple[NDArray[np.int64], NDArray[np.int64]]
 Prepared = tuple[Path, Offers]
 
@@ -45,7 +45,7 @@ def run(
     frame_period_ms: float | None,
     threads: int | None = None,
 ) -> list[LinkRun]:
-    """Every camera's run, in the order of ``names``; the arguments are those of ``simulate.simulate``."""
+    """Every camera's run, in the order of ``names``. Arguments as in ``simulate.simulate``."""
     if threads is None:
         threads = usable_cores() if end_ns * len(names) >= _MIN_THREADED_NS else 1
     shared_path = _path(channel.chain, "", channel.seed, end_ns) if channel.chain else None
@@ -140,7 +140,10 @@ def _serve_together(
 def _run_of(
     config: ChannelConfig, channel: Channel, name: str, path: Path, frames: tuple[Any, ...], end_ns: int
 ) -> LinkRun:
-    """frames: offered_ns, outcome, started_ns and due_ns of a ``LinkRun``, without the fault loss."""
+    """Apply the loss fault and make the result.
+
+    frames: offered_ns, outcome, started_ns and due_ns of a ``LinkRun``, before losses.
+    """
     offered, outcome, started, due = frames
     starts, states = path
     if loss := config.faults.get("loss"):

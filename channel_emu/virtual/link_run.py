@@ -1,4 +1,4 @@
-"""What an engine returns for one camera, and what both engines derive from a configuration."""
+"""The result of an engine for one camera, and values that both engines derive from a configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,14 @@ DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 
 @dataclass(frozen=True)
 class LinkRun:
-    """One camera's frames: instants int64 ns (n,), -1 where there is none; outcome: index into OUTCOMES."""
+    """The simulated frames of one camera.
+
+    offered_ns, started_ns, due_ns: int64 (n,); -1 if it did not happen.
+    outcome: (n,), index into OUTCOMES.
+    end_ns: end of the run.
+    state_share: share of time in each state of the chain.
+    duplicated: number of frames delivered twice.
+    """
 
     camera: str
     offered_ns: NDArray[np.int64]
@@ -34,23 +41,25 @@ class LinkRun:
     duplicated: int = 0
 
     def count(self, outcome: str) -> int:
+        """Number of frames with an outcome, one of OUTCOMES."""
         return int((self.outcome == OUTCOME_CODES[outcome]).sum())
 
     def sawtooth(self) -> ages.Sawtooth:
-        """Ages run from capture, which in virtual time is the offer."""
+        """The age over time, counted from the capture, which in virtual time is the offer."""
         delivered = self.outcome == OUTCOME_CODES["delivered"]
         return ages.sawtooth(self.due_ns[delivered], self.offered_ns[delivered], self.end_ns)
 
     def delays_ms(self) -> NDArray[np.float64]:
-        """The drawn delay of every frame whose transmission ended within the run."""
+        """The drawn delay of every frame that started and was due within the run."""
         done = (self.started_ns >= 0) & (self.due_ns <= self.end_ns)
         return (self.due_ns - self.started_ns)[done] / 1e6
 
 
 def name_ranks(names: list[str]) -> list[int]:
-    """Each camera's place in the order of names, which decides between frames of one instant."""
+    """Each camera's rank in the sorted names, which orders frames of the same instant."""
     return [sorted(names).index(name) for name in names]
 
 
 def camera_period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
+    """The cameras' capture period: as given, else the configuration's, else the default."""
     return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS

@@ -1,4 +1,4 @@
-"""A simulation as files: a row a frame, and a picture of the ages."""
+"""Writes a simulation to files: one row a frame, and a plot of the ages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _CAMERAS, _DELIVERIES = 4, 60
 
 
 def write_frames(simulation: Simulation, path: Path) -> None:
-    """Rows offered_ms, delivered_ms (empty: it never came) and camera, as ``channel-emu fit`` reads them."""
+    """Write CSV rows offered_ms, delivered_ms (empty: not delivered) and camera, as ``channel-emu fit`` reads
+    them. Raises OSError."""
     rows = []
     for run in simulation.runs:
         came = run.outcome == OUTCOME_CODES["delivered"]
@@ -27,14 +28,14 @@ def write_frames(simulation: Simulation, path: Path) -> None:
 
 
 def plot_ages(simulation: Simulation, path: Path) -> None:
-    """Age over time of the first cameras and deliveries, and the distribution of the drawn delays. Raises
-    PlotError."""
+    """Plot the age over time of the first cameras and deliveries, and the distribution of the drawn delays.
+    Raises PlotError."""
     with picture(path, 1, 2, size=(11, 4), width_ratios=[2, 1]) as axes:
         age, delay = axes[0]
         for run in simulation.runs[:_CAMERAS]:
             saw = run.sawtooth()
             due, born = saw.delivered_ns[:_DELIVERIES] / 1e6, saw.generated_ns[:_DELIVERIES] / 1e6
-            # Each delivery is a fall: the age before it and after it.
+            # The age drops at each delivery: plot its value before and after.
             before = np.append(np.nan, due[1:] - born[:-1])[: len(due)]
             age.plot(np.repeat(due, 2) / 1e3, np.stack((before, due - born), 1).ravel(), label=run.camera)
             values = np.sort(run.delays_ms())

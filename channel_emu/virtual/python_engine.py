@@ -1,4 +1,4 @@
-"""Runs ``link.Link`` in virtual time: what ``simulate`` does with ``engine="python"``."""
+"""The engine ``python`` of ``simulate``: runs ``link.Link`` in virtual time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def run(
     frame_period_ms: float | None,
     frame_bytes: int,
 ) -> list[LinkRun]:
-    """Every camera's run, in the order of ``names``; the arguments are those of ``simulate.simulate``."""
+    """Every camera's run, in the order of ``names``. Arguments as in ``simulate.simulate``."""
     offers: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
     for name, rank in zip(names, name_ranks(names)):
         source = _source(config, channel, name, frame_period_ms, rank / len(names))
@@ -37,7 +37,8 @@ def run(
 def _source(
     config: ChannelConfig, channel: Channel, camera: str, frame_period_ms: float | None, phase: float
 ) -> PeriodicArrivals | PoissonArrivals:
-    """phase: in [0, 1), the part of the period by which a staggered camera is late."""
+    """The process that generates a camera's offers. phase: offset of a staggered camera, as a fraction of the
+    period, in [0, 1)."""
     if frame_period_ms is None and config.arrivals.process == "poisson":
         arrivals = channel.arrivals(camera, channel.chain_of(camera))
         assert arrivals is not None

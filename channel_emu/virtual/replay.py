@@ -1,4 +1,4 @@
-"""Replays offers in virtual time, and compares a recorded trace with what the links decide today."""
+"""Replays offers in virtual time, and compares a recorded trace with the decisions of fresh links."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from channel_emu.model.trace import Trace
 def offer_all(
     channel: Channel, offers: dict[str, list[tuple[int, int]]], end_ns: int, sampled: bool = True
 ) -> tuple[dict[str, Link], dict[str, list[Transit]]]:
-    """Offer frames to fresh links, as the live emulator would have been offered them.
+    """Offer frames to fresh links, in the order of time, as to the live emulator.
 
-    offers: (instant in ns, bytes) of each frame, by camera. sampled: see ``Channel.link``. Returns links and
-    transits by camera, as of ``end_ns``.
+    offers: (instant in ns, bytes) of each frame, by camera.
+    sampled: see ``Channel.link``.
+    Returns links and transits by camera, advanced to ``end_ns``.
     """
     links = {camera: channel.link(camera, sampled=sampled) for camera in offers}
     transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
@@ -29,11 +30,11 @@ def offer_all(
 
 
 def compare(trace: Trace) -> dict[str, Any]:
-    """Offer every recorded message again at its recorded instant and compare the link's decisions.
+    """Offer every recorded message again at its recorded instant, and compare the link's decisions: outcome,
+    start, due instant and state.
 
-    Outcome, start, due instant and state of each message must be those recorded.
-
-    Returns {frames: records compared, equal: decided as recorded, different: [one line each, at most 20]}.
+    Returns frames (number of records), equal (number decided as recorded) and different (one line for each
+    difference, at most 20).
     """
     last_ns = max((max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in trace.records), default=0)
     _, decided = offer_all(Channel(trace.config, trace.seed), trace.offers(), last_ns)
@@ -41,7 +42,7 @@ def compare(trace: Trace) -> dict[str, Any]:
     for camera, records in trace.by_camera().items():
         for record, transit in zip(records, decided[camera]):
             outcome = None if transit.outcome is None else str(transit.outcome)
-            # A message that was still inside when the recording ended may have an outcome now.
+            # A message still inside at the end of the recording may have an outcome now.
             same = record.outcome is None or record.outcome == outcome
             if record.started_ns is not None:
                 now = (transit.started_ns, transit.due_ns, transit.state)

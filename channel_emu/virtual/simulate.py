@@ -1,7 +1,7 @@
 """Simulates the links in virtual time: thousands of camera-seconds in a moment, from one seed.
 
-Two engines decide the same for every frame: ``python`` runs ``link.Link`` in an event loop, ``kernel``
-(numba) computes whole arrays. Faults other than loss need the Python one.
+Two engines make the same decision for every frame: ``python`` runs ``link.Link`` in an event loop, ``kernel``
+(numba) computes whole arrays. Faults other than loss need ``python``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ _MOST_CAMERAS = 10_000  # 25 kB each, and ten times as many as a scenario has
 
 
 class SimulationError(ValueError):
-    """A simulation that cannot be run as asked; the message says why."""
+    """A simulation that cannot be run; the message says why."""
 
 
 @dataclass(frozen=True)
 class Simulation:
+    """A finished simulation. engine: that was used. runs: one a camera, in the order of the cameras."""
+
     config: ChannelConfig
     seed: int
     seconds: float
@@ -39,26 +41,30 @@ class Simulation:
     runs: list[LinkRun] = field(repr=False)
 
     def omega(self, at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The set Omega(t) at instants (T,) in any order (thesis 5.4, 6.2): generation time of each camera's
-        newest delivered frame, int64 ns (T, cameras); -1 before its first delivery.
+        """The set Omega(t) (thesis 5.4, 6.2): generation time of each camera's newest delivered frame, int64
+        ns (T, cameras); -1 before its first delivery.
 
-        A frame delivered at an instant counts at that instant.
+        at_ns: instants (T,) in any order; a frame delivered at an instant counts at that instant.
         """
         at = np.asarray(at_ns, np.int64)
         return np.stack([ages.newest_at(run.sawtooth(), at) for run in self.runs], -1)
 
     def ages_ms(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Ages at any instants (T,) in ms, (T, cameras); NaN before a camera's first delivery (5.5)."""
+        """Ages (T, cameras) in ms at the instants ``at_ns`` (T,); NaN before a camera's first delivery
+        (5.5)."""
         born_ns = self.omega(at_ns)
         return np.where(born_ns >= 0, (np.asarray(at_ns, np.int64)[..., None] - born_ns) / 1e6, np.nan)
 
     def mean_age_ms(self) -> float | None:
-        """Continuous time average, over the cameras that had a delivery; None where there was none."""
+        """Continuous time average of the age, over the cameras that had a delivery; None if none had."""
         return ages.mean_of_known([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
 
     def summary(self, metrics: Sequence[str] = ()) -> dict[str, Any]:
-        """What the command prints with --json. metrics: see ``ages.measure``; each the mean over the cameras
-        that have one."""
+        """Results as plain values, as the command prints them with --json.
+
+        metrics: further age metrics (see ``ages.measure``), each averaged over the cameras that have a value.
+        Raises SpellingError for an unknown one.
+        """
         saws = [run.sawtooth() for run in self.runs]
         delays = np.concatenate([run.delays_ms() for run in self.runs])
         share = np.mean([run.state_share for run in self.runs], 0)
@@ -108,13 +114,14 @@ def simulate(
     """Run every camera's link for ``seconds`` of virtual time.
 
     cameras: their number (cam00, cam01, ...) or their names.
-    engine: auto, python or kernel.
-    frame_bytes: size of every frame, for the bandwidth fault.
-    frame_period_ms: the cameras' capture period. Without it Poisson arrivals generate the frames (arrival =
-        capture, as in the thesis); with it they sample the camera's newest frame, as the live emulator does.
-    slot_ms: slot of the slotted mean age (5.2).
-    threads: of the kernel; None uses every processor if the run is long enough. Results do not depend on it.
-    Raises SimulationError.
+    engine: auto (kernel if it supports the channel), python or kernel.
+    frame_period_ms: the cameras' capture period. None: Poisson arrivals generate the frames (arrival =
+        capture, as in the thesis). Given: they sample the camera's newest frame, as the live emulator does.
+    frame_bytes: size of every frame, for faults that depend on it.
+    slot_ms: slot length of the slotted mean age (5.2).
+    threads: of the kernel engine; None uses every processor if the run is long enough. Results do not depend
+        on it.
+    Raises SimulationError if the channel cannot be simulated, or a value is out of range.
     """
     count = cameras if isinstance(cameras, int) else len(cameras)
     if not 1 <= count <= _MOST_CAMERAS:
@@ -150,7 +157,7 @@ def simulate(
 
 
 def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
-    """Upper bound for one camera. Arrivals that sample a camera's frames generate none."""
+    """Upper bound of one camera's rate of frames. Arrivals that sample a camera's frames generate none."""
     rates = config.arrivals.rate_per_ms
     if rates is None or frame_period_ms is not None:
         return 1 / camera_period_ms(config, frame_period_ms)
@@ -158,7 +165,7 @@ def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> floa
 
 
 def _kernel_unsupported(config: ChannelConfig) -> str | None:
-    """Why the kernel cannot run this channel, or None."""
+    """The reason why the kernel engine cannot run this channel, or None."""
     if any(name != "loss" for name in config.faults):
         return f"faults ({', '.join(config.faults)}) are simulated by the python engine only"
     try:

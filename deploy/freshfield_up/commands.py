@@ -25,8 +25,13 @@ class MissingCommand(RuntimeError):
 
 @dataclass(frozen=True)
 class ProcessSet:
-    """The processes of one scenario. ``nodes`` is never empty. ``arms`` holds a process if the scenario has a
-    simulated arm, ``drivers`` one if that arm has a path."""
+    """The processes of one scenario.
+
+    nodes: at least one.
+    edge_address, emulator_address: HOST:PORT on which they listen.
+    arms: one process if the scenario has a simulated arm, else none. arm_address: HOST:PORT of the arm.
+    drivers: one process if that arm has a path, else none.
+    """
 
     edge: Child
     emulator: Child
@@ -57,11 +62,15 @@ def process_set(
     process_per_camera: bool = False,
     edge_options: Sequence[str] = (),
 ) -> ProcessSet:
-    """Commands, addresses and log files of a run.
+    """The processes of a run, not started yet, with their commands, addresses and log files.
 
-    out: folder of the run. page_port: loopback port of the page. data: folder of recorded data, if any.
-    seed: in place of the scenario's. process_per_camera: one node for each camera instead of one for all.
+    out: folder of the run.
+    page_port: loopback port of the page.
+    data: folder of recorded data, if any.
+    seed: replaces the scenario's.
+    process_per_camera: one node for each camera instead of one for all.
     edge_options: further arguments for the edge server.
+    Raises MissingCommand.
     """
     edge_port, emulator_port = free_ports(2)
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
@@ -101,7 +110,8 @@ def process_set(
 
 
 def program(name: str) -> str:
-    """Path of one of the project's commands, from this interpreter's environment if it is there."""
+    """Path of one of the project's commands, preferably in this interpreter's environment. Raises
+    MissingCommand."""
     beside = Path(sys.executable).parent / name
     found = str(beside) if beside.exists() else shutil.which(name)
     if found is None:

@@ -75,7 +75,7 @@ class LiveTable(Display):
 
 
 def make_display(table: bool) -> Display:
-    """A live table where one is wanted and stdout is a terminal, else plain lines."""
+    """A live table if ``table`` is true and stdout is a terminal, else plain lines."""
     return LiveTable() if table and sys.stdout.isatty() else Display()
 
 

@@ -1,4 +1,5 @@
-"""The folder of a run: a new one, or that of an earlier run, which is replaced. Any other is refused."""
+"""Prepares the folder of a run: a new one, or that of an earlier run, which is replaced. Others are
+refused."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import IO, Any
 MARKER = "run.json"
 """Written first into every run's folder. Only a folder that holds one may be replaced."""
 EARLIER = "earlier-run"
-"""Where the files of the run that was replaced lie until the new one is up: a mistyped option loses none."""
+"""Subfolder that keeps the replaced run's files until the new run is up, so a mistyped option loses none."""
 
 
 class FolderError(ValueError):
@@ -19,11 +20,12 @@ class FolderError(ValueError):
 
 
 def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
-    """Make ``out`` an empty run folder with a marker, locked for as long as the returned file is open. The
-    files of an earlier run lie in ``EARLIER`` until ``forget_earlier``.
+    """Make ``out`` an empty run folder with a marker. The folder is locked while the returned file is open.
+    Files of an earlier run are moved to ``EARLIER``, where they stay until ``forget_earlier``.
 
-    about: contents of the marker. Raises FolderError if the folder holds anything but an earlier run, or a
-    run that is still going on.
+    about: contents of the marker.
+    Raises FolderError if the folder cannot be used, holds other files than a run's, or a run is still using
+    it.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -43,10 +45,10 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
         raise FolderError(f"another run is writing to {out}; end it, or name another with --out") from None
     earlier, part = out / EARLIER, out / f".{EARLIER}"
     before = set(out.iterdir()) - {marker, earlier, part}
-    if earlier.exists():  # the last start failed: what lies there is worth more than its logs
+    if earlier.exists():  # the last start failed: keep the run before it, and delete its logs
         for path in before:
             _delete(path)
-    elif before or part.exists():  # what a start that was killed has moved already
+    elif before or part.exists():  # ``part``: files that a killed start had moved already
         part.mkdir(exist_ok=True)
         for path in before:
             path.rename(part / path.name)
@@ -60,7 +62,7 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
 def forget_earlier(out: Path) -> None:
     """Delete the files of the run that this one replaces."""
     if (earlier := out / EARLIER).exists():
-        _delete(earlier.rename(out / f".{EARLIER}"))  # killed meanwhile, this run is the earlier one
+        _delete(earlier.rename(out / f".{EARLIER}"))  # renamed first, in case of a kill in between
 
 
 def _delete(path: Path) -> None:

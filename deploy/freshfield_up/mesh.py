@@ -1,4 +1,4 @@
-"""The mesh at the end of a run, where the scenario asks for one (``edge.export``)."""
+"""Exports a mesh at the end of a run if the scenario asks for one (``edge.export``)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from freshfield_up.status import number, read_json
 
 
 def export_section(scenario: Scenario) -> dict[str, Any] | None:
-    """The section ``edge.export``, or None. The edge server has checked it before a mesh is made."""
+    """The section ``edge.export``, or None. The edge server has checked it by the time a mesh is made."""
     section = scenario.edge.get("export")
     return section if isinstance(section, dict) else None
 
 
 def check(scenario: Scenario) -> None:
-    """Raises MissingCommand before the run if the mesh that is asked for could not be made."""
+    """Raise MissingCommand if the scenario asks for a mesh that could not be made. Call before the run."""
     if export_section(scenario) and importlib.util.find_spec("skimage") is None:
         raise MissingCommand(
             f"{scenario.path}: edge.export: a mesh needs scikit-image: pip install 'freshfield[surface]', or "
@@ -28,7 +28,7 @@ def check(scenario: Scenario) -> None:
 
 
 def possible(out: Path) -> bool:
-    """Whether the field of the run in ``out`` was updated; before, there is nothing to export."""
+    """Whether the field of the run in ``out`` was ever updated; otherwise there is nothing to export."""
     return bool(number(read_json(out / "edge.json"), "updates", "count"))
 
 

@@ -1,4 +1,4 @@
-"""Ports of this machine: which are free, and which servers answer yet."""
+"""Checks of ports: which are free, and which servers answer already."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import socket
 
 # Child processes are started by fork and exec. gRPC's fork handlers would first stop gRPC's threads, which
-# now and then never ends: the launcher hangs. A process that calls exec does not need the handlers.
+# sometimes hangs the launcher. A process that calls exec does not need the handlers.
 os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 
 import grpc
@@ -19,8 +19,8 @@ LOOPBACK = "127.0.0.1"
 
 
 def free_ports(count: int) -> list[int]:
-    """Different free loopback ports. If another program takes one first, the process that was to listen there
-    reports it and the run ends."""
+    """``count`` different free loopback ports. If another program takes one meanwhile, the process that
+    should listen there reports it and the run ends."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for s in sockets:

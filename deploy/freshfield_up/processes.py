@@ -1,4 +1,5 @@
-"""Child processes: start them apart from the terminal, log their output, describe their exit, stop them."""
+"""Child processes: starts them detached from the terminal, logs their output, describes their exit, stops
+them."""
 
 from __future__ import annotations
 
@@ -23,8 +24,14 @@ _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 @dataclass
 class Child:
-    """One process of the run. role: its name in messages, for example ``the edge server``. killed: it did not
-    end in time and had to be killed."""
+    """One process of the run.
+
+    role: its name in messages, such as ``the edge server``.
+    log: file to which its output is appended.
+    environment: variables in addition to this process's.
+    started_s: monotonic time of its last start.
+    killed: whether it did not end in time and had to be killed.
+    """
 
     name: str
     role: str

@@ -1,7 +1,7 @@
 """Memory and processor time of every process: ``processes.jsonl``, one line every two seconds.
 
-Each line: ``{"t_s": 12.0, "edge": {"rss_mb": 512.3, "cpu": 1.42, "pid": 17}, ...}``; ``cpu`` in cores, since
-the previous line.
+Each line: ``{"t_s": 12.0, "edge": {"rss_mb": 512.3, "cpu": 1.42, "pid": 17}, ...}``; ``cpu`` is in cores,
+over the time since the previous line.
 """
 
 from __future__ import annotations

@@ -31,8 +31,16 @@ EXPORT_WITHIN_S = 1200.0
 
 @dataclass(frozen=True)
 class Options:
-    """out: folder of the run. duration_s: seconds from when everything is up; 0: no end. edge: further
-    arguments for the edge server."""
+    """How a run is made.
+
+    out: folder of the run.
+    duration_s: seconds after everything is up; 0: no end.
+    port: loopback port of the page.
+    data, seed, process_per_camera: see ``commands.process_set``.
+    restart: restart a process that ends, instead of ending the run.
+    table: show a live table on a terminal.
+    edge: further arguments for the edge server.
+    """
 
     out: Path
     duration_s: float = 60.0
@@ -62,7 +70,8 @@ class Launcher:
         self._restart_at: dict[str, float] = {}
 
     def run(self) -> int:
-        """Run to the end. Returns the exit code. Raises FolderError or MissingCommand before any start."""
+        """Run to the end. Returns the exit code. Raises FolderError or MissingCommand before any process
+        starts."""
         options = self.options
         mesh.check(self.scenario)
         self.processes = process_set(
@@ -102,7 +111,7 @@ class Launcher:
     def _supervise(self) -> None:
         """Start the processes, then check them every tick until there is a reason to stop."""
         # The nodes render ahead while the edge loads its libraries. The emulator starts last, so that no
-        # frame is sent before the edge can take it, and none is lost to the start.
+        # frame is sent, and lost, before the edge can take it.
         self.processes.edge.start()
         for arm in self.processes.arms:
             arm.start()
@@ -148,7 +157,7 @@ class Launcher:
             self._ready_s = now_s
             folder.forget_earlier(self.options.out)
             for driver in self.processes.drivers:
-                driver.start()  # last: the arm must not tour before the field can learn
+                driver.start()  # last: the arm must not begin its tour before the field can learn
         elif now_s - self._began_s > READY_WITHIN_S:
             self._fail(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
 
@@ -165,7 +174,8 @@ class Launcher:
         return self.processes.edge if doing.startswith(_COMPILING) else None
 
     def _check_alive(self, now_s: float) -> bool:
-        """Look for processes that ended; with --restart, restart them after a second. False ends the run."""
+        """Look for processes that ended; with --restart, restart them after a second. Returns False to end
+        the run."""
         for child in self.processes.children:
             if child.process is None or child.running:
                 continue
@@ -237,7 +247,7 @@ class Launcher:
             self._fail(export.exit_summary())
 
     def _report(self) -> None:
-        """Write the report, whatever happened since the run was up."""
+        """Write the report, also after a failure, if the run was up."""
         out = self.options.out
         if self._failures and self._ready_s is None:
             self._display.message("no report: the run did not start")

@@ -3,13 +3,14 @@
     python -m freshfield_up.soak --minutes 30 --json docs/results/soak.json
     python -m freshfield_up.soak --kills 34 --every 8 --json docs/results/kills.json
 
-starts a scenario's camera node, emulator and edge with a wire between each two. Every minute it does one
-thing to them: first KILLS, then FAULTS again and again, at last a full disk (where it may mount a tmpfs).
-``--kills N``: only kills, N of each process, in turn. A process that was killed is started again at once.
+It starts a scenario's camera node, emulator and edge with a ``Wire`` on each of the two hops. Every minute it
+injects one fault: first KILLS, then FAULTS in rotation, at last a full disk (if it may mount a tmpfs).
+``--kills N`` only kills, each process N times, in turn. A killed process is restarted at once.
 
-Recovery: from the end of a fault (of a kill: from when the new process begins its ledger, ``start_s`` after
-the kill) until the edge has taken a frame of every camera. Exit code 1 if one takes over RECOVERY_S, memory
-grows, or not every frame before the full disk (where lines are lost) is accounted for.
+Recovery is the time from the end of a fault until the edge has taken a frame of every camera; for a kill it
+begins when the new process begins its ledger, ``start_s`` after the kill. The exit code is 1 if a recovery
+takes longer than RECOVERY_S, memory grows, or not every frame before the full disk (which loses ledger lines)
+is accounted for.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from freshfield_up.wire import Wire
 
 RECOVERY_S = 2.0
 GROWTH, WATCHED_MIN = 0.05, 5.0
-"""Memory is flat where the last quarter of a process's life needs no more than this beyond the second. A
-shorter life is not judged."""
+"""Memory counts as flat if the last quarter of a process's life needs at most GROWTH more than the second
+quarter. Processes that lived less than WATCHED_MIN minutes are not judged."""
 ROLES = ("node", "emulator", "edge")
 HOPS = ("node to emulator", "emulator to edge")
 FULL_DISK = ("full disk", "the run's folder")
 KILLS = tuple(("kill", role) for role in ROLES)
-# What leaves the processes alive, so that their memory can be watched.
+# Faults that leave the processes alive, so that their memory can be watched.
 FAULTS = (*(("stop", role) for role in ROLES), *((kind, hop) for kind in WIRE_FAULTS for hop in HOPS))
 _LASTS_S = 8.0
 _DISK_BYTES = 256 << 20
@@ -57,8 +58,13 @@ _READY_S = 400.0
 
 @dataclass
 class Fault:
-    """at_s: since the run began. recovery_s: None where a camera stayed away until the next fault. start_s:
-    of a kill, until the new process began its ledger."""
+    """An injected fault.
+
+    target: process or hop.
+    at_s: since the run began. for_s: its duration.
+    recovery_s: None if a camera did not come back before the next fault.
+    start_s: of a kill, the time until the new process began its ledger.
+    """
 
     kind: str
     target: str
@@ -93,7 +99,7 @@ class Soak:
         self.began_ns = time.time_ns()
 
     def start(self) -> None:
-        """Until every camera streams and the edge has made two updates."""
+        """Start the processes. Returns when every camera streams and the edge has made two updates."""
         self.children["edge"].start()
         self.children["node"].start()
         self._until(lambda: is_serving(self._edge_address), "the edge does not serve")
@@ -101,7 +107,10 @@ class Soak:
         self._until(self._streams, "the cameras do not stream")
 
     def run(self, planned: Sequence[tuple[str, str]], every_s: float) -> list[Fault]:
-        """Do one fault every ``every_s`` seconds; ends a period after the last one."""
+        """Inject one fault every ``every_s`` seconds. Returns one period after the last one.
+
+        planned: (kind, target) of each fault.
+        """
         done, next_s = [], time.monotonic() + every_s / 4
         for kind, target in planned:
             self._watch_until(next_s)
@@ -111,7 +120,8 @@ class Soak:
         return done
 
     def end(self) -> None:
-        """Stop the processes in order. ``frames`` is the report's account, of the time before a full disk."""
+        """Stop the processes in order, and set ``frames``, the report's account of frames up to a full
+        disk."""
         for child in self.children.values():
             stop([child])
         self._account()
@@ -120,7 +130,7 @@ class Soak:
         if self.frames:
             return
         (copy := self.out.parent / "account").mkdir()
-        # Receivers first: what they wrote, the senders' later copies explain.
+        # Copy receivers' ledgers first: the senders' later copies then explain every frame in them.
         for role in reversed(ROLES):
             for path in self.out.glob(f"ledger-{role}-*.tsv"):
                 shutil.copy(path, copy)
@@ -200,7 +210,8 @@ class Soak:
 
 
 def judge(faults: Sequence[Fault], out: Path, cameras: Sequence[str], began_ns: int) -> None:
-    """Set ``recovery_s`` and ``start_s`` of each fault by the ledgers in ``out``."""
+    """Set ``recovery_s`` and ``start_s`` of each fault from the ledgers in ``out``. began_ns: when the run
+    began, UTC."""
     ledgers = ledger.read_all(out)
     arrivals: dict[str, list[float]] = {camera: [] for camera in cameras}
     for each in ledgers:
@@ -220,8 +231,11 @@ def judge(faults: Sequence[Fault], out: Path, cameras: Sequence[str], began_ns: 
 
 
 def memory(samples: Sequence[tuple[float, dict[str, tuple[int, float]]]]) -> dict[str, dict[str, float]]:
-    """Of the last process of each name: minutes watched, and medians of MB in the second and the last quarter
-    of its life (the first one fills caches)."""
+    """Memory of the last process of each role: minutes watched, and medians in MB over the second and the
+    last quarter of its life (the first quarter fills caches).
+
+    samples: (seconds, (pid, MB) by role).
+    """
     found = {}
     for name in ROLES:
         last = samples[-1][1].get(name, (0, 0.0))[0]
@@ -237,7 +251,7 @@ def memory(samples: Sequence[tuple[float, dict[str, tuple[int, float]]]]) -> dic
 
 
 def problems(result: dict[str, Any]) -> list[str]:
-    """What did not hold, one line each."""
+    """The conditions that did not hold, one line each."""
     found = []
     for fault in result["faults"]:
         if fault["recovery_s"] is None or fault["recovery_s"] > RECOVERY_S:
@@ -256,7 +270,7 @@ def problems(result: dict[str, Any]) -> list[str]:
 def soak(
     scenario: str | Path, planned: Sequence[tuple[str, str]], every_s: float, work: Path
 ) -> dict[str, Any]:
-    """Run ``planned`` faults in the folder ``work`` and return what docs/results/soak.json holds."""
+    """Run the ``planned`` faults in the folder ``work``. Returns the contents of docs/results/soak.json."""
     loaded = scenarios.load(scenario)
     run = Soak(loaded, work)
     try:

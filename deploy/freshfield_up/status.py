@@ -16,7 +16,8 @@ Status = dict[str, Any]
 
 @dataclass(frozen=True)
 class RunStatus:
-    """cameras: the status of each camera, merged from its node's and the edge's, in the scenario's order."""
+    """The newest status of all processes. cameras: one mapping a camera, merged from its node and the
+    edge."""
 
     cameras: tuple[Status, ...]
     channel: Status

@@ -1,7 +1,7 @@
 """Limits on the threads that numeric libraries (BLAS, OpenMP, numba, OpenCV) start in each process of a run.
 
-Libraries start a thread for each core by default. Nodes and emulator gain nothing from these threads, which
-would compete with the edge's own: they get one. The edge may use every core.
+Libraries start a thread for each core by default. Nodes and emulator get only one, because they gain nothing
+from more, which would compete with the edge's threads. The edge may use every core.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A wire between two processes: a TCP relay on loopback with the faults that only a network has."""
+"""A TCP relay on loopback between two processes, which can simulate network faults."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ _CHUNK = 1 << 16
 
 
 class Wire:
-    """Relays every connection at ``address`` to ``to`` (HOST:PORT), in a thread of its own until ``close``.
+    """Relays every connection at ``address`` to ``to`` (HOST:PORT), in its own thread until ``close``.
 
-    ``fault`` is one of FAULTS until ``mend``: *black hole*: nothing passes, what was sent waits as TCP has it
-    wait; *half-open*: the far ends of present connections are gone and the near ends are not told before
-    ``mend``, new connections work; *corrupted bytes*: one byte in every 64 kB or less is another.
+    ``fault`` starts one of FAULTS, ``mend`` ends it:
+
+    - black hole: nothing passes; sent data waits in the TCP buffers.
+    - half-open: the far ends of existing connections are closed, of which the near ends learn only at
+      ``mend``; new connections work.
+    - corrupted bytes: one byte of every chunk of at most 64 kB is changed.
     """
 
     address: str

@@ -1,2 +1,2 @@
-"""Whatever composes camera node, emulator and edge: virtual deployments, benches, studies, training.
-Nothing live imports it."""
+"""Experiments with camera node, emulator and edge together: virtual deployments, benches, studies, training.
+No live code imports this package."""

@@ -1,3 +1,3 @@
-"""freshfield's contract: what two processes must agree on, and nothing else."""
+"""Code shared by all processes: wire format, geometry, scenario, files and limits; nothing else."""
 
 __version__ = "0.1.0"

@@ -1,11 +1,12 @@
-"""Who may do what: the one model of gRPC, page and metrics.
+"""Who may do what: one access model for gRPC, the page and the metrics.
 
-A caller shows a token or, over mutual TLS, a certificate. Either stands for a name, which says the role::
+A caller authenticates with a token or, over mutual TLS, with a certificate. Either stands for a name, which
+gives the role::
 
     operator    viewer    camera:cam00    camera:cam00,cam01    camera:*
 
-A server without tokens and without an authority asks nobody: it listens on loopback alone (see
-``Transport``), or ``--insecure`` says otherwise.
+A server without tokens and without a certificate authority does not authenticate callers. It then listens on
+loopback only (see ``Transport``), unless ``--insecure`` is given.
 """
 
 from __future__ import annotations
@@ -38,20 +39,24 @@ CALLS = {
     "/freshfield.v1.EdgeService/SetPolicy": CHANGE,
     "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": LOOK,
 }
-"""What a gRPC method needs. Others (of a service behind ``channel-emu proxy``) need CHANGE."""
-_OPEN = "/grpc.health.v1.Health/"  # says no more than that the process works
+"""The action that each gRPC method needs. Others (of a service behind ``channel-emu proxy``) need CHANGE."""
+_OPEN = "/grpc.health.v1.Health/"  # open to everybody: it only tells that the process works
 
 
 @dataclass(frozen=True)
 class Caller:
-    """role: of ROLES, or "anybody" where nobody is asked. cameras: that a camera may push; empty: all."""
+    """A caller's rights.
+
+    role: of ROLES, or "anybody" if callers are not authenticated.
+    cameras: ids that the role camera may push; empty means all.
+    """
 
     role: str
     cameras: frozenset[str] = frozenset()
 
     @classmethod
     def named(cls, name: str) -> Caller:
-        """The caller of a name. Raises ValueError if it is none."""
+        """The caller that a name such as ``camera:cam00`` stands for. Raises ValueError if it is none."""
         role, _, listed = name.partition(":")
         cameras = frozenset() if listed == "*" else frozenset(listed.split(","))
         if role == "camera" and all(valid_id(camera) for camera in cameras):
@@ -61,6 +66,7 @@ class Caller:
         raise ValueError(f"expected operator, viewer, camera:ID[,ID] or camera:*, got {name[:80]!r}")
 
     def may(self, action: str) -> bool:
+        """Whether the role allows the action: LOOK, CHANGE, PUSH or CLOCK."""
         return self.role == ANYBODY.role or action in ROLES[self.role]
 
     def may_push(self, camera: str) -> bool:
@@ -73,10 +79,12 @@ caller: ContextVar[Caller] = ContextVar("caller", default=ANYBODY)
 
 
 class Access(grpc.aio.ServerInterceptor):
-    """Knows callers, and lets a gRPC call pass to its handler only if its caller may make it.
+    """Authenticates callers, and passes a gRPC call to its handler only if the caller may make it.
 
-    tokens: token by name of the caller. certificates: whether a certificate's common name counts as well. A
-    wrong token is refused, whatever the certificate says.
+    tokens: token by caller name.
+    certificates: whether a client certificate's common name identifies the caller if no token is sent; a
+        wrong token is refused even with a valid certificate.
+    Raises ValueError for a name that is none.
     """
 
     def __init__(self, tokens: Mapping[str, str], certificates: bool) -> None:
@@ -85,7 +93,7 @@ class Access(grpc.aio.ServerInterceptor):
 
     @property
     def open(self) -> bool:
-        """Whether nobody is asked."""
+        """Whether callers are not authenticated at all."""
         return not self._tokens and not self._certificates
 
     @property
@@ -93,7 +101,8 @@ class Access(grpc.aio.ServerInterceptor):
         return bool(self._tokens)
 
     def of_header(self, header: str) -> Caller | None:
-        """The caller of an ``authorization`` header: Bearer TOKEN, or Basic with the token as password."""
+        """The caller of an ``authorization`` header: Bearer TOKEN, or Basic with the token as password. None
+        for an unknown token or another scheme."""
         kind, _, shown = header.partition(" ")
         token = shown.encode(errors="replace")
         if kind.lower() == "basic":
@@ -103,7 +112,7 @@ class Access(grpc.aio.ServerInterceptor):
                 return None
         elif kind.lower() != "bearer":
             return None
-        # All are compared, each in constant time: how long it takes says nothing.
+        # All tokens are compared, each in constant time, so that the time taken reveals nothing.
         found = [known for known, expected in self._tokens if hmac.compare_digest(token, expected)]
         return found[0] if found else None
 
@@ -146,12 +155,12 @@ class Access(grpc.aio.ServerInterceptor):
         names = context.auth_context().get("x509_common_name", []) if self._certificates else []
         try:
             return Caller.named(names[0].decode()) if names else None
-        except ValueError:  # of a certificate that was made for something else
+        except ValueError:  # a certificate that was made for another purpose
             return None
 
 
 class HttpRefused(Exception):
-    """status: of the answer; the message is its text."""
+    """A refused HTTP request. status: HTTP status of the answer; the message is its body."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -159,9 +168,9 @@ class HttpRefused(Exception):
 
 
 class HttpDoor:
-    """The same check for an HTTP server.
+    """The same checks for an HTTP server.
 
-    access: knows who may log in. If it is open, or on loopback has no tokens, nobody is asked.
+    access: who may log in. No login is asked for if it is open, or on loopback if it has no tokens.
     listening_on: address or name that the server was told to listen on.
     """
 
@@ -171,9 +180,12 @@ class HttpDoor:
         self._names = {"localhost", listening_on.lower(), socket.gethostname().lower()}
 
     def check_origin(self, host: str | None, origin: str | None) -> None:
-        """Raises HttpRefused for a request that a foreign web site had a browser make: from a page that is
-        not ours (Origin), or under a foreign name that leads to this machine (Host). Where there is a login,
-        a browser keeps it from foreign names. An address is never foreign: it is the one connected to."""
+        """Refuse requests that another web site made a browser send.
+
+        Raises HttpRefused if ``origin`` is not the page itself (cross-site request), or if ``host`` is not a
+        name of this machine (DNS rebinding). Host is not checked if there is a login, because browsers do not
+        send it under another name; an IP address always passes, because it is the one connected to.
+        """
         name = (host or "").lower()
         name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
         if self.access is None and name not in self._names and not _is_address(name):
@@ -182,7 +194,7 @@ class HttpDoor:
             raise HttpRefused(403, "this request comes from another web site")
 
     def caller(self, authorization: str | None) -> Caller:
-        """Who shows this header. Raises HttpRefused for somebody who may not look."""
+        """The caller of an ``authorization`` header. Raises HttpRefused unless it may LOOK."""
         if self.access is None:
             return ANYBODY
         found = self.access.of_header(authorization or "")

@@ -1,7 +1,7 @@
-"""Wall and virtual clocks behind one method.
+"""Wall and virtual clocks with one common method.
 
-Nothing else in the project reads the wall clock: links, buffers, policies and the edge's loop are given a
-time or a clock, so that a whole deployment can run in virtual time from one seed.
+Nothing else in the project reads the wall clock: links, buffers, policies and the edge's loop receive a time
+or a clock, so a whole deployment can run in virtual time from one seed.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from typing import Protocol
 
 
 class Clock(Protocol):
+    """Tells the time in ns; wall clocks count since 1970 (UTC)."""
+
     def now_ns(self) -> int: ...
 
 
 class WallClock:
-    """UTC nanoseconds that never step: the wall clock read once, carried on by the monotonic one.
+    """UTC nanoseconds that never step: the wall clock, read once, plus the monotonic clock since then.
 
-    offset_ns, drift_ppm: errors of a deliberately wrong clock (the clock_drift effect).
+    offset_ns, drift_ppm: errors of a deliberately wrong clock.
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
@@ -31,14 +33,14 @@ class WallClock:
 
 
 class SystemClock:
-    """UTC as the machine has it now, steps included: what drivers stamp by."""
+    """The machine's UTC clock, steps included: the clock that drivers stamp with."""
 
     def now_ns(self) -> int:
         return time.time_ns()
 
 
 class VirtualClock:
-    """A clock that ``advance_to`` moves, forward only (else ValueError)."""
+    """A clock that ``advance_to`` sets; it raises ValueError for an earlier time."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now = int(start_ns)

@@ -1,7 +1,7 @@
-"""Files that are complete whenever somebody reads them: replaced atomically, or appended line by line.
+"""Files that are complete at any time they are read: replaced atomically, or appended line by line.
 
-A full disk never ends the process that writes. Appended lines that were lost are counted, so that whoever
-adds them up can say that something is missing.
+A full disk does not stop a process that appends: lost lines are counted, so a reader knows how many are
+missing.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-# Ends a line of which only a part was written: no reader of JSON or of tab-separated fields accepts it.
+# Terminates a partly written line, such that no reader of JSON or of tab-separated fields accepts it.
 _LINE_SPOILER = b"\t?" * 6 + b"\n"
 
 
 def write_json(path: Path, data: Any, indent: int | None = None) -> None:
-    """Replace ``path`` by ``data`` as JSON; see ``write_bytes``. ValueError for NaN, which JSON lacks."""
+    """Replace ``path`` by ``data`` as JSON; see ``write_bytes``. Raises ValueError for NaN or infinity."""
     write_text(path, json.dumps(data, allow_nan=False, indent=indent) + "\n")
 
 
@@ -35,10 +35,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Replace ``path`` atomically: a reader sees the old file or the new one, never half of one.
+    """Replace ``path`` atomically: a reader sees the old file or the new one, never a part.
 
-    Any number of threads, processes and machines that share the folder may do so at once. OSError where the
-    file cannot be written: the old one then stays, and nothing is left beside it.
+    Safe for any number of threads, processes and machines that share the folder. Raises OSError if the file
+    cannot be written; the old one then stays, and no temporary file is left.
     """
     if path.exists() and not path.is_file():  # /dev/stdout, a pipe
         path.write_bytes(data)
@@ -54,7 +54,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A CSV file of mappings, one a row; what one of them lacks stays empty. Raises OSError."""
+    """Write a CSV file, one mapping a row; a key that a row lacks gives an empty cell. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(name for row in rows for name in row))
     with path.open("w", newline="") as file:
@@ -64,12 +64,12 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def out_folder(text: str) -> Path:
-    """An argument type: a folder that a command writes into; it need not be there yet."""
+    """Argparse type of an output folder, which need not exist yet. Raises ArgumentTypeError."""
     return _to_write(text, is_folder=True)
 
 
 def out_file(text: str) -> Path:
-    """An argument type: a file that a command writes; it need not be there yet, nor its folder."""
+    """Argparse type of an output file; neither it nor its folder need exist. Raises ArgumentTypeError."""
     return _to_write(text, is_folder=False)
 
 
@@ -89,8 +89,8 @@ def _to_write(text: str, is_folder: bool) -> Path:
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Mappings with the same keys as a table for people: numbers to five digits, to the right; text to the
-    left."""
+    """Format mappings with the same keys (at least one) as a text table: floats to five digits, numbers
+    aligned to the right, text to the left."""
     columns = []
     for name in rows[0]:
         values = [row[name] for row in rows]
@@ -107,10 +107,12 @@ class PlotError(ValueError):
 
 @contextlib.contextmanager
 def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """Axes (rows, columns) to draw on; ``path`` is then replaced by the picture.
+    """Context manager that yields matplotlib axes (rows, columns); on exit it replaces ``path`` by the
+    figure.
 
-    size: in inches. options: of matplotlib's ``subplots``. Raises PlotError without matplotlib, or if the
-    file cannot be written.
+    size: width and height in inches.
+    options: passed to matplotlib's ``subplots``.
+    Raises PlotError if matplotlib is missing or the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -134,9 +136,11 @@ def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **op
 class Lines:
     """Appends whole lines to a file. Thread-safe.
 
-    Each line is a single O_APPEND write, so that it survives SIGKILL. Lines that cannot be written are
-    counted in ``lost``; the first of them is logged.
-    first: line to begin with. OSError if it cannot be written, or the file not opened.
+    Each line is a single O_APPEND write, so it survives SIGKILL. Lines that cannot be written are counted in
+    ``lost``; the first of them is logged.
+
+    first: line to write on opening, if not empty.
+    Raises OSError if the file cannot be opened, or ``first`` not be written.
     """
 
     def __init__(self, path: Path, first: str = "") -> None:
@@ -152,7 +156,7 @@ class Lines:
             raise OSError(f"{path}: its first line cannot be written; is the disk full?")
 
     def write(self, line: str) -> bool:
-        """Append ``line`` (without its newline); False if it is lost, or the file is closed."""
+        """Append ``line`` and a newline. False if the line was lost or the file is closed."""
         with self._lock:
             if self._fd < 0:
                 return False
@@ -190,7 +194,7 @@ class ReplacedJson:
         self._data: Any = None
 
     def read(self) -> Any:
-        """Its newest readable content, None before the first; parsed again only if the file has changed."""
+        """The newest content that could be read, None before the first. Parses only if the file changed."""
         try:
             modified_ns = self._path.stat().st_mtime_ns
             if modified_ns != self._modified_ns:

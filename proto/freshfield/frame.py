@@ -1,6 +1,6 @@
-"""A frame in Python, its conversion to and from the wire message, and every stateless check of it.
+"""The frame in Python, its conversion to and from the wire message, and all stateless checks.
 
-The edge's ingest checks what needs memory: the order of sequence numbers, and clocks.
+Checks that need state (sequence numbers, clocks) are made by the edge's ingest.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PACKED = struct.Struct("<QqqqqIIII7d8d")
 
 
 class FrameRejected(ValueError):
-    """A frame that is refused on arrival. reason: the name that is counted; the message is for people."""
+    """A frame that is refused on arrival. reason: short name, for the counts; the message is for people."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -38,10 +38,13 @@ class FrameRejected(ValueError):
 class Frame:
     """One captured image with its pose.
 
+    camera, session: ids of the camera and of its node's run. sequence: number of the frame in the session.
     generated_ns: capture time on the node's clock.
-    clock_offset_ns, clock_uncertainty_ns: edge clock minus node clock, as the node estimates it.
-    pose_gap_ns: between the capture and the pose sample it was paired with.
+    codec: of CODEC_NAMES' values. payload: the encoded image.
     held_out: never trained on; fidelity is measured against it.
+    clock_offset_ns: edge clock minus node clock, as the node estimates it.
+    clock_uncertainty_ns: bound of the estimate's error.
+    pose_gap_ns: time between the capture and the pose sample that it was paired with.
     """
 
     camera: str
@@ -65,13 +68,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class BufferedFrame:
-    """A frame as the edge's buffer has it. generated_ns is on the edge's clock (the node's offset added)."""
+    """A frame in the edge's buffer. generated_ns, received_ns: capture and arrival on the edge's clock."""
 
     frame: Frame
     generated_ns: int
     received_ns: int
 
     def age_ms(self, now_ns: int) -> float:
+        """Time since the capture. now_ns: on the edge's clock."""
         return (now_ns - self.generated_ns) / 1e6
 
 
@@ -81,8 +85,11 @@ def valid_id(text: str) -> bool:
 
 
 def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, str]:
-    """Camera and session under which a refused frame is counted and written down: ``?`` for what is not an
-    id, and together for all who are not one of ``cameras``, because counts of made-up ids would stay."""
+    """Camera and session under which a refused frame is counted and logged.
+
+    Both are ``?`` for a camera that is not one of ``cameras``, since counts of made-up ids would pile up; the
+    session is ``?`` if it is not a valid id.
+    """
     camera, session = header.camera_id, header.session_id
     if camera not in cameras:
         return OTHER, OTHER
@@ -90,8 +97,8 @@ def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, s
 
 
 def checksum(header: pb.FrameHeader, data: bytes) -> int:
-    """CRC32C over the header's fields, packed in a fixed order, and the payload: a flipped bit must not turn
-    into a wrong pose."""
+    """CRC32C over the header's fields, packed in a fixed order, and the payload ``data``. It covers the
+    header because a flipped bit must not become a wrong pose."""
     p, k = header.pose, header.intrinsics
     packed = _PACKED.pack(
         header.sequence, header.generated_ns, header.clock_offset_ns, header.clock_uncertainty_ns,
@@ -128,14 +135,14 @@ def to_request(frame: Frame) -> pb.PushRequest:
 
 
 def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
-    """Pose and lens of a header, bit for bit and unchecked, for whoever sends them again."""
+    """Pose and intrinsics of a header, bit for bit and unchecked, for sending them again."""
     p, k = h.pose, h.intrinsics
     lens = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
     return Pose((p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)), lens
 
 
 def parse(raw: bytes) -> pb.PushRequest:
-    """The message in ``raw``. Raises FrameRejected with reason unparsable."""
+    """Parse a wire message. Raises FrameRejected with reason unparsable."""
     try:
         return pb.PushRequest.FromString(raw)
     except DecodeError:

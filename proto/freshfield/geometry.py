@@ -111,7 +111,7 @@ def slerp(a: ArrayLike, b: ArrayLike, fraction: float) -> Array:
 
 
 def so3_exp(omega: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
     w = np.asarray(omega, dtype=np.float64)
     angle = float(np.linalg.norm(w))
     k = cross_matrix(w)
@@ -141,7 +141,7 @@ def se3_inverse(transform: ArrayLike) -> Array:
 
 
 def cross_matrix(w: Array) -> Array:
-    """The matrix (3, 3) whose product with a vector is the cross product of ``w`` (3,) with it."""
+    """The skew-symmetric matrix (3, 3) of ``w`` (3,): its product with v is the cross product of w and v."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
@@ -178,7 +178,8 @@ class Pose:
         return out
 
     def interpolate(self, other: Pose, fraction: float) -> Pose:
-        """Pose at ``fraction`` of the way: slerp and a straight line, on SO(3) x R^3."""
+        """Pose at ``fraction`` (0 to 1) of the way to ``other``: slerp for the rotation, a straight line for
+        the translation."""
         q = slerp(self.quaternion, other.quaternion, fraction)
         a, b = np.array(self.translation_m), np.array(other.translation_m)
         t = (1 - fraction) * a + fraction * b
@@ -186,7 +187,11 @@ class Pose:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Camera-to-world (4, 4) at ``eye`` looking at ``target``; image-up is as near to ``up`` as possible."""
+    """Camera-to-world matrix (4, 4) of a camera at ``eye`` (3,) that looks at ``target`` (3,).
+
+    up: world direction (3,) that the image's up is as near to as possible.
+    Raises GeometryError if ``eye`` and ``target`` are the same point.
+    """
     eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
     forward = target - eye
     distance = np.linalg.norm(forward)
@@ -210,7 +215,11 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Intrinsics in pixels (corner origin) with OpenCV's (k1, k2, p1, p2) distortion."""
+    """Pinhole intrinsics in pixels (corner origin).
+
+    width, height: of the image. fx, fy: focal lengths. cx, cy: principal point.
+    distortion: OpenCV's (k1, k2, p1, p2).
+    """
 
     width: int
     height: int
@@ -228,6 +237,7 @@ class Pinhole:
 
     @property
     def distorted(self) -> bool:
+        """Whether any distortion coefficient is not zero."""
         return any(c != 0.0 for c in self.distortion)
 
     def scaled(self, factor: float) -> Pinhole:
@@ -237,14 +247,17 @@ class Pinhole:
         return Pinhole(w, h, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion)
 
     def halved(self, times: int) -> Pinhole:
-        """The same camera with images of half the size, ``times`` over; odd sizes are rounded up, as
-        ``payload.decode`` does."""
+        """The same camera with image sizes halved ``times`` times; odd sizes are rounded up, as in
+        ``payload.decode``."""
         s = 0.5**times
         size = -(-self.width >> times), -(-self.height >> times)
         return Pinhole(*size, self.fx * s, self.fy * s, self.cx * s, self.cy * s, self.distortion)
 
     def rays(self, pixels: ArrayLike | None = None) -> Array:
-        """Unit ray directions in camera axes, (H, W, 3), or (N, 3) for pixel coordinates (N, 2)."""
+        """Unit ray directions in camera axes.
+
+        pixels: coordinates (N, 2), which give (N, 3); None: the centers of all pixels, which give (H, W, 3).
+        """
         if pixels is None:
             u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         else:
@@ -257,7 +270,7 @@ class Pinhole:
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) in camera axes; NaN for points not in front."""
+        """Pixels (..., 2) of points (..., 3) in camera axes; NaN for points that are not in front."""
         p = np.asarray(points, dtype=np.float64)
         z = np.where(p[..., 2] > 1e-9, p[..., 2], np.nan)
         x, y = p[..., 0] / z, p[..., 1] / z
@@ -296,11 +309,12 @@ def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Arra
 _RASTER_POINTS = 33  # points a side at which a lens is checked
 
 
-# Every frame of a camera has the same lens. The cache is bounded, because hostile frames may not.
+# All frames of a camera have the same lens; the cache is bounded because a hostile sender's may differ.
 @lru_cache(maxsize=1024)
 def invertible(camera: Pinhole) -> bool:
-    """Whether undistortion and projection bring the pixels of a raster over the whole image, its edges
-    included, back to where they were. Undistortion diverges for coefficients that no lens has."""
+    """Whether the lens model can be inverted: undistortion followed by projection returns each point of a
+    grid over the whole image, edges included, within MAX_LENS_ERROR_PX. Undistortion diverges for
+    coefficients that no real lens has."""
     if not camera.distorted:
         return True
     u, v = np.meshgrid(

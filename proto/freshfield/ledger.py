@@ -1,23 +1,31 @@
-"""What happened to each frame: one append-only file per process instance.
+"""The ledger: what happened to each frame, in one append-only file per process instance.
 
-Every event is one ``write`` of one line, which survives SIGKILL; at worst the last line is torn (it has no
-newline), and readers drop it. Lines are tab-separated::
+Every event is one ``write`` of one line, which survives SIGKILL; at worst the last line is incomplete (it has
+no newline), and readers drop it. Lines are tab-separated::
 
     t_ns  camera  session  sequence  event  detail
 
-``t_ns`` is the writing process's clock. File: ``OUT/ledger-<role>-<name>-<start_ns>.tsv``, first line
-``#freshfield-ledger 1 <role> <name> <pid>``; roles are ``node``, ``emulator``, ``edge``. A clean exit
-writes the event ``closed`` with empty camera, and as detail how many lines were lost to a full disk, if any;
-``lost_lines``, with a count as detail and empty camera, stands where lines are missing.
+``t_ns`` is on the writing process's clock. The file is ``OUT/ledger-<role>-<name>-<start_ns>.tsv``, its first
+line ``#freshfield-ledger 1 <role> <name> <pid>``; roles are ``node``, ``emulator``, ``edge``.
 
-Events. Node: ``captured``; then ``replaced`` (a newer frame took its place before it was sent) or ``sent``
-(handed to the stream), or ``waiting`` (for its turn when the node ended in order);
-``broken`` (its stream ended before the frame was acknowledged: it may or may not have arrived, what later
-processes wrote decides); ``answered`` with the outcome as detail. Emulator: ``received``; then one of
-``skipped``, ``dropped_busy``, ``superseded``, ``lost``, ``rejected`` (detail: reason), ``forwarded`` (handed
-to the upstream stream; a second ``forwarded`` is a duplicate's copy, announced by ``duplicated``),
-``broken`` (upstream was gone), ``in_flight`` (inside the link when the emulator ended in order).
-Edge: ``delivered`` or ``rejected`` (detail: reason), once per arriving copy.
+Events without a camera: ``closed`` at a clean exit (detail: number of lines lost to a full disk, if any), and
+``lost_lines`` where lines are missing (detail: their number).
+
+Events of a node:
+
+- ``captured``, then one of ``replaced`` (by a newer frame, before it was sent), ``sent`` (handed to the
+  stream) or ``waiting`` (not sent yet when the node exited cleanly);
+- after ``sent``: ``answered`` (detail: the outcome) or ``broken`` (the stream ended before an answer; the
+  ledgers of later processes tell whether the frame arrived).
+
+Events of the emulator:
+
+- ``received``, then one of ``skipped``, ``dropped_busy``, ``superseded``, ``lost``, ``rejected`` (detail:
+  reason), ``forwarded`` (handed to the upstream stream), ``broken`` (upstream was gone) or ``in_flight``
+  (inside the link when the emulator exited cleanly);
+- ``duplicated`` announces a second ``forwarded`` of the same frame.
+
+Events of the edge: ``delivered`` or ``rejected`` (detail: reason), once per arriving copy.
 """
 
 from __future__ import annotations
@@ -33,13 +41,13 @@ from freshfield.files import Lines
 
 VERSION = 1
 ROLES = ("node", "emulator", "edge")
-# The last event is searched for in the end of the file: thousands of lines.
+# The last event is searched for in this much of the file's end: many lines.
 _TAIL_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 12
 
 
 class Event(NamedTuple):
-    """One line. t_ns: the writing process's clock."""
+    """One line. t_ns: on the writing process's clock."""
 
     t_ns: int
     camera: str
@@ -52,8 +60,12 @@ class Event(NamedTuple):
 class Ledger:
     """Writes the events of one process. Thread-safe: each event is a single O_APPEND write.
 
-    Lines lost to a full disk are counted in ``lines_lost``, and the ledger says so as soon as there is space
-    again. OSError where the file cannot be begun.
+    Lines lost to a full disk are counted in ``lines_lost`` and reported in the ledger once it can be written
+    again.
+
+    out: folder, created if missing. role: of ROLES. name: of the process, part of the file's name.
+    start_ns: start of the process on its clock.
+    Raises ValueError for another role, OSError if the file cannot be created.
     """
 
     def __init__(self, out: Path, role: str, name: str, start_ns: int) -> None:
@@ -92,10 +104,10 @@ class Ledger:
 
 
 class LedgerReader:
-    """One ledger. Iterating, once or again, reads a line at a time, so that its length takes no memory.
+    """Reads one ledger. Each iteration reads the file again, line by line, in constant memory.
 
-    torn: how many lines the last iteration left out because they could not be read. unfinished: whether one
-        of them was the last, without its newline: what a process that was killed had begun to write.
+    torn: number of invalid lines that the last iteration skipped.
+    unfinished: whether the last line was one of them, without its newline: a killed process had begun it.
     Raises ValueError if the file is not a ledger of this version, OSError if it cannot be read.
     """
 
@@ -133,7 +145,7 @@ class LedgerReader:
         return tuple(self)
 
     def last(self) -> Event | None:
-        """The last event that can be read, found without reading the whole file."""
+        """The last valid event, found in the file's end; None if there is none."""
         with self.path.open("rb") as file:
             end = file.seek(0, 2)
             start = max(self._body, end - _TAIL_BYTES)
@@ -144,19 +156,19 @@ class LedgerReader:
 
     @property
     def complete(self) -> bool:
-        """Whether the process ended in order and lost no line: what is not written here did not happen."""
+        """Whether the process exited cleanly and lost no line, so that missing events did not happen."""
         last = self.last()
         return last is not None and last.event == "closed" and not last.detail
 
     @property
     def closed(self) -> bool:
-        """Whether the process ended in order."""
+        """Whether the process exited cleanly."""
         last = self.last()
         return last is not None and last.event == "closed"
 
 
 def read_all(out: Path) -> list[LedgerReader]:
-    """Every ledger in ``out`` (not in its folders), in the order of their names."""
+    """Every ledger directly in the folder ``out``, sorted by name. Raises as ``LedgerReader``."""
     return [LedgerReader(path) for path in sorted(out.glob("ledger-*.tsv"))]
 
 

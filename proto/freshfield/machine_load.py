@@ -1,6 +1,6 @@
-"""How busy a machine is: what this process uses, what another one uses, and what others keep busy.
+"""Processor and memory use of this process, of another one, and of the whole machine.
 
-Everything comes from /proc; a value that the system does not tell is None, never a guess.
+Values come from /proc; what the system does not tell is None, never a guess.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ _PROC = Path("/proc")
 
 
 class LoadMeter:
-    """Cores that this process and the whole machine used since the last call of ``row`` or ``outside_cores``.
+    """Measures the cores that this process and the whole machine used since the last call of ``row`` or
+    ``outside_cores``.
 
-    name: what rows call this process.
+    name: key of this process in the rows.
     """
 
     def __init__(self, name: str = "bench") -> None:
@@ -27,7 +28,10 @@ class LoadMeter:
         self._last = (time.perf_counter(), _own_s(), _busy_s())
 
     def row(self, t_s: float) -> dict[str, Any]:
-        """A line of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, "machine": {"cpu"}}``."""
+        """A row of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, "machine": {"cpu"}}``.
+
+        t_s: time of the row. ``cpu`` is in cores; ``machine`` is missing if the system does not tell.
+        """
         now = (time.perf_counter(), _own_s(), _busy_s())
         (then_s, own_then, busy_then), self._last = self._last, now
         wall = max(now[0] - then_s, 1e-6)
@@ -44,23 +48,21 @@ class LoadMeter:
         return row
 
     def outside_cores(self) -> float | None:
-        """Cores that others kept busy."""
+        """Cores that other processes kept busy; None if unknown."""
         return outside_cores(self.row(0.0))
 
 
 def outside_cores(row: Mapping[str, Any]) -> float | None:
-    """Cores that others kept busy: what a row's machine used minus what its processes used."""
+    """Cores that other processes kept busy: the row's machine minus the row's processes; None if unknown."""
     found = _outside(row)
     return None if found is None else round(found, 2)
 
 
 def outside_load(processes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """How many cores others kept busy during a whole run.
+    """Load of a whole run. processes: rows of ``processes.jsonl``.
 
-    processes: rows of ``processes.jsonl``.
-
-    Returns {cores, ours, method}. ``cores`` is the median of ``outside_cores`` over the rows that say what
-    the machine used, None where none does.
+    Returns {cores, ours, method}: the medians over the rows of the cores used by other processes (None if no
+    row has the machine's use) and by the run's own, and how ``cores`` was measured.
     """
     ours = [_ours(row) for row in processes]
     others = [cores for row in processes if (cores := _outside(row)) is not None]
@@ -77,7 +79,7 @@ def usable_cores() -> int:
 
 
 def rss_mb(pid: int | str = "self") -> float | None:
-    """Resident memory of a process in MB (10^6 bytes)."""
+    """Resident memory of a process in MB (10^6 bytes); None if it cannot be read."""
     try:
         pages = int((_PROC / str(pid) / "statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):
@@ -92,14 +94,14 @@ def peak_rss_mb() -> float:
         return round(int(line.split()[1]) * 1024 / 1e6, 1)
     except (OSError, ValueError, IndexError, StopIteration):
         pass
-    # The second choice only: on Linux a process inherits this value from the one that starts it.
+    # Only the fallback: on Linux a process inherits this value from its parent.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # Linux counts kibibytes, macOS bytes.
     return round(peak * (1 if os.uname().sysname == "Darwin" else 1024) / 1e6, 1)
 
 
 def cpu_s(pid: int) -> float | None:
-    """Processor time that a process has used, in core-seconds."""
+    """Processor time that a process has used, in core-seconds; None if it cannot be read."""
     try:
         words = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
         return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
@@ -108,8 +110,8 @@ def cpu_s(pid: int) -> float | None:
 
 
 def machine_ticks() -> list[int] | None:
-    """Processor time of the whole machine since it started, in ticks: user, nice, system, idle, iowait, irq,
-    softirq, steal. Guest time is within user already."""
+    """Processor time of the whole machine since boot, in clock ticks: user (which includes guest), nice,
+    system, idle, iowait, irq, softirq, steal; None if it cannot be read."""
     try:
         return [int(word) for word in (_PROC / "stat").read_text().split("\n", 1)[0].split()[1:9]]
     except (OSError, ValueError, IndexError):

@@ -1,8 +1,8 @@
 """Encode images into payloads and decode them again.
 
-The limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels,
-OpenCV allocates as many bytes as a PNG's chunk claims (one flipped bit: 4 GB, 5 s), and a zstandard frame
-that declares its size ignores ``max_output_size``.
+The limits are checked on headers *before* anything is decompressed: a 109 kB PNG can claim 2.7 GB of pixels,
+OpenCV allocates as many bytes as a PNG's chunk claims (one flipped bit: 4 GB, 5 s), and the zstandard decoder
+ignores ``max_output_size`` for a frame that declares its size.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ import zstandard
 from numpy.typing import NDArray
 
 CODECS = ("jpeg", "png", "zstd")
-# By the number of halvings.
+# Indexed by the number of halvings.
 _JPEG_FLAGS = (
     cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8
 )  # fmt: skip
 
 
 class PayloadError(ValueError):
-    """A payload that is refused. reason: the short name that is counted; the message is for people."""
+    """A payload that is refused. reason: short name, for the counts; the message is for people."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -46,8 +46,8 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
 
     image: uint8 RGB (H, W, 3) or RGBA (H, W, 4).
     codec: ``jpeg`` (RGB), ``png`` (lossless, keeps alpha) or ``zstd`` (raw RGB, lossless).
-    quality: of jpeg, 1..100; from 90 up the color is not subsampled.
-    Raises PayloadError for a shape or codec that cannot be sent.
+    quality: of jpeg, 1 to 100; from 90 up without chroma subsampling.
+    Raises PayloadError for an image, size or codec that cannot be sent.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise PayloadError("bad_image", f"expected uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")
@@ -74,8 +74,8 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
 
 
 def check(payload: bytes, codec: str, width: int, height: int) -> None:
-    """Refuse, without decoding, what must not be decoded. Takes microseconds, for the
-    largest payload some milliseconds.
+    """Refuse a payload that must not be decoded, by its headers only. Takes microseconds, for the largest
+    payload some milliseconds.
 
     Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (not this format, a PNG that ends
     early, or a JPEG of too many segments), ``too_many_scans`` (of a JPEG), or ``size_mismatch`` (the image is
@@ -108,12 +108,12 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
 
 
 def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 0) -> NDArray[np.uint8]:
-    """Decode a payload to uint8 RGB (H, W, 3) or RGBA (H, W, 4), after ``check``.
+    """Check a payload (``check``) and decode it to uint8 RGB (H, W, 3) or RGBA (H, W, 4).
 
-    halvings: 0 to 3, how often width and height are halved, rounded up; the last row and column are repeated
-        where they are odd. A JPEG is decoded to the smaller size at once, in less time.
-
-    Raises PayloadError: those of ``check``, and ``undecodable`` for damaged data.
+    width, height: announced size, before halving.
+    halvings: 0 to 3, how often both sides are halved and rounded up; an odd side repeats its last row or
+        column. A JPEG is decoded directly to the smaller size, which is faster.
+    Raises PayloadError with a reason of ``check``, or ``undecodable`` for damaged data.
     """
     check(payload, codec, width, height)
     if codec == "zstd":
@@ -152,7 +152,7 @@ def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header; None unless every chunk up to the last lies within the data."""
+    """Width and height in the header; None unless all chunks up to the last lie within the data."""
     if len(data) < 33 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
         return None
     at, width, height = 8, *struct.unpack(">II", data[16:24])
@@ -169,14 +169,14 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_scans(data: bytes) -> int:
-    """Number of scans: their marker never stands for data within a scan. A thumbnail in a header adds its
-    own. Both alignments are counted as words, because ``bytes.count`` takes 35 ms for 8 MB of 0xFF."""
+    """Number of start-of-scan markers, which cannot occur as data within a scan; a thumbnail in a header adds
+    its own. Counted as 16-bit words in both alignments: ``bytes.count`` takes 35 ms for 8 MB of 0xFF."""
     words = (np.frombuffer(data, "<u2", (len(data) - start) // 2, start) for start in (0, 1))
     return sum(int(np.count_nonzero(part == 0xDAFF)) for part in words)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the start-of-frame segment; None unless exactly one stands before the scan."""
+    """Width and height in the start-of-frame segment; None unless exactly one precedes the first scan."""
     if data[:2] != b"\xff\xd8":
         return None
     at, size = 2, None

@@ -1,4 +1,4 @@
-"""Reads a scenario file: who takes part, the seed, and one section for each package to interpret.
+"""Reads a scenario file: the cameras, the seed, and one section for each package to interpret.
 
 The file is YAML::
 
@@ -10,8 +10,8 @@ The file is YAML::
     channel: {...}     # channel_emu.model.config
     edge:    {...}     # edge_server.config
 
-``read_section`` turns a mapping into a dataclass and refuses, in one line naming file, key and what was
-expected, every unknown key, wrong type or value out of range.
+``read_section`` turns a mapping into a dataclass. It refuses unknown keys, wrong types and values out of
+range, with one line that names the file, the key and what was expected.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from freshfield.limits import MAX_CAMERAS, MAX_ERROR_CHARS, MAX_IMAGE_SIDE_PX
 from freshfield.untrusted import UntrustedError, read_yaml
 
 PHASES = ("locked", "spread")
-# What every fidelity of a run without held-out cameras is called: on page, report, console and in metrics.
+# Label of every fidelity of a run without held-out cameras: on page, report, console and in metrics.
 NOTHING_HELD_OUT = "training views, nothing is held out"
 T = TypeVar("T")
 _HERE = Path(__file__).resolve()
 _CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"
 SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios"
-"""The shipped scenarios: of the checkout, or those that an installed wheel carries."""
+"""Folder of the shipped scenarios: in the checkout, else in the installed wheel."""
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot run. The message is one line, cut short: file, key, what was expected."""
+    """An invalid scenario. The message is one line (file, key, what was expected), truncated if too long."""
 
     def __init__(self, message: str) -> None:
         super().__init__(message if len(message) <= MAX_ERROR_CHARS else f"{message[:MAX_ERROR_CHARS]} ...")
@@ -52,10 +52,11 @@ class ScenarioError(ValueError):
 class Cameras:
     """The section ``cameras``.
 
-    count: of cameras, named cam00, cam01, ...; ids: their names instead.
-    held_out: those never trained on.
-    phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as the thesis's do;
-        ``spread``: each at its own seeded phase, as cameras without a common trigger do.
+    count: number of cameras, named cam00, cam01, ...
+    ids: names of the cameras, instead of ``count``.
+    held_out: names of the cameras that are never trained on.
+    phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as in the thesis;
+        ``spread``: each at its own seeded phase, like cameras without a common trigger.
     """
 
     count: int = 0
@@ -66,7 +67,8 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A parsed scenario file. The sections stay mappings until their package reads them."""
+    """A parsed scenario file. The sections source, channel and edge stay mappings until their package reads
+    them."""
 
     path: Path
     name: str
@@ -81,12 +83,14 @@ class Scenario:
 
     @property
     def training(self) -> tuple[str, ...]:
+        """The cameras that are not held out."""
         return tuple(c for c in self.cameras if c not in self.held_out)
 
     @property
     def max_side_px(self) -> int:
-        """The largest image side that its cameras send: of the source's width and height, where it has both,
-        else whatever is accepted at all. A camera that cannot do the size asked for sends its own."""
+        """Bound on the image sides that the cameras send: the larger of the source's width and height if both
+        are given, else MAX_IMAGE_SIDE_PX. It is that, too, for kind ``camera``, because a camera that does
+        not support the given size sends its own."""
         if self.source.get("kind") == "camera":
             return MAX_IMAGE_SIDE_PX
         sides = [self.source.get(name) for name in ("width", "height")]
@@ -94,18 +98,19 @@ class Scenario:
         return max(whole) if len(whole) == len(sides) else MAX_IMAGE_SIDE_PX
 
     def phase_ns(self, camera: str, fps: float) -> int:
-        """How much later than the ticks of its rate a camera captures (``cameras.phase``)."""
+        """Delay of a camera's captures after the multiples of 1 / ``fps``, below 1 / ``fps``; see
+        ``cameras.phase``."""
         return 0 if self.phase == "locked" else int(self.rng("phase", camera).random() * 1e9 / fps)
 
     def rng(self, purpose: str, camera: str | None = None) -> np.random.Generator:
-        """The random stream of a purpose and camera. Streams are independent: adding a camera does not change
-        those of the others."""
+        """The random stream of a purpose and camera. Streams are independent, so adding a camera does not
+        change those of the others."""
         return np.random.default_rng(seed_sequence(self.seed, purpose, camera or ""))
 
 
 def seed_sequence(seed: int, purpose: str, camera: str = "") -> np.random.SeedSequence:
-    """The seeds of one camera's random stream for one purpose. It depends on the camera's name, not on its
-    place in a list, so cameras are independent of each other."""
+    """Seed sequence of one camera's random stream for one purpose. It depends on the camera's name, not on
+    its place in a list, so cameras are independent of each other."""
     words = [seed & 0xFFFFFFFF, seed >> 32]
     for text in (purpose, camera):
         data = text.encode()
@@ -116,8 +121,8 @@ def seed_sequence(seed: int, purpose: str, camera: str = "") -> np.random.SeedSe
 def load(path: str | Path, seed: int | None = None) -> Scenario:
     """Read and check a scenario file.
 
-    path: of the file, or the name of a shipped one, such as ``room``.
-    seed: instead of the file's.
+    path: the file, or the name of a shipped scenario, such as ``room``.
+    seed: replaces the file's seed.
     Raises ScenarioError.
     """
     file = Path(path)
@@ -136,7 +141,11 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
 
 
 def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
-    """Check a scenario's mapping. file: named in errors. Raises ScenarioError."""
+    """Check a scenario's mapping.
+
+    data: the value of the YAML document. file: named in errors. seed: replaces that of ``data``.
+    Raises ScenarioError.
+    """
     known = ("name", "description", "seed", "cameras", "source", "channel", "edge")
     if not isinstance(data, dict):
         raise ScenarioError(f"{file}: expected a mapping with the keys {', '.join(known)}")
@@ -180,17 +189,17 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
 def read_section(cls: type[T], mapping: Any, where: str) -> T:
     """Build a dataclass from a mapping, strictly by its annotations.
 
-    cls: its fields are int, float, bool, str, Path, list, dict, tuple, unions with None, or dataclasses.
-    mapping: what was read. A float field takes any finite number, an int field no float.
-    where: file and key, with which every error begins.
-    Raises ScenarioError. The dataclass checks its own ranges: a ValueError of its ``__post_init__`` becomes a
-    ScenarioError.
+    cls: dataclass with fields of int, float, bool, str, Path, list, dict, tuple, dataclasses, or unions of
+        them with None. A float field takes any finite number, an int field no float.
+    mapping: the value read from the file.
+    where: file and key, the beginning of every error.
+    Raises ScenarioError, also for a ValueError of the dataclass's ``__post_init__``, which checks ranges.
     """
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
     hints = typing.get_type_hints(cls)
     given = sorted(dataclasses.fields(cls), key=lambda f: bool(f.kw_only))  # type: ignore[arg-type]
-    fields = {f.name: f for f in given if f.init}  # as messages list them: what a base adds comes last
+    fields = {f.name: f for f in given if f.init}  # in the order of messages: keyword-only fields come last
     _refuse_unknown(mapping, tuple(fields), f"{where}.")
     values = {key: _convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
     for name, spec in fields.items():

@@ -1,4 +1,4 @@
-"""The streams that a server has open: which one ends for a new one, and to which one a session belongs."""
+"""The open streams of a server: which one is ended to admit a new one, and which one owns a session."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from freshfield.access import caller
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 
-# How long a call that is to end waits for the client to take the answer under way.
+# How long ``end`` waits for the client to take an answer that is being written.
 _TAKEN_S = 0.5
 
 
 async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> health.aio.HealthServicer:
-    """Add health checks, which say that ``services`` are served, and reflection of them. Before the start."""
+    """Add the health service, which reports ``services`` as serving, and reflection. Call before the server
+    starts."""
     checks = health.aio.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(checks, server)
     reflection.enable_server_reflection((*services, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
@@ -32,7 +33,10 @@ async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> heal
 
 
 class ServedCall:
-    """``async with`` around the handling of a call: ``end`` ends it from outside. open: until then."""
+    """Async context around the handling of a call, which ``end`` can end from another task.
+
+    open: whether the context has not been left yet.
+    """
 
     def __init__(self, context: grpc.aio.ServicerContext) -> None:
         task = asyncio.current_task()
@@ -45,7 +49,8 @@ class ServedCall:
         self._writing = False
 
     def end(self, code: grpc.StatusCode, why: str) -> None:
-        """The client is given ``code`` and ``why``, unless it leaves an answer untaken for _TAKEN_S."""
+        """End the call. The client receives ``code`` and ``why``, unless an answer that is being written is
+        not taken within _TAKEN_S."""
         self._status = code, why
         if self._writing:
             asyncio.get_running_loop().call_later(_TAKEN_S, self._cancel)
@@ -53,7 +58,7 @@ class ServedCall:
             self.task.cancel()
 
     async def write(self, answer: Any) -> None:
-        """Send an answer. A call that ends in the midst of it could not say why: ``end`` waits for it."""
+        """Send an answer. ``end`` waits for it: a call cancelled during a write cannot send a status."""
         self._writing = True
         await self._context.write(answer)
         self._writing = False
@@ -71,17 +76,17 @@ class ServedCall:
         self.open = False
         if self._status is not None and kind is asyncio.CancelledError:
             self.task.uncancel()
-            # An answer that the client does not take leaves gRPC no way to say why the call ends.
+            # While the client leaves an answer untaken, gRPC cannot send the status.
             with contextlib.suppress(grpc.aio.InternalError):
                 await self._context.abort(*self._status)
 
 
 class OpenStreams:
-    """At most ``most`` streams at once. A new one always finds a place, so that whoever opens streams and
-    says nothing shuts nobody out: one that never was of use ends for it, the oldest first, or else the one
-    whose last use is longest ago.
+    """Admits at most ``most`` streams at once. A new stream is always admitted, so a client that opens idle
+    streams cannot shut others out. To make room, the oldest stream that was never used is ended, or else the
+    least recently used one.
 
-    ended: number of streams that ended so.
+    ended: number of streams ended to make room.
     """
 
     def __init__(self, most: int) -> None:
@@ -92,7 +97,7 @@ class OpenStreams:
 
     @contextlib.asynccontextmanager
     async def open(self, context: grpc.aio.ServicerContext) -> AsyncIterator[ServedCall]:
-        """The call, for as long as it has its place."""
+        """Admit the call of ``context`` and hold its place within the ``async with`` block."""
         if len(self._silent) + len(self._used) >= self._most:
             longest_idle, _ = (self._silent or self._used).popitem(last=False)
             longest_idle.end(grpc.StatusCode.RESOURCE_EXHAUSTED, "ended for a new stream: too many are open")
@@ -106,7 +111,7 @@ class OpenStreams:
                 self._used.pop(call, None)
 
     def use(self, call: ServedCall) -> None:
-        """The stream was of use: it carried a frame that was taken."""
+        """Mark a stream as used: it carried a frame that was accepted."""
         if call.open and (call in self._silent or call in self._used):
             self._silent.pop(call, None)
             self._used[call] = None
@@ -114,15 +119,18 @@ class OpenStreams:
 
 
 class SessionStreams:
-    """Which stream sends a session of each camera. Another one may go on with it when that one is closed or
-    has been silent for a while: it cannot, in the midst of a session, use up the sequence numbers."""
+    """Knows which stream sends each session of each camera. Another stream may continue the session only
+    after the owner closed or was silent for SESSION_IDLE_NS; otherwise it could use up sequence numbers in
+    the middle of a session."""
 
     def __init__(self, cameras: Iterable[str]) -> None:
         self._sent: dict[str, OrderedDict[str, tuple[ServedCall, int]]] = {c: OrderedDict() for c in cameras}
 
     def claim(self, camera: str, session: str, call: ServedCall, now_ns: int) -> None:
-        """A frame of ``session`` came on the stream ``call``. Raises FrameRejected: forbidden_camera,
-        session_in_use."""
+        """Record that a frame of ``session`` came on the stream ``call``.
+
+        Raises FrameRejected with reason forbidden_camera (the caller may not push it) or session_in_use.
+        """
         if not call.caller.may_push(camera):
             raise FrameRejected("forbidden_camera", f"this credential is not one of camera {camera}")
         sessions = self._sent[camera]

@@ -1,7 +1,8 @@
 """gRPC channels and servers as every process of the project opens them: limits, keepalive, TLS, tokens.
 
-``grpc.http2.bdp_probe=0``: with bandwidth probing on, a stalled reader lets a client queue megabytes of
-frames, which is age. Keepalive is set at both ends, because servers punish pings they did not agree to.
+``grpc.http2.bdp_probe=0``: with bandwidth probing, a client can queue megabytes of frames behind a stalled
+reader, which makes them old. Keepalive is set at both ends, because servers close connections whose pings
+they did not agree to.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _COMMON: list[tuple[str, Any]] = [
 ]
 CLIENT_OPTIONS = [
     *_COMMON,
-    # Senders pause by ``backoff_s``; gRPC's own back-off would add up to two minutes on top.
+    # Senders pause by ``backoff_s``; gRPC's own back-off would add up to two minutes.
     ("grpc.initial_reconnect_backoff_ms", 200),
     ("grpc.min_reconnect_backoff_ms", 200),
     ("grpc.max_reconnect_backoff_ms", 1_000),
@@ -53,8 +54,8 @@ CLIENT_OPTIONS = [
 SERVER_OPTIONS = [
     *_COMMON,
     # Without bandwidth probing the window stays at 64 kB, and a receiver that is not scheduled for a moment
-    # blocks every camera on the connection (p99 of the emulator's delay error 10 to 35 ms instead of 1). What
-    # may queue is bounded by the credits, not by this.
+    # blocks every camera on the connection (p99 of the emulator's delay error 10 to 35 ms instead of 1).
+    # Queueing is bounded by the streams' credits, not by this window.
     ("grpc.http2.lookahead_bytes", 1 << 20),
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
     ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
@@ -67,17 +68,17 @@ SERVER_OPTIONS = [
 
 
 def backoff_s(failures: int, first_s: float, max_s: float, jitter: np.random.Generator) -> float:
-    """Pause (seconds) before a stream is opened again: doubled with every failure, times 0.5 to 1.
+    """Pause in seconds before a stream is opened again: doubled with every failure, times 0.5 to 1.
 
     failures: failed attempts since the stream last worked, from 0.
-    first_s, max_s: pause before jitter at 0 failures, and its bound.
-    jitter: one draw is taken, so that the cameras do not all come back at once.
+    first_s: pause at 0 failures, before jitter. max_s: largest pause, before jitter.
+    jitter: source of the factor, so that the cameras do not all reconnect at once.
     """
     return min(first_s * 2.0 ** min(failures, 60), max_s) * float(jitter.uniform(0.5, 1.0))
 
 
 def peer_text(text: str | None) -> str:
-    """What a peer said, for a log: on one line, without the characters that command a terminal, cut short."""
+    """A peer's text made safe for a log: one line, control characters escaped, truncated."""
     return repr((text or "")[:MAX_PEER_TEXT_CHARS])[1:-1]
 
 
@@ -86,11 +87,14 @@ class TransportError(ValueError):
 
 
 def host_port(text: str) -> tuple[str, int]:
-    """Host and port (0 to 65535) of ``HOST:PORT``; an IPv6 host stands in brackets and keeps them, no host
-    means 127.0.0.1. Raises TransportError naming what was expected."""
+    """Parse ``HOST:PORT`` with a port from 0 to 65535.
+
+    An IPv6 host is given in brackets and returned with them; no host means 127.0.0.1.
+    Raises TransportError.
+    """
     host, colon, port = text.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
-    # isdigit alone lets superscripts pass, and a long enough number is an error of its own for int().
+    # isdigit alone accepts superscripts, and int() raises its own error for a very long number.
     numeric = port.isascii() and port.isdigit() and len(port) <= 5 and int(port) < 65536
     if not colon or not numeric or any(c.isspace() or c == "/" for c in host) or (":" in host) != bracketed:
         raise TransportError(f"expected HOST:PORT, such as 127.0.0.1:7001 or [::1]:7001, got {text!r}")
@@ -98,7 +102,7 @@ def host_port(text: str) -> tuple[str, int]:
 
 
 def peer(option: str, text: str) -> str:
-    """HOST:PORT of a peer to connect to, given with ``option``. Raises TransportError that names it."""
+    """Check HOST:PORT of a peer to connect to (port from 1). option: named in the TransportError raised."""
     try:
         host, port = host_port(text)
     except TransportError as error:
@@ -110,13 +114,16 @@ def peer(option: str, text: str) -> str:
 
 @dataclass(frozen=True)
 class Transport:
-    """How this process talks: files are PEM. Without ``cert`` and ``ca`` everything is plain text.
+    """Security of this process's connections. Without ``cert`` and ``ca`` everything is plain text.
 
-    cert, key: own certificate (a server needs both for TLS; a client for mutual TLS).
-    ca: trusted authority (a client uses TLS when given; a server then demands client certificates).
-    tokens: token by name of its caller (see ``access``). A server takes each of them; a client sends the
-    first, whose name it need not know ("").
-    insecure: a server may listen beyond this machine without TLS or without asking who calls.
+    cert, key: own certificate and private key, PEM files (a server needs both for TLS; a client for mutual
+        TLS).
+    ca: certificate of the trusted authority, a PEM file. A client given one uses TLS; a server given one
+        demands client certificates.
+    tokens: token by caller name (see ``access``). A server accepts all of them; a client sends the first,
+        whose name may be "".
+    insecure: a server may listen beyond this machine without TLS or authentication; a client may send its
+        token to another machine without TLS.
     """
 
     cert: Path | None = None
@@ -131,7 +138,7 @@ class Transport:
 
     @cached_property
     def access(self) -> Access:
-        """Who may do what at this server. Raises TransportError for options that a server cannot have."""
+        """Access rules of this server. Raises TransportError for options that do not suit a server."""
         if self.ca is not None and self.cert is None:
             raise TransportError("--tls-ca of a process that listens needs --tls-cert and --tls-key as well")
         try:
@@ -142,10 +149,11 @@ class Transport:
             ) from None
 
     def guard(self, host: str, what: str, http: bool = False) -> str:
-        """What is wrong with listening on ``host`` for ``what``, in words to show; empty where nothing is.
-        Raises TransportError for what is wrong if it was not asked for (``insecure``).
+        """Check that listening on ``host`` is secure: loopback, or encrypted and authenticated.
 
-        http: callers can show tokens only.
+        what: name of the service, for the message.
+        http: callers can authenticate with tokens only, not with certificates.
+        Returns "" if it is secure, else a warning if ``insecure`` is set. Raises TransportError if not.
         """
         missing = [] if self.cert else ["nothing is encrypted (--tls-cert, --tls-key)"]
         if self.access.open:
@@ -163,8 +171,8 @@ class Transport:
         return words
 
     def tls(self, host: str) -> ssl.SSLContext | None:
-        """Of an HTTP server that listens on ``host``; None on loopback or without a certificate. Raises
-        TransportError for files that are none."""
+        """TLS context of an HTTP server that listens on ``host``; None on loopback or without a certificate.
+        Raises TransportError if the files cannot be used."""
         return None if self.cert is None or is_loopback(host) else self._context()
 
     def _context(self) -> ssl.SSLContext:
@@ -176,28 +184,31 @@ class Transport:
         return context
 
     def aio_channel(self, target: str, options: list[tuple[str, Any]] = CLIENT_OPTIONS) -> grpc.aio.Channel:
-        """Client channel; must be called with an event loop running. Raises TransportError for a token that
-        would go to another machine in plain text."""
+        """Client channel to ``target`` (HOST:PORT); needs a running event loop. Raises TransportError if a
+        token would be sent to another machine in plain text."""
         credentials = self._client_credentials(target)
         if credentials is None:
             return grpc.aio.insecure_channel(target, options=options)
         return grpc.aio.secure_channel(target, credentials, options=options)
 
     def channel(self, target: str) -> grpc.Channel:
-        """Blocking client channel, for tools and tests."""
+        """Blocking client channel, for tools and tests. Raises as ``aio_channel``."""
         credentials = self._client_credentials(target)
         if credentials is None:
             return grpc.insecure_channel(target, options=CLIENT_OPTIONS)
         return grpc.secure_channel(target, credentials, options=CLIENT_OPTIONS)
 
     def aio_server(self) -> grpc.aio.Server:
-        """Server without a port; must be called with an event loop running. Raises TransportError, see
+        """Server without a port yet (see ``bind``); needs a running event loop. Raises TransportError as
         ``access``."""
         return grpc.aio.server(options=SERVER_OPTIONS, interceptors=[] if self.access.open else [self.access])
 
     def bind(self, server: grpc.aio.Server, address: str) -> int:
-        """Listen on ``host:port`` (port 0 = any) and return the port. Raises TransportError if that is no
-        address, the port is taken, the host is another machine or ``guard`` does not let it."""
+        """Listen on ``host:port`` (port 0: any free one) and return the port.
+
+        Raises TransportError if the address is invalid, the port is taken, the host is not this machine, or
+        ``guard`` refuses.
+        """
         try:
             host, number = host_port(address)
         except TransportError as error:
@@ -209,7 +220,7 @@ class Transport:
                 port = server.add_insecure_port(f"{host}:{number}")
             else:
                 port = server.add_secure_port(f"{host}:{number}", self._server_credentials())
-        except RuntimeError:  # its text speaks of gRPC's own debugging
+        except RuntimeError:  # its text is only useful for debugging gRPC
             port = 0
         if port == 0:
             raise TransportError(
@@ -235,7 +246,7 @@ class Transport:
 
 
 def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None:
-    """The security options that every process takes. listens: whether it waits for others to connect."""
+    """Add the security options that all processes share. listens: whether this one is a server."""
     group = parser.add_argument_group("security", "off unless given; the same options for every process")
     group.add_argument("--tls-cert", type=Path, metavar="PEM", help="own certificate")
     group.add_argument("--tls-key", type=Path, metavar="PEM", help="own private key")
@@ -256,7 +267,7 @@ def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None
 
 
 def from_arguments(args: argparse.Namespace) -> Transport:
-    """Transport of parsed ``add_arguments`` options. Raises TransportError for files that cannot be used."""
+    """The Transport of the options of ``add_arguments``. Raises TransportError for unusable files."""
     for path in (args.tls_cert, args.tls_key, args.tls_ca):
         if path:
             _read(path)
@@ -264,7 +275,7 @@ def from_arguments(args: argparse.Namespace) -> Transport:
         raise TransportError("--tls-cert and --tls-key go together")
     tokens = _tokens(args.token_file) if args.token_file else {}
     transport = Transport(args.tls_cert, args.tls_key, args.tls_ca, tokens, args.insecure)
-    # gRPC would say nothing of a damaged file, and try again for ever.
+    # With a damaged file gRPC would retry for ever without a message.
     if args.tls_cert:
         transport._context()
     if args.tls_ca:

@@ -1,8 +1,8 @@
-"""Files that a stranger may have written: references are followed only as far as the file's own size allows.
+"""Reads YAML and JSON files that an attacker may have written.
 
-A few hundred bytes of YAML or of a pickle can refer to themselves so often that they stand for gigabytes. An
-honest file has fewer values than bytes, however often it repeats some by reference. A key that an object has
-twice is refused: which of the two values was meant, nobody knows.
+A few hundred bytes of YAML or pickle can refer to themselves so often that they expand to gigabytes.
+Expansion is therefore bounded by the file's size: an honest file has fewer values than bytes, even with
+references. A repeated key in a mapping is refused, because either value may have been meant.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import yaml
 
 from freshfield.limits import MAX_YAML_CHARS
 
-LEAST_VALUES = 100_000  # of a YAML file, however short: anchors repeat cameras and lenses honestly
+LEAST_VALUES = 100_000  # allowed in any YAML file, however short: anchors may well repeat cameras and lenses
 
 
-MOST_NESTED = 50  # collections within one another; the parser's work grows with their number for every token
+MOST_NESTED = 50  # depth of nested collections; the parser's work for every token grows with it
 
 
 class UntrustedError(ValueError):
@@ -78,9 +78,9 @@ def _repeated(key: str) -> str:
 
 
 def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]]) -> None:
-    """Raise UntrustedError if ``value``, with every reference written out, has more than ``most`` values.
+    """Raise UntrustedError if ``value``, with every reference expanded, has more than ``most`` values.
 
-    parts(value): the values that it is directly made of.
+    parts: returns the direct children of a value.
     """
     waiting, seen = [value], 0
     while waiting:
@@ -91,13 +91,15 @@ def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]
 
 
 def stored_bytes(path: Path) -> int:
-    """Most bytes that an archive written without compression, as ours are, can hold; 0 where there is no
-    file."""
+    """Size of a file, 0 if there is none: a bound on what an uncompressed archive, as ours are, can hold."""
     return path.stat().st_size if path.is_file() else 0
 
 
 def read_yaml(text: str) -> Any:
-    """The value of a YAML document, of plain types only; references are allowed. Raises UntrustedError."""
+    """The value of a YAML document, of plain types only; references are allowed.
+
+    Raises UntrustedError if it is too long, not YAML, nested too deeply, repeats a key, or expands too far.
+    """
     if len(text) > MAX_YAML_CHARS:
         raise UntrustedError(f"not YAML: {len(text)} characters, more than {MAX_YAML_CHARS}")
     loader = None
@@ -110,7 +112,7 @@ def read_yaml(text: str) -> Any:
         return loader.construct_document(node)
     except UntrustedError:
         raise
-    # What a tag says is a number, a date or a truth value, and is none, raises nearly anything.
+    # A tag that claims a number, a date or a truth value for other text raises nearly anything.
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         raise UntrustedError(f"not YAML: {' '.join(str(error).split())}") from None
     finally:
@@ -119,7 +121,7 @@ def read_yaml(text: str) -> Any:
 
 
 def read_json(text: str) -> Any:
-    """The value of a JSON document. Raises UntrustedError."""
+    """The value of a JSON document. Raises UntrustedError if it is invalid or repeats a key."""
     try:
         return json.loads(text, object_pairs_hook=_object)
     except UntrustedError:

@@ -39,8 +39,8 @@ def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
 
 
 def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:
-    """Hand-eye calibrations of those ``cameras`` that ``config`` lists, by camera; identity where none is
-    named yet. Raises ScenarioError."""
+    """Hand-eye calibrations of those ``cameras`` that ``config`` lists, by camera; the identity for a camera
+    without a file yet. Raises ScenarioError."""
     where = f"{scenario.path}: source.arm.cameras"
     for camera in config.cameras:
         if camera not in scenario.cameras:

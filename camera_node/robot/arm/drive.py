@@ -1,7 +1,7 @@
 """``camera-node drive-arm``: moves the camera on an arm around its target, from viewpoint to viewpoint.
 
-A move is started and then polled; the library never blocks until its end. So Ctrl-C, SIGTERM, a closed
-terminal, a stalled arm, a stale state or a program stopped at the pendant end the drive, and the arm comes to
+A move is started and then polled, so the library does not block until its end. Ctrl-C, SIGTERM, a closed
+terminal, a stalled arm, a stale state or a program stopped at the pendant end the drive and bring the arm to
 rest. If this process dies, the controller's own watchdog stops the arm.
 """
 
@@ -37,7 +37,7 @@ _CONTROL_S = 8  # longest connection of the control interface
 _STOPPING_S = 5.0
 _SIMULATED_STALE_S = 10.0
 _ARRIVED_RAD = 1e-3
-# In this time even a slow arm turns farther than its encoder noise.
+# Within this time even a slow arm turns by more than its encoder noise.
 _STALLED_S, _STALLED_RAD = 5.0, 1e-3
 _POLL_S = 0.05
 _MOVED_RAD = 0.01

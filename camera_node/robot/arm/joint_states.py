@@ -1,7 +1,7 @@
 """Time-stamped joint states of an arm, through the manufacturer's Real-Time Data Exchange (4.3.3).
 
-The library keeps returning the last values after a connection is lost. So only stamps that advance count: a
-stream without a new stamp for ``STALE_S`` is closed and reconnected, with growing pauses. Until then no frame
+The library keeps returning the last values after a connection is lost, so only advancing stamps count: a
+stream without a new stamp for ``STALE_S`` is closed and reconnected, with growing pauses. Meanwhile no frame
 gets a pose.
 """
 
@@ -268,7 +268,8 @@ class HandPoses:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 
     def at(self, t_ns: int) -> tuple[Pose, int]:
-        """Raises PoseGapError where no sample is near enough."""
+        """Flange-to-world pose for an instant, and the time (ns) to the nearest sample. Raises PoseGapError
+        if none is near enough."""
         joints, gap_ns = self._stream.at(t_ns, self._wait_s)
         return Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns
 

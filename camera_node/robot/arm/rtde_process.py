@@ -3,8 +3,8 @@
     python -m camera_node.robot.arm.rtde_process HOST FREQUENCY_HZ
 
 The client library (ur_rtde) holds Python's lock while it connects, and waits forever for a controller that
-accepts the connection and then does not answer. So it runs in a process of its own, which the node can end.
-It writes one ``SAMPLE`` for each new stamp.
+accepts the connection and then does not answer. It therefore runs in its own process, which the node can end.
+This process writes one ``SAMPLE`` for each new stamp.
 """
 
 from __future__ import annotations

@@ -116,9 +116,12 @@ def plan_tour(
 def reachable(
     arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, poses: Sequence[Array]
 ) -> NDArray[np.bool_]:
-    """Whether the arm can hold the camera at each of ``poses`` (N, 4, 4), camera-to-world, (N,): in a posture
-    that is not singular and touches neither itself nor the floor. The way there is not looked at. Other
-    arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are read."""
+    """Whether the arm can hold the camera at each pose, (N,): in a posture that is not singular and touches
+    neither itself nor the floor. Paths to the poses are not checked.
+
+    poses: camera-to-world (N, 4, 4).
+    Other arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are used.
+    """
     found = _postures(arm, base, hand_eye, path, poses, None)
     joints, places = np.reshape([q for q, _ in found], (-1, 6)), np.array([k for _, k in found], np.int64)
     out = np.zeros(len(poses), np.bool_)

@@ -4,9 +4,8 @@
   sample (thesis 4.3.3) and linear interpolation with slerp; and the processor time of one pairing.
 - ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
   bound; arm noise .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard deviations of the
-  errors over the trials, within which an error may lie below its bound by chance. ``planned``: the
-  refinement, with poses after the first four as the guided session proposes them; its bound is that of its
-  own poses.
+  errors over the trials, by which an error may be below its bound by chance. ``planned``: the refinement with
+  poses that the guided session proposes after the first four; its bound is that of these poses.
 - ``offset``: error of the time offset between arm and camera against the length of the recording and speed.
 """
 

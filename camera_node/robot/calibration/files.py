@@ -44,8 +44,8 @@ class Track:
 
 
 def sorted_track(times_ns: Sequence[int], poses: Sequence[Array], what: str) -> Track:
-    """The track of poses (4, 4) as they came. what: they are, for messages. Raises CalibrationError for fewer
-    than two."""
+    """Sort poses (4, 4) by stamp into a track. what: name of the poses in messages. Raises CalibrationError
+    for fewer than two."""
     times_ns, poses, counts = sort_samples(times_ns, poses)
     if len(times_ns) < 2:
         raise CalibrationError(f"{len(times_ns)} {what}: a time offset needs many of a moving hand")

@@ -1,1 +1,1 @@
-"""Recorded data sets: one reader a format, streamed by live cameras or read offline."""
+"""Recorded data sets: one reader module a format, for streaming by camera nodes or for reading offline."""

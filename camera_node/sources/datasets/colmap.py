@@ -1,8 +1,9 @@
 """COLMAP models as text or binary (COLMAP's documentation, "Output Format"), with their images.
 
-Poses are world-to-camera with OpenCV axes, quaternions w-first, pixels counted from the image's corner, as
-here. The model lies in the folder itself or in ``sparse/0``, ``sparse``, ``colmap/sparse/0``; the images in
-``images`` beside it, or in a folder of smaller ones (``images_4``). Points are not read.
+The files' poses are world-to-camera with OpenCV axes and w-first quaternions; their pixel origin is the
+image's corner, as in this project. The model is in the folder itself or in ``sparse/0``, ``sparse`` or
+``colmap/sparse/0``, its images in ``images`` beside it, or in a folder of smaller ones (``images_4``). Points
+are not read.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from camera_node.sources.datasets.records import (
 from freshfield.geometry import quaternion_to_matrix
 
 _PLACES = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
-# Binary ones are preferred, as COLMAP does.
+# At each place binary files are preferred, as COLMAP does.
 FILES = tuple(f"{place}cameras{ending}" for place in _PLACES for ending in (".bin", ".txt"))
-# COLMAP's number and name of each supported model with the number of its parameters; others are refused.
+# Supported camera models: COLMAP's number of the model, its name, and its number of parameters.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -48,13 +49,12 @@ class _Image:
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:
-    """The images of the model that have a file, in the order of their names.
+    """The model's images that have a file, sorted by name; the others are counted as missing.
 
-    path: the folder, or a file of the model.
-    images: folder of images, beside the model or one or two folders above it (default ``images``, else the
-        data set's folder itself).
-
-    Images without a file are left out and counted. Raises DatasetError.
+    path: the data set's folder, or a file of the model.
+    images: name of the folder of images, beside the model or above it (default ``images``, else the data
+        set's folder itself).
+    Raises DatasetError.
     """
     files = find_files(path, FILES) if path.is_dir() else [path.with_name(f"cameras{path.suffix}")]
     file = next((f for f in files if f.is_file() and f.with_stem("images").is_file()), None)
@@ -177,7 +177,7 @@ class _Bytes:
         self._at = 0
 
     def take(self, layout: str) -> tuple:
-        """The next fields, as ``struct`` names them."""
+        """The next fields, in the format characters of ``struct``."""
         return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout)))
 
     def name(self) -> str:

@@ -1,9 +1,9 @@
 """DyNeRF (Neural 3D Video): ``camXX.mp4`` files and ``poses_bounds.npy``, which LLFF defined.
 
-A row a camera, in the order of the videos' names: a 3 x 5 matrix row by row, whose columns are the camera's
-down, right and backwards axes in the world, its position, and (height, width, focal length) of the images the
-focal length was found on; then the nearest and furthest depth, which nobody needs here. The principal point
-is the center, there is no distortion.
+``poses_bounds.npy`` has one row of 17 numbers a camera, in the order of the videos' names. The first 15 are a
+3 x 5 matrix, row by row, with the columns: the camera's down, right and backwards axes in the world, its
+position, and (height, width, focal length) of the images used for calibration. The last two, the nearest and
+farthest depth, are not used. The principal point is the image center, and there is no distortion.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"
 FILES = (POSES,)
-# Of a video's shape against that of the images its focal length was found on: both are rounded to pixels.
+# Tolerated difference between the aspect ratios of video and calibration images; both are rounded to pixels.
 _SAME_SHAPE = 0.02
 
 
 def load_rig(path: Path) -> VideoRig:
-    """The rig of a folder, or of its ``poses_bounds.npy``. Raises DatasetError."""
+    """The rig of a folder, or of its ``poses_bounds.npy``. Opens every video. Raises DatasetError."""
     file = path if path.is_file() else path / POSES
     rows = _rows(file)
     videos = sorted(file.parent.glob("cam*.mp4"))

@@ -1,13 +1,14 @@
 """The VR-NeRF Eyeful Tower data set: ``cameras.json`` and image folders.
 
-``cameras.json`` holds ``{"KRT": [...]}`` with an entry an image: ``cameraId`` ("10/10_DSC0001", its path
-without folder and extension), ``width`` and ``height`` of the full size, ``K`` (3 x 3) and ``T`` (4 x 4,
-world to OpenCV camera axes), both **column by column**, and ``distortionModel``: RadialAndTangential [k1 k2
-p1 p2 k3] or Fisheye [k1 k2 k3 - - - p1 p2] (equidistant). The world's y points up and becomes our z here;
-meters.
+``cameras.json`` holds ``{"KRT": [...]}`` with one entry an image: ``cameraId`` ("10/10_DSC0001", the image's
+path without folder and extension), ``width`` and ``height`` of the full size, ``K`` (3 x 3) and ``T`` (4 x 4,
+world to OpenCV camera axes, meters), both **column by column**, and ``distortionModel``: RadialAndTangential
+[k1 k2 p1 p2 k3] or Fisheye [k1 k2 k3 - - - p1 p2] (equidistant). The data set's y points up; it becomes our
+z.
 
-The images stand scaled in ``images-jpeg-1k`` to ``images-jpeg`` (full size); ``splits.json`` names those for
-testing. The set's ``cameras.xml``, Metashape's own, holds nothing more and is not read.
+The folders ``images-jpeg-1k`` to ``images-jpeg`` (full size) hold the images in several sizes;
+``splits.json`` lists the test images. ``cameras.xml``, Metashape's own file, has no further information and
+is not read.
 """
 
 from __future__ import annotations
@@ -31,20 +32,21 @@ from camera_node.sources.datasets.records import (
 from freshfield.geometry import Pose, se3_inverse
 
 FILES = ("cameras.json",)
-# Smallest first: more pixels than a field learns in a second are of no use.
+# Smallest first: more pixels than a field can learn in a second are of no use.
 FOLDERS = ("images-jpeg-1k", "images-jpeg-2k", "images-jpeg-4k", "images-jpeg")
 # (x, y up, z) -> (z, x, y): the height y becomes our z.
 _UPRIGHT = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:
-    """The images that have a file; cameras are named by their folders ("10").
+    """The images that have a file; the others are counted as missing. Cameras are named by their folders
+    ("10").
 
     path: the scene's folder, or its ``cameras.json``.
-    images: folder of images (default: the smallest there is).
+    images: name of the folder of images (default: the smallest size present).
 
-    Nothing in a scene moves, and a camera shows its own images, not necessarily those of one position at a
-    time. Images without a file are left out and counted. Raises DatasetError.
+    Scenes are static; the n-th images of two cameras need not be from the same position of the rig.
+    Raises DatasetError.
     """
     folder = path if path.is_dir() else path.parent
     file = path if path.is_file() else folder / FILES[0]
@@ -122,7 +124,7 @@ def _entry(entry: dict[str, Any], where: str) -> tuple[str, Lens, np.ndarray]:
             "with 5 or Fisheye with 8"
         )
     with errors_at(where):
-        Pose.from_matrix(transform)  # refuses what is no rigid transform, which alone can be inverted so
+        Pose.from_matrix(transform)  # refuses a matrix that is not rigid, as se3_inverse needs it
         lens = Lens(
             width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
         )

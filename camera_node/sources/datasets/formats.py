@@ -1,7 +1,7 @@
-"""Formats of data sets, one reader module each, and which of them a folder or file is of.
+"""The data set formats, and how to recognize the format of a folder or file.
 
-The formats are the kinds of ``camera_node.config`` whose keys are a ``RecordedConfig``: a new one is a reader
-module here, called as the kind, and its keys there, which are the reader's arguments.
+Formats are the kinds of ``camera_node.config`` whose dataclass is a ``RecordedConfig``. To add one, add a
+reader module here, named like the kind, and a dataclass there, whose fields are the reader's arguments.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
 from camera_node.sources.datasets.video import VideoRig
 
-# In this order: where several fit, the one that says most about its images comes first.
+# In this order of preference: if several fit, the one with most information about its images comes first.
 FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
 
 
 class Reader(Protocol):
-    """What the module of a format offers. FILES: patterns of the files that describe a data set in a folder;
-    the first usable one is taken."""
+    """Interface of a format's module. FILES: patterns of the files that describe a data set in a folder; the
+    first usable one is taken."""
 
     FILES: tuple[str, ...]
 
@@ -32,19 +32,19 @@ class Reader(Protocol):
 
 @runtime_checkable
 class RigReader(Protocol):
-    """What the module of a format of synchronized videos offers besides."""
+    """Additional interface of the modules for synchronized videos."""
 
     def load_rig(self, path: Path, **keys: Any) -> VideoRig:
         """The rig of a folder or describing file. Raises DatasetError."""
 
 
 def reader(name: str) -> Reader:
-    """The reader of one of ``FORMATS``; only its module is imported."""
+    """Import and return the reader module of a format, one of ``FORMATS``."""
     return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{name}"))
 
 
 def open_configured(path: Path, config: RecordedConfig) -> Dataset | VideoRig:
-    """What a scenario's section, whose ``data`` is at ``path``, asks for. Raises DatasetError."""
+    """Open the data set of a scenario's ``source:`` section. path: located ``data``. Raises DatasetError."""
     shared = {*(each.name for each in fields(RecordedConfig)), "background", "trajectory"}
     keys = {each.name: getattr(config, each.name) for each in fields(config) if each.name not in shared}
     found = reader(config.kind)
@@ -55,8 +55,11 @@ def open_configured(path: Path, config: RecordedConfig) -> Dataset | VideoRig:
 
 
 def recognize(file: Path) -> str:
-    """The format of a describing file, by its name or the contents of its JSON; ``transforms``, whose reader
-    says what is missing, where nothing tells. Raises DatasetError for a damaged file."""
+    """The format of a describing file, by its name or the contents of its JSON.
+
+    Returns ``transforms`` if nothing matches; its reader then reports what is missing. Raises DatasetError
+    for a damaged JSON file.
+    """
     if file.suffix in (".bin", ".txt"):
         return "colmap"
     data = read_json(file) if file.suffix == ".json" else None
@@ -66,11 +69,12 @@ def recognize(file: Path) -> str:
 
 
 def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tuple[Path, Dataset]:
-    """The describing file of a data set, and its images with alpha kept. Raises DatasetError.
+    """Open a data set, with alpha kept. Returns its describing file and its images.
 
-    path: the describing file, or a folder, of whose describing files the first whose images exist is taken.
-    scale: images are divided by it.
-    name: of the format, instead of recognizing it.
+    path: the describing file, or a folder, in which the first describing file whose images exist is taken.
+    scale: image sizes are divided by it.
+    name: the format; None recognizes it.
+    Raises DatasetError.
     """
     if name is not None and name not in FORMATS:
         raise DatasetError(f"format {name!r}: expected one of {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""Reading and shrinking images without color fringes: area averages, alpha premultiplied."""
+"""Reads images, and shrinks them without color fringes: by area averages with premultiplied alpha."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import cv2  # isort: skip
 
 
 def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
-    """The image as ``cv2.imread`` returns it; None for a file that it cannot read, and for one whose header
-    states more pixels than its limit, where ``cv2.imread`` raises."""
+    """Like ``cv2.imread``, with its ``flags``, but returns None also for a header that states more pixels
+    than OpenCV's limit, where ``cv2.imread`` raises."""
     try:
         return cv2.imread(str(path), flags)
     except cv2.error:
@@ -25,9 +25,10 @@ def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
 
 
 def read_image(path: Path) -> Image:
-    """RGB (H, W, 3) or straight-alpha RGBA (H, W, 4), uint8. Raises DatasetError.
+    """Read an image as uint8 RGB (H, W, 3) or straight-alpha RGBA (H, W, 4).
 
-    EXIF rotation is ignored: poses and intrinsics belong to the pixels as stored.
+    EXIF rotation is ignored, because poses and intrinsics belong to the pixels as stored. Raises
+    DatasetError.
     """
     image = decode_file(path, cv2.IMREAD_UNCHANGED)
     if image is None:
@@ -42,13 +43,13 @@ def read_image(path: Path) -> Image:
 
 
 def as_image(array: np.ndarray) -> Image:
-    """The same array, for type checkers: OpenCV's stubs do not say that uint8 in is uint8 out."""
+    """The same array, cast for type checkers: OpenCV's stubs do not say that uint8 in gives uint8 out."""
     return cast(Image, array)
 
 
 def resize(image: Image, width: int, height: int) -> Image:
-    """Area-averaged copy. Colors are weighted with alpha, so that those of transparent pixels do not bleed
-    into the edges."""
+    """Resize by area averages. Colors are weighted with alpha, so that those of transparent pixels do not
+    bleed into the edges."""
     if image.shape[:2] == (height, width):
         return image
     if image.shape[2] == 3:
@@ -63,7 +64,8 @@ def resize(image: Image, width: int, height: int) -> Image:
 
 
 def composite(image: Image, background: str) -> Image:
-    """RGBA over white or black as RGB; ``keep`` and images without alpha come back as they are."""
+    """Composite RGBA over a ``white`` or ``black`` background to RGB. With ``keep``, or without alpha, the
+    image is returned unchanged."""
     if background == "keep" or image.shape[2] == 3:
         return image
     alpha: NDArray[np.float32] = image[..., 3:].astype(np.float32) / 255.0

@@ -1,8 +1,8 @@
-"""Lenses as data sets describe them, and their images undistorted.
+"""Lens models of data sets, and the undistortion of their images.
 
-``Pinhole`` has OpenCV's k1, k2, p1, p2 and no more. An image of a lens that needs more (k3, a fisheye) is
-undistorted when it is read: resampled to the widest pinhole camera of the same size in which every pixel
-shows something.
+``Pinhole`` has only OpenCV's k1, k2, p1, p2. Images of a lens that needs more (k3, a fisheye) are undistorted
+when they are read: resampled to the widest pinhole camera of the same size in which every pixel lies within
+the original image.
 """
 
 from __future__ import annotations
@@ -23,23 +23,24 @@ import cv2  # isort: skip
 
 Array = NDArray[np.float64]
 
-# Of an undistorted image, to each side of its axis: beyond it a pinhole's corners are mostly stretching.
+# Widest angle from the axis of an undistorted image; beyond it the corners are mostly stretched.
 _WIDEST_RAD = math.radians(60.0)
-# Focal lengths tried, as multiples of the lens's own, narrowest view first.
+# Focal lengths to try, as multiples of the lens's own, narrowest view first.
 _ZOOMS = 4.0 * 0.98 ** np.arange(180)
 _BORDER = 65
-# Of the image that a lens is described for, of which smaller copies are read.
+# Largest side of the image that a lens is described for; smaller copies of it may be read.
 _MAX_SIDE_PX = 10**6
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera in pixels, whose origin is the image's corner.
+    """Intrinsics in pixels (corner origin) with a general lens distortion.
 
-    radial: k1, k2, ... of r^2, r^4, ...
+    radial: k1, k2, ..., the coefficients of r^2, r^4, ...
     tangential: OpenCV's p1, p2.
-    fisheye: equidistant, r is the angle from the axis (OpenCV's and COLMAP's fisheye models where tangential
-        is zero).
+    fisheye: equidistant projection, in which r is the angle from the axis; with zero ``tangential`` this is
+        OpenCV's and COLMAP's fisheye model.
+    Raises DatasetError for sizes, focal lengths or coefficients that are impossible.
     """
 
     width: int
@@ -90,18 +91,19 @@ class Lens:
 
 
 def pinhole(lens: Lens) -> Pinhole:
-    """The camera of the lens's images: the lens itself where ``Pinhole`` can express it, else that of
-    ``undistort``. Raises DatasetError for coefficients that no lens has."""
+    """The camera of the lens's images after ``undistort``: the lens itself if ``Pinhole`` can express it,
+    else an undistorted camera. Raises DatasetError for coefficients that no lens has."""
     return _as_pinhole(lens) or _undistorted(lens)
 
 
 def exact(lens: Lens) -> bool:
-    """Whether ``pinhole(lens)`` is the lens itself, so that its images stay as they are."""
+    """Whether ``pinhole(lens)`` is the lens itself, so that ``undistort`` changes nothing."""
     return _as_pinhole(lens) is not None
 
 
 def undistort(lens: Lens, image: NDArray[np.uint8]) -> Image:
-    """An image (H, W) or (H, W, C) of ``lens`` as ``pinhole(lens)`` sees it; unchanged where exact."""
+    """Resample an image (H, W) or (H, W, C) of ``lens`` to the camera ``pinhole(lens)``; unchanged if exact.
+    Raises as ``pinhole``."""
     if exact(lens):
         return image
     return as_image(cv2.remap(image, *_maps(lens), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
@@ -132,7 +134,7 @@ def _undistorted(lens: Lens) -> Pinhole:
 
 
 def _covered(lens: Lens, straight: Pinhole) -> bool:
-    """Whether the lens has something to show at every pixel of ``straight``, and no part of it twice."""
+    """Whether every pixel of ``straight`` lies within the lens's image, and none of that is shown twice."""
     side = np.linspace(0.0, 1.0, _BORDER)
     u = np.concatenate([side, side, np.zeros(_BORDER), np.ones(_BORDER)]) * straight.width
     v = np.concatenate([np.zeros(_BORDER), np.ones(_BORDER), side, side]) * straight.height
@@ -147,7 +149,7 @@ def _covered(lens: Lens, straight: Pinhole) -> bool:
     return bool(np.all((at >= 0.0) & (at <= (lens.width, lens.height))))
 
 
-# Some 22 MB for a camera of two thousand pixels: a rig's cameras take turns.
+# Some 22 MB for a camera of two thousand pixels a side; bounded, because the cameras of a rig take turns.
 @lru_cache(maxsize=8)
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     straight = _undistorted(lens)

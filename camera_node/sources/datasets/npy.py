@@ -1,8 +1,8 @@
-"""Python objects in a ``.npy`` file, without running code from it.
+"""Reads Python objects from a ``.npy`` file without running code from it.
 
 Such a file is a pickle, and a pickle is a program. Here it can only build numbers, text, lists, dictionaries
-and arrays. numpy's own functions for arrays take the pickle's word for what lies in memory, and crash; those
-here build an array of numbers from as many bytes as it needs, and refuse every other.
+and arrays. numpy's own array constructors trust the sizes that the pickle states and may crash; those here
+build an array of numbers only from exactly as many bytes as it needs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from freshfield.untrusted import refuse_expansion
 
 
 class _Dtype:
-    """Stands for a numpy.dtype of numbers or text: its code, such as ``f8``, then its byte order."""
+    """Placeholder for a numpy.dtype of numbers or text: its code, such as ``f8``, and its byte order."""
 
     def __init__(self, code: str, *_: Any) -> None:
         self._code, self._order = str(code), "|"
@@ -38,7 +38,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stands for a numpy.ndarray until its state is known. value: the array then."""
+    """Placeholder for a numpy.ndarray until its state is known. value: then the array."""
 
     value: Any = None
 
@@ -52,7 +52,7 @@ class _Array:
             self.value = _array(raw, dtype, shape, "F" if columns_first else "C")
 
 
-@functools.cache  # a text that is referred to often takes memory once
+@functools.cache  # text that is referred to many times takes memory only once
 def _bytes(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"it asks for the encoding {encoding}")
@@ -81,7 +81,7 @@ _HARMLESS = {
 
 
 class _Plain(pickle._Unpickler):
-    """Python's own: the one in C makes room for what a few bytes claim."""
+    """Based on the unpickler in Python: the one in C allocates whatever size a few bytes claim."""
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
 
@@ -96,14 +96,14 @@ class _Plain(pickle._Unpickler):
     dispatch[pickle.BUILD[0]] = load_build
 
     def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core", "numpy._core")  # what it was called before numpy 2
+        module = module.replace("numpy.core", "numpy._core")  # its name before numpy 2
         if (module, name) not in _HARMLESS:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data does not need")
         return _HARMLESS[module, name]
 
 
 def load_object(file: Path) -> Any:
-    """The one object that ``numpy.save`` wrote; an array of objects in it becomes a list. Raises
+    """Load the single Python object that ``numpy.save`` wrote; arrays of objects in it become lists. Raises
     DatasetError."""
     try:
         stream = io.BytesIO(file.read_bytes())
@@ -137,7 +137,7 @@ def _parts(value: Any) -> Iterable[Any]:
 
 
 def _plain(value: Any) -> Any:
-    """The value with real arrays in it."""
+    """The value with placeholders replaced by arrays."""
     if isinstance(value, _Array):
         return _plain(value.value)
     if isinstance(value, dict):

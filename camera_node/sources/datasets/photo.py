@@ -1,4 +1,4 @@
-"""One posed image file of a data set: checked, undistorted, masked and shrunk when it is read."""
+"""An image file of a data set, which is checked, undistorted, masked and shrunk when it is read."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import DatasetError, Image, PosedImage, errors_at
 from freshfield.geometry import Pose
 
-# A smaller copy has its original's shape but for rounding to whole pixels.
+# Tolerated difference of aspect ratio between an image and its original, due to rounding to whole pixels.
 _SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """How a data set's images are read. scale: their sizes are divided by it. background: white or black goes
-    under transparent pixels; keep leaves alpha."""
+    """How a data set's images are read.
+
+    scale: image sizes are divided by it, at least 1.
+    background: ``white`` or ``black`` behind transparent pixels; ``keep`` keeps alpha.
+    """
 
     scale: float = 1.0
     background: str = "keep"
@@ -30,7 +33,7 @@ FULL_SIZE = ImageOptions()
 
 @dataclass(frozen=True)
 class Photo:
-    """path: the file, taken with ``lens``. mask: an image that is zero where the background is."""
+    """An image file. lens: of the file as stored. mask: image file that is zero in the background."""
 
     path: Path
     lens: Lens
@@ -38,10 +41,10 @@ class Photo:
     mask: Path | None = None
 
     def read(self) -> Image:
-        """uint8 RGB or RGBA, as ``options`` say. Raises DatasetError."""
+        """Read it as uint8 RGB or RGBA according to ``options``. Raises DatasetError."""
         image = undistort(self.lens, self._checked(self.path))
         if self.mask is not None:
-            # Labels or 255: anything that is not zero is kept.
+            # Masks hold labels or 255: every nonzero pixel is kept.
             kept = np.where(self._checked(self.mask)[..., :3].any(axis=-1), 255, 0).astype(np.uint8)
             image = np.dstack([image[..., :3], undistort(self.lens, kept)])
         small = shrink(pinhole(self.lens), self.options.scale)
@@ -58,8 +61,10 @@ class Photo:
 
 
 def lens_for_image(lens: Lens, path: Path, where: str) -> Lens:
-    """The lens scaled to the size of the image at ``path``: data sets keep smaller copies. where: starts
-    messages. Raises DatasetError for another shape."""
+    """The lens scaled to the size of the image at ``path``, which may be a smaller copy.
+
+    where: beginning of error messages. Raises DatasetError for another aspect ratio, or an unreadable image.
+    """
     height, width = read_image(path).shape[:2]
     if (width, height) == (lens.width, lens.height):
         return lens
@@ -79,7 +84,11 @@ def posed_photo(
     camera: str = "",
     time_s: float | None = None,
 ) -> PosedImage:
-    """A photo with its pose. where: starts messages. Raises DatasetError for an impossible pose or lens."""
+    """A photo with its pose, as a data set's image.
+
+    name, camera, time_s: as in ``PosedImage``. camera_to_world: (4, 4) or (3, 4), OpenCV axes.
+    where: beginning of error messages. Raises DatasetError for an impossible pose or lens.
+    """
     with errors_at(where):
         pose = Pose.from_matrix(camera_to_world).matrix()
         undistorted = pinhole(photo.lens)
@@ -90,6 +99,6 @@ def posed_photo(
         camera_to_world=pose,
         intrinsics=shrink(undistorted, photo.options.scale),
         read=photo.read,
-        # Sent as it is stored where it is what would be shown.
+        # The stored file can be sent as it is if it is not scaled, masked or undistorted.
         path=photo.path if photo.options.scale == 1 and photo.mask is None and exact(photo.lens) else None,
     )

@@ -1,4 +1,4 @@
-"""What a recorded data set is made of: posed images that are read when somebody looks at them."""
+"""The elements of a recorded data set: posed images that are read on demand, and common helpers."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class DatasetError(ValueError):
 class PosedImage:
     """One posed image of a data set.
 
-    name: unique in the data set, which calls it so.
-    camera: "" in a set of photos taken by one camera that moved.
-    time_s: None where the data set knows no time.
+    name: the data set's own, unique within it.
+    camera: name; "" in a set of photos taken by one moving camera.
+    time_s: time in the recording; None if unknown.
     camera_to_world: float64 (4, 4), OpenCV axes, in the data set's units.
     intrinsics: of the image as ``read`` returns it.
-    read: uint8 (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is damaged
-        or of another size.
-    path: the image's own file, where it has one and is shown unscaled.
+    read: returns uint8 (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is
+        damaged or has another size.
+    path: the image's own file, if ``read`` does not scale, mask or undistort it; else None.
     """
 
     name: str
@@ -48,12 +48,12 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Images in the data set's own order.
+    """A data set: its images, in its own order.
 
     missing: number of entries without a file.
-    fps: rate of the recording, where the data set says it.
-    held_out: names of the images that the data set keeps for testing, where it says so.
-    per_camera: each image is shown by the camera that took it, also where nothing moves.
+    fps: rate of the recording; None if the data set does not tell.
+    held_out: names of the data set's own test images.
+    per_camera: each image belongs to the camera that took it, although nothing moves.
     """
 
     images: tuple[PosedImage, ...]
@@ -63,7 +63,7 @@ class Dataset:
     per_camera: bool = False
 
     def __post_init__(self) -> None:
-        """Raises DatasetError for two images of one name: whoever keeps images by name would lose one."""
+        """Raises DatasetError if two images have the same name."""
         for name, count in Counter(image.name for image in self.images).most_common(1):
             if count > 1:
                 raise DatasetError(f"{count} of its entries are of the image {name}: keep one")
@@ -84,22 +84,22 @@ class Dataset:
 
     @property
     def moving(self) -> bool:
-        """True where cameras and times are known: a recording of something that moves."""
+        """Whether cameras and times are known, so that it is a recording of a moving scene."""
         return any(image.camera and image.time_s is not None for image in self.images)
 
     def of(self, camera: str) -> tuple[PosedImage, ...]:
-        """The images of one camera, in the order of time."""
+        """The images of one camera, sorted by time."""
         found = [image for image in self.images if image.camera == camera]
         return tuple(sorted(found, key=lambda image: 0.0 if image.time_s is None else image.time_s))
 
 
-_LONGEST_NAME = 255  # bytes, of a file on every common file system
-_LONGEST_PATH = 1000  # a system takes 4096 bytes, of which the folder and other alphabets need some
+_LONGEST_NAME = 255  # bytes of a file name, on every common file system
+_LONGEST_PATH = 1000  # characters; systems allow 4096 bytes, including the folder and multi-byte characters
 
 
 def path_within(name: str) -> Path:
-    """The path of a file in a data set's folder, as the set names it. DatasetError where it leads out, or
-    where no file can have the name."""
+    """The relative path of a file within a data set's folder. Raises DatasetError if ``name`` leads out of
+    the folder, or cannot be a file name."""
     path = Path(name)
     if not name or path.is_absolute() or ".." in path.parts:
         raise DatasetError(f"{name[:200]!r} does not lie within the folder of the data set")
@@ -113,13 +113,13 @@ def path_within(name: str) -> Path:
 
 
 def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:
-    """The files of a folder that match a pattern, in the order of the patterns."""
+    """The files of a folder that match a pattern, in the order of the patterns, each once."""
     return list(dict.fromkeys(file for pattern in patterns for file in sorted(folder.glob(pattern))))
 
 
 @contextlib.contextmanager
 def errors_at(where: str) -> Iterator[None]:
-    """Start the message of what is raised within (DatasetError, GeometryError) with ``where``."""
+    """Context in which a DatasetError or GeometryError becomes a DatasetError that begins with ``where``."""
     try:
         yield
     except (DatasetError, GeometryError) as error:
@@ -137,7 +137,11 @@ def read_json(file: Path) -> Any:
 
 
 def read_array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
-    """The finite numbers at ``key`` of a JSON object. where: starts messages. Raises DatasetError."""
+    """The finite numbers at ``key`` of a JSON object, reshaped to ``shape``.
+
+    where: beginning of error messages.
+    Raises DatasetError if they are missing, not finite numbers, or too many or few.
+    """
     try:
         value = np.array(entry[key], dtype=np.float64)
     except KeyError:
@@ -150,7 +154,7 @@ def read_array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...], where
 
 
 def camera_to_world(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
-    """(4, 4) from the rotation (3, 3) and translation (3) that take world points to camera axes."""
+    """Camera-to-world matrix (4, 4) from the world-to-camera rotation (3, 3) and translation (3,)."""
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = rotation
     world_to_camera[:3, 3] = translation

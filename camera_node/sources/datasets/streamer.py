@@ -1,8 +1,8 @@
-"""Live cameras that show a recorded data set, whatever its format.
+"""Sources that stream a recorded data set of any format as if live.
 
-A recording of several cameras plays back at its own rate. Photos of something still are split: every eighth
-goes to the held-out cameras, the others round-robin to the training cameras, and each camera steps through
-its photos back and forth, as a moving camera.
+A recording of several cameras is played back at its own rate. Photos of a static scene are split: every
+eighth goes to the held-out cameras, the others round-robin to the training cameras, and each camera steps
+through its photos back and forth, like a moving camera.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ from freshfield.scenario import Scenario, ScenarioError
 
 HOLD_OUT_EVERY = 8
 PHOTO_FPS = 10.0
-# Videos only decode forwards: on the way back, this many (shrunk) frames are decoded at once.
+# Videos decode only forwards: for backward playback, this many (shrunk) frames are decoded at once.
 _BLOCK = 12
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
 @dataclass(frozen=True)
 class Playback:
-    """Which frame a tick shows: ``count`` of them, recorded at ``recorded_fps`` and captured at ``fps``.
+    """Maps ticks to frames.
 
+    count: number of frames. fps: rate of the ticks. recorded_fps: rate of the frames.
     back_and_forth: 0 1 2 3 2 1 0 1 ..., so that motion never jumps; otherwise 0 1 2 3 0 1 ...
     """
 
@@ -53,7 +54,7 @@ class Playback:
     back_and_forth: bool = True
 
     def frame(self, tick: int) -> int:
-        """The frame nearest to the tick's instant."""
+        """Number of the frame nearest to the tick's instant."""
         position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
         if not self.back_and_forth:
             return int(position % self.count)
@@ -85,8 +86,8 @@ def open_recorded(
 
 
 def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[str, list[int]]:
-    """Image indices of each camera: index % 8 == 0 to the held-out cameras in turn (if there are any), the
-    others to the training cameras in turn. Raises DatasetError if a camera would get none."""
+    """Image indices of each camera. Images with index % 8 == 0 go to the held-out cameras in turn (if there
+    are any), the others to the training cameras in turn. Raises DatasetError if a camera would get none."""
     truth = [i for i in range(count) if i % HOLD_OUT_EVERY == 0] if held_out else []
     rest = [i for i in range(count) if i not in set(truth)]
     shares = {camera: truth[k :: len(held_out)] for k, camera in enumerate(held_out)}
@@ -114,7 +115,7 @@ def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) ->
 
 
 def _recorded_rate(fps: float, path: Path) -> Fraction:
-    """The rate that a recording states or its times show. Raises DatasetError for an impossible one."""
+    """A recording's rate as a fraction. Raises DatasetError if it is outside FPS_RANGE."""
     lowest, highest = FPS_RANGE
     if not lowest <= fps <= highest:
         raise DatasetError(
@@ -142,7 +143,7 @@ class ImageSource(Source):
         return Shot(image, Pose.from_matrix(shown.camera_to_world), shown.intrinsics)
 
     def _as_stored(self, shown: PosedImage) -> bytes | None:
-        """The file itself where it is what would be sent: compressing twice costs quality for nothing."""
+        """The file's bytes if they can be sent as they are, since compressing again would cost quality."""
         if shown.path is None or shown.path.suffix.lower() not in _SUFFIXES.get(self._codec, ()):
             return None
         data = shown.path.read_bytes()
@@ -202,7 +203,7 @@ def _video_sources(
 ) -> dict[str, Source]:
     names = assign_cameras(scenario, config.assignment, cameras, list(rig.cameras))
     clips = {name: open_clip(rig, name) for name in rig.cameras}
-    # All cameras turn round at the same frame, or they would drift apart at every turn.
+    # All cameras turn back at the same frame; otherwise they would drift apart at every turn.
     count = min(clip.count for clip in clips.values())
     rates = {_recorded_rate(clip.fps, clip.path) for clip in clips.values()}
     for clip in clips.values():
@@ -229,7 +230,7 @@ def _video_sources(
 
 
 def _trajectory_poses(config: TrajectoryConfig, camera: str, base: Path, where: str) -> PoseProvider:
-    """Poses of one camera in the clip's time, from the TUM file that the scenario names."""
+    """Poses of one camera, on the clip's time scale, from the TUM file that the scenario names."""
     with errors_of(f"{where}.files.{camera}"):
         poses = read_tum(
             base / config.files[camera],

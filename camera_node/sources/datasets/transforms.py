@@ -1,9 +1,9 @@
 """Data sets described by a ``transforms.json``: nerfstudio, instant-ngp and NeRF-synthetic.
 
-Poses are camera-to-world with OpenGL camera axes and become OpenCV's here. Intrinsics stand per file or
-per frame (``fl_x fl_y cx cy w h k1 k2 p1 p2``, or ``camera_angle_x``); their pixel origin is the image's
-corner, as COLMAP's is. Where every frame has a ``time`` and a ``camera`` (or ``camera_label``) the set is a
-recording by several cameras of something that moves.
+Poses are camera-to-world with OpenGL camera axes, converted to OpenCV's here. Intrinsics are given per file
+or per frame (``fl_x fl_y cx cy w h k1 k2 p1 p2``, or ``camera_angle_x``); their pixel origin is the image's
+corner, as in COLMAP. If frames have a ``time`` and a ``camera`` (or ``camera_label``), the data set is a
+recording of a moving scene by several cameras.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from camera_node.sources.datasets.records import (
 )
 from freshfield.geometry import OPENGL_TO_OPENCV
 
-# First what nerfstudio and NeRF-synthetic start a training from.
+# First the files from which nerfstudio and NeRF-synthetic start a training.
 FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
 _EXTENSIONS = ("", ".png", ".jpg", ".jpeg")
 _FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
-    """Images of a transforms JSON, or of the first one in a folder whose images exist.
+    """The images of a transforms JSON, or of the first one in a folder that has images.
 
-    Entries without a file are left out and counted. Raises DatasetError.
+    Entries without an image file are counted as missing. Raises DatasetError.
     """
     if options.background not in BACKGROUNDS:
         raise DatasetError(f"background is {options.background!r}: expected one of {', '.join(BACKGROUNDS)}")
@@ -110,7 +110,7 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
             raise DatasetError(f"{where}: {name} is not zero; only k1, k2, p1, p2 are supported")
     if "w" in d and "h" in d:
         width, height = int(_number(d, "w", where)), int(_number(d, "h", where))
-    else:  # NeRF-synthetic: images of one camera have one size, which its first image tells
+    else:  # NeRF-synthetic: all images of a camera have the size of its first one
         if camera not in sizes:
             sizes[camera] = read_image(image).shape[1::-1]
         width, height = sizes[camera]

@@ -1,4 +1,4 @@
-"""Synchronized videos with a calibration JSON as a data set: every frame of every camera is an image."""
+"""Synchronized videos with a calibration JSON, as a data set with one image for every frame."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PLACES = ("videos/{}.mp4", "{}.mp4")
 
 @dataclass(frozen=True)
 class VideoRig:
-    """cameras: name -> calibration (full size). files: name -> video."""
+    """Synchronized videos. cameras: calibration at full size, by name. files: video file, by name."""
 
     cameras: dict[str, CalibratedCamera]
     files: dict[str, Path]
@@ -36,7 +36,8 @@ class VideoRig:
 def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
     """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
 
-    files: camera -> video, relative to the JSON, where it is at none of ``_PLACES``. Raises DatasetError.
+    files: camera to video file, relative to the JSON, for videos that are not at ``_PLACES``.
+    Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
     cameras, files = load_calibration(calibration), files or {}
@@ -66,9 +67,11 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 
 def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:
-    """Every frame of every video as an image, read when asked for; cameras one after the other.
+    """Every frame of every video as an image that is read on demand, one camera after the other.
 
-    Poses are the calibration's. Videos of different lengths are cut to the shortest. path: for messages.
+    Poses are those of the calibration. All videos are cut to the length of the shortest.
+    path: for error messages. scale: image sizes are divided by it.
+    Raises DatasetError if a pose is missing, or a video cannot be opened.
     """
     clips = {name: open_clip(rig, name) for name in rig.cameras}
     count = min(clip.count for clip in clips.values())
@@ -94,7 +97,8 @@ def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:
 
 
 def open_clip(rig: VideoRig, name: str) -> Clip:
-    """The video of a camera. Raises DatasetError if its size is not the calibration's."""
+    """Open a camera's video. Raises DatasetError if it cannot be opened, or its size is not the
+    calibration's."""
     clip = Clip(rig.files[name])
     expected: Pinhole = rig.cameras[name].intrinsics
     if (clip.width, clip.height) != (expected.width, expected.height):

@@ -1,4 +1,4 @@
-"""One video file as numbered frames, in any order. Decoded forwards, one at a time."""
+"""Random access to the frames of a video file, which is decoded forwards, one frame at a time."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before c
 
 import cv2  # isort: skip
 
-# Up to here, skipping forward by decoding is cheaper than the seek, which decodes from a key frame.
+# Up to this distance, decoding forward is cheaper than seeking, which decodes from a key frame.
 _SKIP_FRAMES = 30
 
 
 class Clip:
-    """Frames 0 .. count - 1 of a file. Holds one decoder and no frames. Raises DatasetError.
+    """Frames 0 to count - 1 of a video file. Holds one decoder and no frames.
 
-    Attributes: count, fps (the file's own), width, height (as stored).
+    Attributes: count, fps (30 if the file does not tell), width and height as stored.
+    Raises DatasetError if the file cannot be opened, or has no frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +33,8 @@ class Clip:
         self._next = 0
 
     def frame(self, index: int, width: int, height: int) -> Image:
-        """Frame ``index`` as RGB (height, width, 3), shrunk by area."""
+        """Frame ``index`` as uint8 RGB, area-averaged to (height, width, 3). Raises DatasetError if there is
+        no such frame, or it cannot be decoded."""
         if not 0 <= index < self.count:
             raise DatasetError(f"{self.path}: frame {index} is not within 0..{self.count - 1}")
         if not self._next <= index <= self._next + _SKIP_FRAMES:
@@ -61,12 +63,12 @@ class Clip:
     def _seek(self, index: int) -> None:
         self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
         self._next = int(self._capture.get(cv2.CAP_PROP_POS_FRAMES))
-        if self._next > index:  # a container without an index: start again and count
+        if self._next > index:  # a container without an index: start again and decode forward
             self._capture.release()
             self._capture = self._open()
             self._next = 0
 
     def _damaged(self, index: int) -> DatasetError:
-        # The decoder's place is unknown now: make the next call seek.
+        # The decoder's position is unknown now: make the next call seek.
         self._next = self.count
         return DatasetError(f"{self.path}: frame {index} of {self.count} cannot be decoded")

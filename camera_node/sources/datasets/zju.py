@@ -1,12 +1,12 @@
-"""ZJU-MoCap: ``annots.npy`` and a folder of JPEGs a camera, as Neural Body's data has them.
+"""ZJU-MoCap: ``annots.npy`` and a folder of JPEG files a camera, as in Neural Body's version of the data.
 
     annots.npy  {"cams": {"K": [3 x 3, ...], "D": [5, ...], "R": [3 x 3, ...], "T": [3, ...]},
                  "ims": [{"ims": ["Camera_B1/000000.jpg", ...]}, ...]}
 
-each list of ``cams`` with an entry a camera, ``ims`` with one an instant, paths in the cameras' order. ``R``
-and ``T`` take world points to OpenCV camera axes; ``T`` is in millimeters. ``K`` counts pixel centers as
-whole numbers and gains 0.5 here; ``D`` is OpenCV's k1 k2 p1 p2 k3. Masks lie in folders of their own
-(``mask``, ``mask_cihp``), as PNG files named like the images.
+The lists of ``cams`` have one entry a camera, ``ims`` one an instant, with paths in the cameras' order. ``R``
+and ``T`` take world points to OpenCV camera axes; ``T`` is in millimeters. In ``K`` pixel centers are whole
+numbers, so 0.5 is added here; ``D`` is OpenCV's k1 k2 p1 p2 k3. Masks are PNG files named like the images, in
+folders of their own (``mask``, ``mask_cihp``).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from camera_node.sources.datasets.records import (
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)
-# Assumed rate of the studio's cameras: the files do not say it.
+# Assumed rate of the studio's cameras, which the files do not tell.
 FPS = 50.0
 _MM = 1e-3
 
@@ -39,12 +39,12 @@ _MM = 1e-3
 def load_dataset(
     path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = FPS
 ) -> Dataset:
-    """Every image of every camera, at instants 1 / ``recorded_fps`` apart.
+    """The images of all cameras, at instants 1 / ``recorded_fps`` apart; those without a file are counted as
+    missing.
 
     path: the folder, or its ``annots.npy``.
-    masks: a folder beside the cameras' whose masks cut the background out.
-
-    Images without a file are left out and counted. Raises DatasetError.
+    masks: name of a folder of masks, beside those of the cameras, that cut out the person; None: no masks.
+    Raises DatasetError.
     """
     file = path if path.is_file() else path / ANNOTATIONS
     annotations = load_object(file)
@@ -74,7 +74,7 @@ def load_dataset(
             if not (folder / name).is_file():
                 missing += 1
                 continue
-            if lens is None:  # the annotations do not tell the images' size, a camera's first one does
+            if lens is None:  # the annotations do not have the images' size, so the first image is read
                 height, width = read_image(folder / name).shape[:2]
                 lens = _lens(numbers["K"][index], numbers["D"][index], width, height, where)
             mask = None if masks is None else (folder / masks / name).with_suffix(".png")

@@ -1,4 +1,4 @@
-"""What the driver of a real camera offers: an open camera that hands out stamped images."""
+"""The interface of drivers for real cameras: an open camera that returns time-stamped images."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Image = NDArray[np.uint8]
 
 
 class CameraError(ValueError):
-    """A camera that cannot be used, or gave no frame; one line: what, where, what to do."""
+    """A camera that cannot be used, or gave no frame. The message is one line: what, where, what to do."""
 
 
 class Feed(ABC):
     """An open camera. Constructed with (camera, device, config, fps, clock); raises CameraError.
 
-    intrinsics: the device's own, for images as ``grab`` returns them; None where it knows none.
-    no_intrinsics: why ``intrinsics`` is None and what to do, in one line; else "".
-    stamped_by: where a frame's instant comes from, for people; known when the first frame has come.
+    intrinsics: the device's own, for images as ``grab`` returns them; None if it has none.
+    no_intrinsics: one line on why ``intrinsics`` is None and what to do; else "".
+    stamped_by: where time stamps come from, for people; known after the first frame.
     """
 
     intrinsics: Pinhole | None = None
@@ -33,27 +33,32 @@ class Feed(ABC):
 
     @classmethod  # noqa: B027
     def check(cls, scenario: Scenario, config: Any, cameras: Sequence[str]) -> None:
-        """What can be known to be wrong before anything is opened. Raises ScenarioError or CameraError."""
+        """Find errors before any camera is opened. Raises ScenarioError or CameraError."""
 
     @abstractmethod
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        """The next frame: when the middle of it was exposed (ns, our clock) and uint8 RGB (H, W, 3); None
-        after ``timeout_s`` without one. Raises CameraError if the camera is gone."""
+        """The next frame: the middle of its exposure (ns, our clock) and uint8 RGB (H, W, 3); None if no
+        frame came within ``timeout_s``. Raises CameraError if the camera is gone."""
 
     @abstractmethod
     def close(self) -> None: ...
 
 
 def as_camera_error(camera: str, error: Exception) -> CameraError:
-    """What a camera's driver raised, in one line that names the camera."""
+    """A driver's exception as a CameraError, in one line that names the camera."""
     if isinstance(error, CameraError):
         return error
     return CameraError(f"{camera}: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def select_device(camera: str, make: str, device: str | None, serials: Sequence[str]) -> int:
-    """Index in ``serials`` (at least one) of the device that is named, or of the only one. Raises CameraError
-    naming those that are there. make: for messages."""
+    """Index in ``serials`` of the device to use.
+
+    camera, make: for error messages.
+    device: its serial number; None: the only one.
+    serials: serial numbers of the connected devices, at least one.
+    Raises CameraError if the device is not connected, or None was given and there are several.
+    """
     names = ", ".join(serials)
     if device is None:
         if len(serials) > 1:
@@ -65,7 +70,8 @@ def select_device(camera: str, make: str, device: str | None, serials: Sequence[
 
 
 def intrinsics_or_reason(find: Callable[[], Pinhole]) -> tuple[Pinhole | None, str]:
-    """``intrinsics`` and ``no_intrinsics`` of a feed. Not an error yet: a calibration may replace them."""
+    """``intrinsics`` and ``no_intrinsics`` of a feed. A CameraError of ``find`` is no error yet, because a
+    calibration file may replace the intrinsics."""
     try:
         return find(), ""
     except CameraError as error:

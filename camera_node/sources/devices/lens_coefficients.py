@@ -1,4 +1,4 @@
-"""Lenses of many coefficients as the four that travel with a frame: OpenCV's k1, k2, p1, p2."""
+"""Approximates lenses with many coefficients by the four of a frame's header: OpenCV's k1, k2, p1, p2."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _RASTER = 25
 def fit_opencv_distortion(
     width: int, height: int, k: ArrayLike, distortion: Sequence[float]
 ) -> tuple[Pinhole, float]:
-    """The nearest camera with k1, k2, p1, p2, and its largest error (pixels) anywhere in the image.
+    """Least-squares fit of k1, k2, p1, p2 to a lens, over a grid of points in the image.
 
     width, height: of the image, pixels.
-    k: OpenCV's camera matrix (3, 3), pixel centers at whole numbers.
-    distortion: 4 to 14 of OpenCV's coefficients (k1, k2, p1, p2, k3, k4, k5, k6, s1 .. s4, tx, ty).
-
-    Least squares over where the lens puts a raster of points.
+    k: OpenCV's camera matrix (3, 3), with pixel centers at whole numbers.
+    distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, k4, k5, k6, s1 .. s4, tx, ty), up to 14; the rest
+        are zero.
+    Returns the camera (corner origin) and the largest error on the grid, in pixels.
     """
     matrix = np.asarray(k, dtype=np.float64).reshape(3, 3)
     given = np.zeros(max(5, len(distortion)))
@@ -30,7 +30,7 @@ def fit_opencv_distortion(
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     u, v = np.meshgrid(np.linspace(0, width - 1, _RASTER), np.linspace(0, height - 1, _RASTER))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
-    # The rays that the picture shows, so that the fit holds for all of it and for nothing beyond.
+    # Only rays that the image shows, so that the fit holds for all of it and for nothing beyond.
     straight = cv2.undistortPointsIter(
         pixels[:, None],
         matrix,
@@ -46,7 +46,7 @@ def fit_opencv_distortion(
     seen = (pixels - [cx, cy]) / [fx, fy]
     wanted = np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
     found: NDArray[np.float64] = np.zeros(4)
-    if any(distortion):  # else rounding would leave traces, and the picture would be undistorted for nothing
+    if any(distortion):  # otherwise rounding errors would make the lens count as distorted
         found, *_ = np.linalg.lstsq(np.concatenate([rows_x, rows_y]), wanted, rcond=None)
     lens = Pinhole(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5,
                    tuple(map(float, found)))  # type: ignore[arg-type]  # fmt: skip

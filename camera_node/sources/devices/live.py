@@ -1,7 +1,7 @@
 """Real cameras as sources: a thread takes the frames as they come, and ``read`` returns the newest one.
 
-The camera's driver stamps a frame, never whoever fetches it, and each frame is read once. A camera that fails
-is opened again with growing pauses, while its captures are counted as failed.
+Frames are stamped by the camera's driver, not when they are read, and each frame is read once. A camera that
+fails is reopened after growing pauses; meanwhile its captures are counted as failed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DRIVERS = {
 
 
 def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> Feed:
-    """Open a camera. Raises CameraError, whatever the driver raises."""
+    """Open a camera of the scenario. clock: of its time stamps. Raises CameraError for any driver error."""
     try:
         return _driver(config.kind)(camera, config.devices.get(camera), config, fps, clock)
     except Exception as error:
@@ -53,7 +53,7 @@ def _driver(kind: str) -> Any:
 
 
 def _close_quietly(feed: Feed) -> None:
-    """A camera that is gone may raise once more."""
+    """Close a feed, and ignore errors: a camera that is gone may raise once more."""
     try:
         feed.close()
     except Exception as error:
@@ -61,10 +61,11 @@ def _close_quietly(feed: Feed) -> None:
 
 
 class LiveSource(Source):
-    """One real camera. The constructor returns when the first frame has come, or raises CameraError.
+    """One real camera. The constructor waits for the first frame, and raises CameraError without one.
 
-    opener: opens the camera, or raises.
-    calibrated: intrinsics that replace the device's own, scaled to the images' size.
+    opener: opens the camera, or raises; called again after a failure.
+    poses: of the camera.
+    calibrated: intrinsics that replace the device's own, scaled to the images' size; None: the device's own.
     first_frame_s: how long the first frame may take.
     """
 
@@ -105,8 +106,9 @@ class LiveSource(Source):
         self._thread.start()
 
     def read(self, content: int) -> Shot:
-        """The newest frame that was not read yet; waits half a period for it. Raises CameraError, and
-        PoseGapError where its instant has no pose."""
+        """The newest frame if it was not read yet; waits for one up to half a period (at most 0.5 s).
+        ``content`` is ignored. Raises CameraError without a new frame, PoseGapError if its instant has no
+        pose."""
         with self._condition:
             if not self._condition.wait_for(lambda: self._newest is not None, self._wait_s):
                 raise CameraError(f"{self.camera}: no new frame: {self._trouble}")
@@ -117,7 +119,7 @@ class LiveSource(Source):
         return Shot(image, pose, self.intrinsics, gap_ns, captured_ns)
 
     def close(self) -> None:
-        """End the thread, which closes the camera."""
+        """Stop the thread, which closes the camera."""
         atexit.unregister(self.close)
         self._stop.set()
         if self._thread.is_alive():
@@ -156,7 +158,7 @@ class LiveSource(Source):
             _close_quietly(current)
 
     def _take(self, feed: Feed) -> bool:
-        """Wait a little for a frame and keep it; whether one came."""
+        """Wait up to _GRAB_S for a frame and keep it. Returns whether one came."""
         taken = feed.grab(_GRAB_S)
         if taken is None:
             self._trouble = f"none for {_GRAB_S:g} s"
@@ -172,7 +174,7 @@ class LiveSource(Source):
 
 def open_live(scenario: Scenario, config: LiveConfig, cameras: Sequence[str]) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``. Raises ScenarioError, CameraError or ArmError."""
-    _driver(config.kind).check(scenario, config, cameras)  # before an arm is connected to
+    _driver(config.kind).check(scenario, config, cameras)  # before connecting to an arm
     if len(cameras) > 1:
         for camera in cameras:
             if camera not in config.devices:
@@ -200,7 +202,8 @@ def open_live(scenario: Scenario, config: LiveConfig, cameras: Sequence[str]) ->
 
 
 def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, CalibratedCamera]:
-    """The calibrated cameras of the file that the scenario names, if any. Raises DatasetError."""
+    """Calibrated cameras by name, from the scenario's calibration file; empty if it names none. Raises
+    DatasetError."""
     if config.calibration is None:
         return {}
     path = Path(config.calibration).expanduser()
@@ -210,7 +213,7 @@ def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, Calibrated
 def _poses(
     scenario: Scenario, config: LiveConfig, cameras: Sequence[str], known: Mapping[str, CalibratedCamera]
 ) -> dict[str, PoseProvider]:
-    """Poses from the arm, else from the calibration. Raises ScenarioError where neither has one."""
+    """Poses from the arm, else from the calibration. Raises ScenarioError if a camera has neither."""
     poses: dict[str, PoseProvider] = {}
     if config.arm is not None:
         from camera_node.robot.arm.camera_poses import camera_poses

@@ -1,8 +1,7 @@
-"""Luxonis OAK cameras through depthai 3: color frames with the instant of their exposure (thesis 4.3.1).
+"""Luxonis OAK cameras through depthai 3: color frames stamped at the middle of their exposure (thesis 4.3.1).
 
-The device's clock is kept in step with the host's by the library; a frame's stamp is taken at the middle of
-its exposure. Intrinsics come from the calibration that is burnt into the device, and a lens that can focus
-stays where it was then.
+The library synchronizes the device's clock with the host's. Intrinsics come from the calibration stored in
+the device, and an autofocus lens is fixed at the position at which it was calibrated.
 """
 
 from __future__ import annotations
@@ -33,15 +32,15 @@ from freshfield.scenario import Scenario, ScenarioError
 log = logging.getLogger("camera-node")
 
 _SEARCH_MS = "2000"
-# Beyond this, four coefficients do not describe the lens: better let the device straighten the picture.
+# Beyond this error, four coefficients do not describe the lens: better let the device rectify the image.
 _WORST_LENS_PX = 1.0
 
 
 def library() -> Any:
     """The module depthai. Raises CameraError saying what to install."""
-    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", _SEARCH_MS)  # its own is 11.5 s
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", _SEARCH_MS)  # the default is 11.5 s
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
-    # Or it takes over the process's signals, so that a file that may not grow ends the node.
+    # Its signal handlers would end the node when a file reaches its size limit (SIGXFSZ).
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
     try:
         import depthai
@@ -51,7 +50,8 @@ def library() -> Any:
 
 
 def find(camera: str, device: str | None) -> Any:
-    """The device of a serial number, or the only one. Raises CameraError naming those that are there."""
+    """The device with the serial number ``device``; None: the only one. Raises CameraError naming those that
+    are there."""
     try:
         there = library().Device.getAllAvailableDevices()
         ids = [each.getDeviceId() for each in there]
@@ -66,7 +66,7 @@ def find(camera: str, device: str | None) -> Any:
 
 
 class OakFeed(Feed):
-    """A running pipeline of one camera."""
+    """A running depthai pipeline of one camera."""
 
     stamped_by = "the device, at the middle of the exposure"
 
@@ -146,8 +146,8 @@ class FrameQueue:
 
 
 def calibrated_focus(calibration: Any, socket: Any) -> int:
-    """Position (1 to 255) of the lens at which the device was calibrated, 0 for one that does not move, or
-    was never calibrated. Wherever else autofocus puts it, its focal length is another."""
+    """Lens position (1 to 255) at which the device was calibrated; 0 for a fixed lens or an uncalibrated
+    device. At other positions the focal length differs."""
     try:
         return int(calibration.getLensPosition(socket))
     except RuntimeError:
@@ -155,9 +155,10 @@ def calibrated_focus(calibration: Any, socket: Any) -> int:
 
 
 def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rectified: bool) -> Pinhole:
-    """Intrinsics of pictures of ``size`` from the device's calibration; straightened ones have no distortion.
+    """Intrinsics from the device's calibration.
 
-    Raises CameraError for a device that was never calibrated, and for a lens model that is not OpenCV's.
+    size: width and height of the images. rectified: whether the device rectifies them (no distortion).
+    Raises CameraError if the device was never calibrated, or its lens model is not OpenCV's.
     """
     width, height = size
     try:

@@ -1,10 +1,9 @@
-"""Any camera that OpenCV opens: USB cameras, and network cameras by address.
+"""Any camera that OpenCV can open: USB cameras, and network cameras by address.
 
-Drivers of Linux (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
-returns that stamp; where the exposure was set, half of it is subtracted. Stamps of other back ends cannot be
-trusted, so there the instant of arrival less ``latency_ms`` is used. The first frame decides which of the two
-holds for as long as the camera is open. A thread reads without a pause, so that no frame waits in the driver
-and grows old.
+Linux drivers (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
+returns that stamp; if the exposure is fixed, half of it is subtracted. Stamps of other back ends cannot be
+trusted; for them the arrival time minus ``latency_ms`` is used. The first frame decides which of the two is
+used while the camera is open. A thread (``live``) reads without pause, so that no frame ages in the driver.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ log = logging.getLogger("camera-node")
 
 _OPEN_MS = 2500
 _READ_MS = 2000
-# A stamp on the machine's own clock is younger than this; anything else is another clock.
+# A stamp on the machine's monotonic clock is younger than this; otherwise it is from another clock.
 _PLAUSIBLE_NS = 1_000_000_000
 _BY_KERNEL, _BY_ARRIVAL = "the kernel", "their arrival, less latency_ms"
-_MANUAL = 1  # V4L2 calls it so
+_MANUAL = 1  # V4L2's value for manual exposure
 
 
 class OpenCvFeed(Feed):
-    """An open capture. OpenCV knows no intrinsics."""
+    """An open ``cv2.VideoCapture``, which has no intrinsics."""
 
     def __init__(
         self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
@@ -53,13 +52,13 @@ class OpenCvFeed(Feed):
             (cv2.CAP_PROP_FPS, float(fps)),
             (cv2.CAP_PROP_BUFFERSIZE, 1),
         ):
-            self._capture.set(key, value)  # a camera that cannot keeps its own: the picture says which
+            self._capture.set(key, value)  # an unsupported value is ignored; the images show the real size
         if config.exposure_us is not None:
             self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
             self._capture.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / 100.0)  # V4L2 counts 100 us
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        """Waits as long as the driver does (network cameras: two seconds)."""
+        """As ``Feed.grab``, but it waits as long as the driver does (network cameras: two seconds)."""
         if not self._capture.grab():
             raise CameraError(
                 f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended"
@@ -74,8 +73,8 @@ class OpenCvFeed(Feed):
         return captured_ns, cast(Image, np.ascontiguousarray(picture[:, :, ::-1]))
 
     def _age_ns(self) -> int | None:
-        """Age of the frame that was just grabbed; None where its stamp is of another clock than the first
-        frame's, so that its instant is unknown."""
+        """Age of the frame that was just grabbed; None if it is unknown because its stamp, unlike the first
+        frame's, is not from the machine's clock."""
         stamp_age_ns = None
         if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
             stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)

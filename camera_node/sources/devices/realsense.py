@@ -1,8 +1,8 @@
-"""Intel RealSense D400 cameras, the thesis's D435i among them: the color stream (thesis 4.3.1).
+"""The color stream of Intel RealSense D400 cameras, such as the thesis's D435i (thesis 4.3.1).
 
-With the library's global time, a stamp is already the host's; where a device has none, its own clock is
-mapped to ours by the samples that took least. A stamp is of when a frame's readout began; where the frame's
-metadata say when the middle of its exposure was, it is moved there.
+With the library's global time, stamps are on the host's clock; for a device without it, the device's clock is
+mapped to ours by the fastest samples (``ArrivalClock``). A stamp is the beginning of the readout; if the
+frame's metadata tell the middle of the exposure, that is used instead.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from freshfield.clock import Clock, SystemClock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
 
-_LONGEST_EXPOSURE_US = 200_000  # a color sensor of the series exposes no longer than 165 ms
+_LONGEST_EXPOSURE_US = 200_000  # the color sensors of the series expose at most 165 ms
 
 
 def library() -> Any:
@@ -49,9 +49,10 @@ def library() -> Any:
 
 
 def find(camera: str, device: str | None) -> str:
-    """The serial number of the camera that is meant. Raises CameraError naming those that are there.
+    """The serial number of the camera to use: ``device``, or the only one if None. Raises CameraError naming
+    those that are there.
 
-    Asked of the context: a pipeline would look for a camera for 15 s.
+    Queries the context, because a pipeline would search for a camera for 15 s.
     """
     rs = library()
     try:
@@ -101,7 +102,7 @@ class RealsenseFeed(Feed):
         self._stamps = FrameClock(clock, SystemClock())
 
     def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
-        """Ask for the host's time and for the exposure; returns the library's intrinsics."""
+        """Enable global time and set the exposure. Returns the library's intrinsics."""
         rs = library()
         for sensor in profile.get_device().query_sensors():
             if sensor.supports(rs.option.global_time_enabled):
@@ -126,14 +127,15 @@ class RealsenseFeed(Feed):
 
 
 class FrameClock:
-    """A frame's stamp as nanoseconds of ``clock``. system: the clock of the library's UTC stamps."""
+    """Converts frame stamps to ``clock`` (ns). system: the clock of the library's UTC stamps."""
 
     def __init__(self, clock: Clock, system: Clock) -> None:
         self._clock, self._system = clock, system
         self._device = ArrivalClock()
 
     def captured_ns(self, frame: Any) -> int:
-        """Global and system time are the host's UTC, of which our clock is a steady copy: ages carry over."""
+        """When a frame was captured, on ``clock``. Stamps of global and system time are on the host's UTC
+        clock; the frame's age on that clock is subtracted from ours, which does not step."""
         rs = library()
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
@@ -142,7 +144,7 @@ class FrameClock:
 
 
 def _since_exposed_ns(frame: Any) -> int:
-    """From the middle of the exposure to the instant that the stamp is of, 0 where the frame does not say."""
+    """Time from the middle of the exposure to the frame's stamp; 0 if the metadata do not tell."""
     value = library().frame_metadata_value
     keys = (value.frame_timestamp, value.sensor_timestamp)
     if not all(frame.supports_frame_metadata(key) for key in keys):
@@ -152,12 +154,13 @@ def _since_exposed_ns(frame: Any) -> int:
 
 
 def as_grabbed(frame: Any, stamps: FrameClock) -> tuple[int, Image]:
-    """What ``Feed.grab`` gives of an RGB frame; a copy, because the library takes the memory back."""
+    """The result of ``Feed.grab`` for an RGB frame. The image is copied, because the library reuses its
+    memory."""
     return stamps.captured_ns(frame), cast(Image, np.array(frame.get_data(), dtype=np.uint8))
 
 
 def lens(camera: str, intrinsics: Any) -> Pinhole:
-    """Intrinsics as the library gives them. Raises CameraError for a lens model that is not OpenCV's."""
+    """Intrinsics from the library's. Raises CameraError for a lens model that is not OpenCV's."""
     rs = library()
     straight = intrinsics.model in (rs.distortion.none, rs.distortion.inverse_brown_conrady)
     if not straight and intrinsics.model not in (
@@ -168,7 +171,7 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
             f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
             "the file in source.calibration"
         )
-    # Color streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
+    # Color streams of the D400 are rectified; their coefficients describe the inverse, and are zero.
     distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
     if straight and distortion:
         raise CameraError(

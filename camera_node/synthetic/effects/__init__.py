@@ -45,26 +45,27 @@ class EffectError(ScenarioError):
 
 @dataclass(frozen=True)
 class EffectParameters(Bounded):
-    """in_truth: whether the effect applies to held-out cameras as well."""
+    """Base of the effects' parameters. in_truth: whether the effect applies to held-out cameras as well."""
 
     in_truth: bool = field(default=False, kw_only=True)
 
     kind: ClassVar[str]
 
     def start(self, rng: np.random.Generator) -> Any:
-        """The effect on one camera, by the protocol of its kind below; ``rng`` is that camera's stream."""
+        """The effect on one camera: an object with the protocol of its kind below. rng: the effect's random
+        stream for this camera."""
         return self
 
 
 def effect_class(name: str) -> type[EffectParameters]:
-    """The class of an effect, now imported. Raises EffectError for an unknown name."""
+    """Import and return the class of an effect. Raises EffectError for an unknown name."""
     if name not in NAMES:
         raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
     return getattr(importlib.import_module(f"{__name__}.{name}"), name.title().replace("_", ""))
 
 
 def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
-    """Random stream of frame number ``index`` under a key (2,): frames may be asked for in any order."""
+    """Random stream of frame number ``index`` under a key (2,), independent of the order of the frames."""
     return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, index]))
 
 
@@ -85,8 +86,8 @@ class LensEffect(Protocol):
 
 
 class Renderer(Protocol):
-    """Renders a camera's image, or some of its rows, at any instant: a CameraRenderer, with effects or
-    not."""
+    """Renders a camera's image, or some of its rows, at any instant: a CameraRenderer, perhaps with exposure
+    effects around it."""
 
     @property
     def camera(self) -> Pinhole: ...
@@ -134,7 +135,7 @@ class Effects:
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockEffect, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
-    rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of those that decide cached frames
+    rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 
     def extend(self, scene: Scene) -> Scene:
         """The scene with effects of the kinds world and lens. Raises EffectError."""
@@ -162,20 +163,24 @@ class Effects:
         return renderer
 
     def apply(self, image: Image, index: int, t_s: float) -> Image:
+        """``image`` with every image effect; see ``ImageEffect``."""
         for effect in self.image:
             image = effect.apply(image, index, t_s)
         return image
 
     def node_ns(self, true_ns: int) -> int:
+        """Time of the node's clock, with every clock effect, at a true time."""
         for effect in self.clock:
             true_ns = effect.node_ns(true_ns)
         return true_ns
 
     @property
     def pose_varies(self) -> bool:
+        """Whether the reported poses differ from frame to frame."""
         return any(effect.varies for effect in self.pose)
 
     def reported_pose(self, pose: Pose, index: int) -> Pose:
+        """The pose that frame number ``index``, taken from ``pose``, reports."""
         for effect in self.pose:
             pose = effect.reported(pose, index)
         return pose

@@ -29,8 +29,11 @@ class ClockDrift(EffectParameters):
 
 
 class DriftingClock:
-    """Times are whole nanoseconds: a float64 holds today's time only to 256 ns. A call takes well under a
-    microsecond. offset_ns, drift_ppb: of this camera."""
+    """One camera's clock. offset_ns, drift_ppb: its errors.
+
+    Times are whole nanoseconds, because a float64 holds today's time only to 256 ns. A call takes well under
+    a microsecond.
+    """
 
     def __init__(self, parameters: ClockDrift, rng: np.random.Generator) -> None:
         offset, drift = rng.standard_normal(2)

@@ -34,7 +34,7 @@ class ExposureDrift(EffectParameters):
 
 
 class DriftingExposure:
-    """phase, offset_stops: of this camera."""
+    """One camera's exposure. phase: of the sine, in periods. offset_stops: constant offset."""
 
     def __init__(self, parameters: ExposureDrift, rng: np.random.Generator) -> None:
         self._p = parameters
@@ -42,7 +42,7 @@ class DriftingExposure:
         self.offset_stops = parameters.offset_spread_stops * float(rng.standard_normal())
 
     def stops(self, t_s: float) -> float:
-        """Exposure error at an instant."""
+        """Exposure error at an instant, in stops."""
         phase = phase_of(t_s, self._p.period_s) + self.phase
         return self.offset_stops + self._p.amplitude_stops * math.sin(2 * math.pi * phase)
 

@@ -37,8 +37,8 @@ class HotPixels(EffectParameters):
 
 
 class DamagedSensor:
-    """The camera's random stream decides which pixels are damaged; a frame's hits follow from that stream and
-    its number."""
+    """One camera's sensor. Its random stream decides which pixels are damaged, and, with a frame's number,
+    the frame's hits."""
 
     def __init__(self, parameters: HotPixels, rng: np.random.Generator) -> None:
         self._p = parameters
@@ -61,7 +61,7 @@ class DamagedSensor:
         if shape not in self._damage:
             rng = np.random.Generator(np.random.Philox(key=self._key))
             pixels = shape[0] * shape[1]
-            dose = rng.random(pixels)  # share of damaged pixels from which on each is one
+            dose = rng.random(pixels)  # a pixel is damaged once the share of damaged pixels exceeds its dose
             order = np.argsort(dose) if p.growth_ppm_per_h else np.flatnonzero(dose < p.hot_ppm * 1e-6)
             at = shape[2] * order + rng.integers(0, 3, pixels)[order]
             self._damage[shape] = dose[order], at, rng.exponential(p.hot_counts, pixels)[order]

@@ -34,7 +34,8 @@ class PoseNoise(EffectParameters):
 
 
 class NoisyPose:
-    """A frame's error follows from the camera's random stream and the frame's number alone."""
+    """One camera's pose error; a frame's error depends only on the camera's random stream and the frame's
+    number."""
 
     def __init__(self, parameters: PoseNoise, rng: np.random.Generator) -> None:
         p = parameters

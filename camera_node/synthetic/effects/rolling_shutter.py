@@ -36,7 +36,7 @@ class RollingShutter(EffectParameters):
         height, step = renderer.camera.height, self.rows_at_once
         first, stop = (0, height) if rows is None else rows
         strips = []
-        # Bands count from the top row, so that a row looks the same whichever rows are asked for.
+        # Bands are counted from the image's top row, so that a row looks the same in any requested range.
         for top in range(first - first % step, stop, step):
             bottom = min(top + step, height)
             middle = 0.5 * (top + bottom - 1)

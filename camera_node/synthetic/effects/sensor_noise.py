@@ -29,7 +29,8 @@ class SensorNoise(EffectParameters):
 
 
 class NoisySensor:
-    """A frame's noise follows from the camera's random stream and the frame's number alone."""
+    """One camera's noise; a frame's noise depends only on the camera's random stream and the frame's
+    number."""
 
     def __init__(self, parameters: SensorNoise, rng: np.random.Generator) -> None:
         self._key = rng.integers(0, 2**64, size=2, dtype=np.uint64)

@@ -46,8 +46,8 @@ class Shadows(EffectParameters):
         moving: Sequence[PlacedParts],
         specular: SpecularReflection | None,
     ) -> Array:
-        """See ``lighting.ShadowModel``. Traces points of the light to every surface point, so that a light of
-        many points makes penumbrae."""
+        """See ``lighting.ShadowModel``. Traces rays from points of the light to every surface point; a light
+        of many points makes penumbrae."""
         lost = np.zeros_like(surface.albedo)
         casters = [_casters(placed) for placed in moving]
         count = len(light.points)
@@ -68,7 +68,7 @@ class Shadows(EffectParameters):
 
 
 def _casters(placed: PlacedParts) -> PlacedParts:
-    """Without the parts that cast no shadow."""
+    """The parts that cast a shadow."""
     casting = [k for k, part in enumerate(placed.parts) if part.casts_shadow]
     if len(casting) == len(placed.parts):
         return placed
@@ -78,7 +78,8 @@ def _casters(placed: PlacedParts) -> PlacedParts:
 def _behind(
     source: Array, ray: Array, distance: Array, placed: PlacedParts, visible: Array
 ) -> NDArray[np.intp]:
-    """Indices of the points that see a light point past static parts and may lie behind a body."""
+    """Indices of the surface points that static parts do not hide from the light point ``source``, and that
+    may lie behind the body ``placed``."""
     if not placed.parts:
         return np.empty(0, dtype=np.intp)
     center, radius = placed.bounding_sphere()

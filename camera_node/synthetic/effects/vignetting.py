@@ -33,5 +33,5 @@ class Vignetting(EffectParameters):
 
 @lru_cache(maxsize=16)
 def gains(camera: Pinhole, exponent: float) -> NDArray[np.float32]:
-    """(H, W, 1): share of each pixel's light that is left."""
+    """Share of each pixel's light that is left, (H, W, 1)."""
     return (camera.rays()[..., 2:] ** exponent).astype(np.float32)

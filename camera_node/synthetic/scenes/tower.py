@@ -78,7 +78,7 @@ def build(params: Params) -> Scene:
 
 
 def _moving_bodies(params: Params, walk: Walk, drawn: float) -> tuple[MovingBody, ...]:
-    """drawn: in [0, 1), decides which body is alone."""
+    """The moving bodies of the scene. drawn: random number in [0, 1) that selects one of two bodies."""
     person = walking_person(walk)
     if params.movers == "person":
         return (person,)
@@ -89,7 +89,7 @@ def _moving_bodies(params: Params, walk: Walk, drawn: float) -> tuple[MovingBody
 
 
 def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
-    """A cart that drives an ellipse in the walk's period; its speed sets the length."""
+    """A cart that drives along an ellipse in the walk's period; the speed determines the ellipse's size."""
     deck = tx.Stripes((0.93, 0.72, 0.12), (0.16, 0.16, 0.18), 0.2, soft=0.03)
     crate = tx.Framed(tx.Checker((0.24, 0.46, 0.78), (0.90, 0.88, 0.82), 0.12), (0.55, 0.37, 0.20),
                       (0.24, 0.24), 0.04)  # fmt: skip

@@ -1,7 +1,8 @@
 """Faults of the link, one file each, loaded only if the scenario lists them.
 
-A fault module has a dataclass ``Params`` (its keys in the scenario) and a class ``Effect`` made from
-(params, seed, camera). Like the link, it looks its random numbers up by (camera, offer number).
+A fault module has a dataclass ``Params`` (its keys in the scenario) and a subclass ``Effect`` of
+``link.Fault``, constructed from (params, seed, camera). Like the link, it looks up its random numbers by
+(camera, offer number).
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth", 
 
 
 def params_class(name: str) -> type[Any]:
-    """The parameter dataclass of a listed fault; this is what imports its module."""
+    """The parameter dataclass of the fault ``name``, one of NAMES. Imports the fault's module."""
     return importlib.import_module(f"channel_emu.model.faults.{name}").Params
 
 
 def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
-    """The listed faults for one camera, in the order of NAMES, whatever order they were listed in."""
+    """The faults of one camera, in the order of NAMES. params: ``Params`` by fault name."""
     return tuple(
         importlib.import_module(f"channel_emu.model.faults.{name}").Effect(params[name], seed, camera)
         for name in NAMES
@@ -32,8 +33,11 @@ def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
 
 @dataclass(frozen=True)
 class ChanceParams:
-    """Parameters of a ``ChanceFault``. probability: one number, or one for each state of the chain in which
-    transmission starts; losses are then those of Gilbert and Elliott."""
+    """Parameters of a ``ChanceFault``.
+
+    probability: one number, or one for each chain state in which transmission may start (for losses, the
+        Gilbert-Elliott model).
+    """
 
     probability: float | list[float]
 
@@ -44,7 +48,7 @@ class ChanceParams:
 
 
 class ChanceFault(Fault):
-    """Base of the faults that hit each frame with a probability. purpose: of the camera's random stream."""
+    """Base of the faults that hit each frame with a probability. purpose: name of the random stream."""
 
     purpose: ClassVar[str]
 
@@ -54,6 +58,7 @@ class ChanceFault(Fault):
         self._by_state = per_state(params.probability)
 
     def hits(self, transit: Transit) -> bool:
+        """Whether the fault hits this frame."""
         p = self._by_state[transit.state if len(self._by_state) > 1 else 0]
         return self.rng.uniform(transit.number) < p
 

@@ -1,4 +1,4 @@
-"""A line of finite rate: each frame's size adds to its delay, so big frames are slow."""
+"""A line of finite rate: each frame's size over the rate is added to its delay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows in which nothing gets through: a frame in transmission during any part of one is lost."""
+"""Time windows without connection: a frame whose transmission overlaps one is lost."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Params:
     """[start, end] of each window, in ms since the emulator started."""
     every_ms: float | None = None
     for_ms: float | None = None
-    """Besides, a window of ``for_ms`` at the end of each period of ``every_ms``."""
+    """In addition, a window of ``for_ms`` at the end of each period of ``every_ms``."""
 
     def __post_init__(self) -> None:
         for window in self.windows_ms:

@@ -1,4 +1,4 @@
-"""Flips bytes of the payload on the way: the edge must refuse the frame by its CRC."""
+"""Damages bytes of the payload in transit: the edge must refuse the frame by its CRC."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from channel_emu.model.link import Transit
 @dataclass(frozen=True)
 class Params(ChanceParams):
     count: int = 1
-    """Bytes flipped in a damaged frame."""
+    """Number of bytes to damage in a frame that is hit."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -30,7 +30,7 @@ class Effect(ChanceFault):
 
 
 def damage(payload: bytes, flips: tuple[tuple[float, int], ...]) -> bytes:
-    """The payload with its bytes flipped; an empty payload has none to flip."""
+    """A copy of the payload with the damage of ``Transit.flips`` applied; an empty payload stays empty."""
     data = bytearray(payload)
     for place, mask in flips:
         if data:

@@ -1,4 +1,4 @@
-"""Loses frames: transmission takes its time, then nothing arrives."""
+"""Loses frames: a lost frame occupies the link for its whole transmission, but never arrives."""
 
 from __future__ import annotations
 

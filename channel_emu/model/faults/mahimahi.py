@@ -1,4 +1,4 @@
-"""A line that lets packets go at recorded instants: Mahimahi's traces (Netravali et al., USENIX ATC 2015)."""
+"""A line that sends packets at recorded instants: Mahimahi's traces (Netravali et al., USENIX ATC 2015)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKET_BYTES = 1500
 @dataclass(frozen=True)
 class Params:
     opportunities_ms: list[int]
-    """Instants, ascending, at each of which PACKET_BYTES may leave; after the last the trace begins anew."""
+    """Ascending instants in ms; at each PACKET_BYTES may be sent. The trace repeats after the last."""
 
     def __post_init__(self) -> None:
         times = self.opportunities_ms
@@ -22,13 +22,13 @@ class Params:
 
 
 class Effect(Fault):
-    """A frame leaves with the last packet it needs. What an opportunity has left over is lost, and those of a
-    frame that was preempted are spent."""
+    """A frame is delivered with the last packet that it needs. Unused bytes of an opportunity are lost, and a
+    preempted frame does not give its opportunities back."""
 
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.times_ns = [at * 10**6 for at in params.opportunities_ms]
         self._next = 0
-        """Number of the first opportunity that is left."""
+        """Number of the first unused opportunity, counted over all repetitions of the trace."""
 
     def extra_ns(self, transit: Transit) -> int:
         start = transit.started_ns

@@ -1,4 +1,4 @@
-"""Resets the camera's stream: what is in the link is broken, the node has to connect anew."""
+"""Resets the camera's stream: frames inside the link are broken, and the node has to reconnect."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
-"""The chain's path over a whole horizon, and arrivals and work along it: ``chain.Chain`` and ``traffic``.
+"""The chain's path over a whole run, and arrivals along it: kernels of ``chain.Chain`` and ``traffic``.
 
-Arguments of the functions here:
+Common arguments:
 
-    starts, states   the chain's path: sojourns' starts and the last one's end, int64 ns (S + 1,); states (S,)
-    rates_per_ns     float64, one entry a state or one for all
-    work             integral of the rate that is to be reached
+    starts, states   the chain's path: starts of the sojourns and the end of the last, int64 ns (S + 1,), and
+                     their states (S,)
+    rates_per_ns     float64, one entry a state, or one for all
+    work             value that the integral of the rate must reach
     key              uint64 (2,), of a random stream (``counter_rng.stream_key``)
-    hint             index of a sojourn from which a search starts
+    hint             index of the sojourn at which a search starts
     horizon_ns       end of the run
 """
 
@@ -32,9 +33,9 @@ saturating_add = njit(nanoseconds.saturating_add, nogil=True)
 
 @njit(cache=True, nogil=True)
 def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
-    """(starts, states) up to the first sojourn that ends after the horizon.
+    """The path (starts, states) up to the first sojourn that ends after the horizon.
 
-    sojourn_rate (M,), jumps (M, M), slot_ns, initial: the attributes of ``chain.Chain``.
+    sojourn_rate: (M,). jumps: (M, M). These, slot_ns and initial are attributes of ``chain.Chain``.
     """
     starts = np.empty(1024, np.int64)
     states = np.empty(1024, np.int64)
@@ -68,7 +69,8 @@ def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
 
 @njit(cache=True, nogil=True)
 def segment(starts, at_ns, hint):
-    """Index of the sojourn that contains ``at_ns``: a linear search from ``hint`` on, binary before it."""
+    """Index of the sojourn that contains ``at_ns``: linear search forward from ``hint``, else binary
+    search."""
     i = hint
     if starts[i] > at_ns:
         return np.searchsorted(starts, at_ns, side="right") - 1
@@ -79,7 +81,7 @@ def segment(starts, at_ns, hint):
 
 @njit(cache=True, nogil=True)
 def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
-    """``traffic.completion_ns`` along the path; NEVER_NS if not before its end."""
+    """``traffic.completion_ns`` along the path; NEVER_NS if the work is not done before the path's end."""
     alike = True
     for k in range(1, len(rates_per_ns)):
         alike &= rates_per_ns[k] == rates_per_ns[0]
@@ -154,8 +156,10 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
 
 @njit(cache=True, nogil=True)
 def sample_newest(offered_ns, rates_per_ns, starts, states, key):
-    """For each offered frame (instants int64 ns (n,)) the arrival that samples it, or -1 where a newer frame
-    was offered first."""
+    """Instant (n,) of the arrival that samples each offered frame, or -1 if a newer frame is offered first.
+
+    offered_ns: int64 (n,), ascending.
+    """
     sampled = np.empty(len(offered_ns), np.int64)
     u, v = np.empty(_BLOCK), np.empty(_BLOCK)
     hint = 0

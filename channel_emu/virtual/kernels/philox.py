@@ -1,4 +1,4 @@
-"""The numbers of ``channel_emu.model.counter_rng``, compiled."""
+"""The random numbers of ``channel_emu.model.counter_rng``, compiled."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ def _pair(n, again, k0, k1):
 
 @njit(cache=True, nogil=True)
 def pair(number, again, key):
-    """Two uniforms in (0, 1); ``key``: uint64 (2,) holding 32-bit words."""
+    """The pair of uniforms in (0, 1) of ``number`` and attempt ``again``. key: uint64 (2,) of 32-bit
+    words."""
     return _pair(np.uint64(number), np.uint64(again), key[0], key[1])
 
 
 @njit(cache=True, nogil=True)
 def fill(first, u, v, key):
-    """Write the pairs of numbers first, first + 1, ... into u and v (float64, one length)."""
+    """Write the pairs of the numbers first, first + 1, ... into ``u`` and ``v`` (float64, of equal
+    length)."""
     n, k0, k1 = np.uint64(first), key[0], key[1]
     for i in range(len(u)):
         u[i], v[i] = _pair(n + np.uint64(i), np.uint64(0), k0, k1)

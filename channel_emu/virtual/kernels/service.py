@@ -1,4 +1,4 @@
-"""The decisions of ``queue_server.QueueServer`` and ``link.Link`` over whole arrays, one server at a time."""
+"""The decisions of ``queue_server.QueueServer`` and ``link.Link`` for all frames of one server."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DROP_NEW, NEWEST_WAITS, FCFS, PARALLEL = 0, 1, 2, 4
 
 @njit(cache=True, nogil=True)
 def _longest_waiting(head, ticket):
-    """The camera whose waiting frame is next; at least one waits."""
+    """The camera whose waiting frame is served next; at least one must wait."""
     best = -1
     for c in range(len(head)):
         if head[c] >= 0 and (best < 0 or ticket[head[c]] < ticket[head[best]]):
@@ -29,7 +29,7 @@ def _longest_waiting(head, ticket):
 def _drop_new(
     arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
 ):  # fmt: skip
-    """``serve`` for one camera under drop-new, into the last three arguments."""
+    """``serve`` for one camera under drop-new; writes its results into the last three arguments."""
     by_state = len(means_ms) > 1
     mean_ms = means_ms[0]
     free_ns, hint = np.int64(0), 0
@@ -61,32 +61,33 @@ def serve(
     arrive_ns, camera, discipline, queue_limit, work, means_ms, speeds, modulated, starts, states,
     path_from, path_to, horizon_ns,
 ):  # fmt: skip
-    """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
+    """Serve the n frames of all cameras, given in the order of their arrival.
 
-    arrive_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive
-        (-1: never sampled).
+    arrive_ns: int64 (n,); -1: never sampled.
+    camera: (n,), index of the frame's camera.
     discipline: index into ``link.DISCIPLINES``.
-    queue_limit: most frames waiting (fcfs) or in service (parallel).
-    work: of ``work.draw``.
-    means_ms: mean delay, (1,) or one a state. speeds: its inverse in 1/ns, inf where it is 0.
-    modulated: the work is served at the rate of each state passed through, not of the first one.
-    starts, states: all paths (see ``chain_path``); camera c's is starts[path_from[c] : path_to[c]], with one
-        entry of ``states`` unused at its end.
+    queue_limit: maximum number of frames waiting (fcfs) or in service (parallel).
+    work: (n,), of ``work.draw``.
+    means_ms: mean delay, (1,) or one a state. speeds: its inverse in 1/ns, inf for a mean of 0.
+    modulated: serve the work at the rate of the current state, not of the state at the start.
+    starts, states: concatenated paths of the chains (see ``chain_path``). Camera c's path is
+        starts[path_from[c] : path_to[c]], and likewise in ``states``, whose last entry is unused.
     horizon_ns: frames due later are in flight.
+    Returns outcome (int8), started and due (int64 ns, -1: never), each (n,).
     """
     count, cameras = len(arrive_ns), len(path_from)
     outcome = np.zeros(count, np.int8)
     started = np.full(count, -1, np.int64)
     due = np.full(count, -1, np.int64)
     if discipline == DROP_NEW and cameras == 1:
-        # The general loop below would decide the same; nothing waits here, which makes it twice as fast.
+        # The loop below would decide the same; this one is twice as fast, because no frame waits.
         _drop_new(
             arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
         )
         return outcome, started, due
     hints = path_from.copy()
     ticket = np.arange(count)
-    head = np.full(cameras, -1, np.int64)  # of each camera's waiting frames, which ``follower`` links
+    head = np.full(cameras, -1, np.int64)  # first waiting frame of each camera; ``follower`` links the others
     tail = np.full(cameras, -1, np.int64)
     follower = np.full(count if discipline == FCFS else 1, -1, np.int64)
     waiting, serving = 0, -1

@@ -1,4 +1,4 @@
-"""The work of all frames of a link, drawn ahead by the laws of ``service_time``."""
+"""Draws the work of all frames of a link in advance, by the laws of ``service_time``."""
 
 from __future__ import annotations
 
@@ -48,10 +48,12 @@ def _gamma(number, shape, key):
 
 @njit(cache=True, nogil=True)
 def draw(count, law, parameter, delays_ms, key):
-    """Work of mean one of frames 0, 1, ..., float64 (count,); law ``trace``: the delay in ms, ``none``: 0.
+    """Work of frames 0 to count - 1, float64 (count,), with mean one; for trace the delay in ms, for none 0.
 
-    law: index into ``config.LAWS``, as the constants above. parameter: shape of gamma, sigma of lognormal.
-    delays_ms: of the law trace. key: uint64 (2,), of the random stream.
+    law: index into ``config.LAWS``, like the constants above.
+    parameter: shape of gamma, sigma of lognormal; unused by the others.
+    delays_ms: of the law trace.
+    key: uint64 (2,), of the random stream.
     """
     if law == LAW_EXPONENTIAL:
         return exponentials(0, count, key)

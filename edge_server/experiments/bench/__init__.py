@@ -1,1 +1,1 @@
-"""``edge-server bench``: measurements of this machine, one part a file."""
+"""``edge-server bench``: measurements on this machine, one file per part."""

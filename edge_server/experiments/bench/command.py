@@ -1,4 +1,4 @@
-"""``edge-server bench``: measurements of this machine, each with the load of other processes."""
+"""``edge-server bench``: measurements on this machine, each reported with the load of other processes."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
 MORE = ("embed", "foreground", "peer", "shown", "growth", "surface", "scanned")
-# Parts that store each figure as it comes, and skip what is known.
+# Parts that store each figure when it is measured, and skip known ones.
 _RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
-_MODULES = {"growth": "shown.growth", "drift": "track"}  # where a part is in no module of its own name
-# The scenes that parts have to choose from; shown finds others, too.
+_MODULES = {"growth": "shown.growth", "drift": "track"}  # parts whose module has another name
+# The scenes that each part offers; shown also accepts others.
 _SCENES = {"field": SCENES, "track": ("room", "kitchen"), "drift": ("room", "kitchen")}
-# Flags of some parts only.
+# Flag -> the parts that it applies to.
 _ONLY_OF = {
     "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
     "only": ("options", "surface"), "scene": (*_SCENES, "shown"),
@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _measure(part, module, args, figures)
         except BenchError as error:
             print(f"edge-server bench {part}: {error}", file=sys.stderr)
-            status = 1  # the other parts may go well
+            status = 1  # continue with the other parts
             continue
         except KeyboardInterrupt:
             _write(args.json, figures)
@@ -154,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _known(path: Path, quick: bool) -> dict[str, Any]:
-    """The figures of an earlier run. BenchError where they cannot be continued."""
+    """The figures of an earlier run. Raises BenchError if they cannot be continued."""
     if not path.is_file():
         return {}
     try:
@@ -175,7 +175,7 @@ def _module(part: str) -> ModuleType:
 
 
 def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: dict[str, Any]) -> None:
-    """One part, into ``figures``."""
+    """Measure one part, and store its results in ``figures``."""
     store = ResultStore()
     if part in _RESUMABLE:
         store = ResultStore(figures.setdefault(part, {}), lambda *_: _write_json(args.json, figures))
@@ -197,7 +197,7 @@ def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
 
 
 def _write(path: Path | None, figures: dict[str, Any]) -> None:
-    """The JSON, its tables beside it, and PART.png of every part that draws one."""
+    """Write the JSON and, in the same folder, its tables and PART.png of every part that draws one."""
     if path is None:
         return
     _write_json(path, figures)
@@ -230,7 +230,7 @@ def _conditions(figures: dict[str, Any]) -> str:
 
 
 def _table(module: ModuleType, figures: dict[str, Any]) -> str:
-    """The part's own tables, or every figure by its name."""
+    """The part's own tables, or one table of all figures by name."""
     if hasattr(module, "table"):
         text: str = module.table(figures)
         return text
@@ -238,7 +238,7 @@ def _table(module: ModuleType, figures: dict[str, Any]) -> str:
 
 
 def flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested figures as pairs of a name, ``a.b.c``, and a value for people; series are left out."""
+    """Nested figures as pairs of a name, ``a.b.c``, and a formatted value; lists are left out."""
     out: list[tuple[str, str]] = []
     for name, value in figures.items():
         if isinstance(value, dict):

@@ -1,6 +1,6 @@
-"""How long a learned decision takes, from the newest frames to the action, and the network's share of it.
+"""Measures the time of a learned decision, from the newest frames to the action, and of its parts.
 
-Embeddings are given: ``bench embed`` measures what they cost.
+Embeddings are given; ``bench embed`` measures their cost.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LENS = Pinhole.from_fov(64, 64, 60.0)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """Milliseconds, median and 99th percentile, by the kind of action and the number of cameras."""
+    """Milliseconds of decisions, median and 99th percentile, by kind of action and number of cameras."""
     repeats = 200 if run.quick else 2000
     load = LoadMeter()
     found = {
@@ -73,7 +73,8 @@ def _decision(action: Any, n: int, repeats: int) -> dict[str, float]:
 
 
 def _ms(part: str, task: Callable[[], Any], repeats: int) -> dict[str, float]:
-    """Wall-clock time, and processor time of this thread, which other processes do not lengthen."""
+    """Wall-clock time of ``task``, and processor time of this thread, which other processes do not
+    increase."""
     for _ in range(20):  # libraries load and allocate at the first calls
         task()
     gc.collect()
@@ -102,7 +103,7 @@ def _newest_frames(n: int) -> dict[str, BufferedFrame]:
 
 
 class _StoredEmbeddings:
-    """Embeddings that need no computing."""
+    """Embeddings that are already computed."""
 
     def __init__(self, n: int) -> None:
         self._rows = np.random.default_rng(1).standard_normal((n, DIM)).astype(np.float32)

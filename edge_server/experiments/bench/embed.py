@@ -1,4 +1,4 @@
-"""Time of embedding a frame, compared with ONNX Runtime alone on the same part of the same model."""
+"""Measures the time to embed a frame, compared with ONNX Runtime alone on the same part of the same model."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from freshfield.machine_load import LoadMeter
 
 SIZES = (128, 320)
 BATCHES = (1, 18)  # one camera, and a whole rig
-# Of a camera whose frames are not of the model's size.
+# Image size (height, width) of a camera whose frames do not have the model's size.
 CAMERA = (480, 640)
 DIM = 32
-_WARM_UP = 3  # rounds that do not count: memory is allocated in them
+_WARM_UP = 3  # rounds that are not counted, because they allocate memory
 # Figures of a row of the table and their decimals.
 _COLUMNS = (("embed_ms", 3), ("runtime_ms", 3), ("ratio", 2), ("cpu_ratio", 2), ("camera_ms", 3),
             ("camera_ratio", 2), ("camera_cpu_ratio", 2))  # fmt: skip
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """Median milliseconds a frame by model, size and batch.
+    """Median milliseconds per frame by model, size and batch.
 
-    ``embed_ms``: of frames of the model's size. ``runtime_ms``: of ONNX Runtime on ready-made input in the
-    same parts, run by run in turn. ``camera_ms``: of frames of 640 x 480, which are fitted into the model's
-    size first. ``ratio`` and ``camera_ratio``: medians over rounds of the first and of the last over the
-    second; ``cpu_ratio`` and ``camera_cpu_ratio``: of their processor time, which the load of others does not
-    touch.
-
-    Raises BenchError where there is no model to measure.
+    embed_ms: of frames of the model's size.
+    runtime_ms: of ONNX Runtime on prepared input in the same parts, in alternating runs.
+    camera_ms: of frames of 640 x 480, which are first fitted into the model's size.
+    ratio, camera_ratio: medians over rounds of embed_ms and camera_ms over runtime_ms.
+    cpu_ratio, camera_cpu_ratio: the same of processor time, which the load of other processes does not
+        affect.
+    Raises BenchError if a model cannot be measured.
     """
     repeats = 20 if run.quick else 100
     files = [run.model] if run.model is not None else sorted(MODELS.glob("detector_*.onnx"))
@@ -47,7 +47,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
                 config = EmbeddingConfig(str(path), DIM, size, None, "cpu", threads=1)
                 rows = {str(n): _by_batch(config, n, repeats) for n in BATCHES}
             except SizeError:
-                continue  # exported for one size, and measured at that one
+                continue  # exported for another size only
             except EmbeddingError as error:
                 raise BenchError(str(error)) from None
             of_model[str(size)] = rows
@@ -88,9 +88,9 @@ def _by_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
 
 
 def _in_turn(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[tuple[float, float]]]:
-    """(milliseconds, processor milliseconds) of each run. All take turns, so that the load of others meets
-    them alike, and the order changes every round, because a busy system tends to stop what has just run
-    long."""
+    """(milliseconds, processor milliseconds) of each run. All take turns, so that the load of other processes
+    affects them equally, and the order changes every round, because a busy system tends to interrupt what has
+    been running long."""
     spent: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
     names = list(work)
     for k in range(repeats + _WARM_UP):

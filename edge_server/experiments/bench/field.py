@@ -1,7 +1,7 @@
-"""Speed of each representation: seconds to a quality from scratch, rates, rendering, compilation, memory.
+"""Measures each representation: seconds to a quality from scratch, rates, rendering, compilation, memory.
 
 Every point is a new field, fitted from scratch for a planned time, because a fit schedules its learning rate
-over its time. Scores are of held-out cameras. Beside every scene stand two baselines that need no field: the
+over its time. Scores are of held-out cameras. For every scene there are two baselines that need no field: the
 mean color of the training images, and the training image nearest to each held-out camera.
 """
 
@@ -51,15 +51,17 @@ VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
 
 
-_SCALES = {"fox": 2.0}  # by which a recording's images are divided
+_SCALES = {"fox": 2.0}  # divisors of the image sizes of recordings
 
 
 @dataclass(frozen=True)
 class Workload:
-    """How much is measured.
+    """The amount of work.
 
+    seeds: number of seeds on the synthetic scenes.
     planned_s: fitting times on the synthetic scenes, each from scratch.
-    recorded_s: those on the recorded scenes.
+    recorded_s: fitting times on the recorded scenes.
+    rate_repeats: number of fits for the rates.
     """
 
     seeds: int
@@ -73,9 +75,9 @@ QUICK = Workload(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{start: {FIELD: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series, seconds_to_db,
-    ...}}}; recorded scenes where FRESHFIELD_DATA names their folder. FIELD: with the options that change it,
-    with which a start is not measured. BenchError: a scene that was asked for cannot be had."""
+    """Measure {start: {FIELD: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series,
+    seconds_to_db, ...}}}; recorded scenes if FRESHFIELD_DATA names their folder. With options, FIELD contains
+    them, and the start is not measured. Raises BenchError if a requested scene is not available."""
     workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
     lpips, missing = open_lpips(run.lpips)
     stills = list(_stills(run.scenes))
@@ -109,7 +111,7 @@ def _curve_and_rates(
 
 
 def _stills(asked: Sequence[str]) -> Iterable[tuple[str, MultiviewStill]]:
-    """The scenes that were asked for, or all that can be had."""
+    """The requested scenes, or all available ones. Raises BenchError."""
     for scene in asked or SCENES:
         if scene in SYNTHETIC:
             yield scene, synthetic_still(scene, cameras=VIEWS + 1, size=SIZE)
@@ -123,7 +125,7 @@ def _stills(asked: Sequence[str]) -> Iterable[tuple[str, MultiviewStill]]:
 
 
 def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
-    """Compile times and memory, each in a process of its own, cold with an empty kernel cache."""
+    """Compile times and memory, each measured in its own process; cold: with an empty kernel cache."""
     speed = MachineSpeed()
     speed.sample()
     load = LoadMeter()
@@ -133,7 +135,7 @@ def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
         figures["jit_cold_s"], figures["jit_cold_cpu_s"] = cold["jit_s"], cold["jit_cpu_s"]
         cached = _child(field, folder)
     else:
-        _child(field, None, "compile")  # fills the cache if nobody has
+        _child(field, None, "compile")  # fills the cache if necessary
         cached = _child(field, None)
     figures["jit_cached_s"], figures["jit_cached_cpu_s"] = cached["jit_s"], cached["jit_cpu_s"]
     figures["peak_rss_mb"] = cached["peak_rss_mb"]
@@ -185,7 +187,7 @@ def _curve(
 
 
 def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Seconds fitted until each quality; they may be a little more than planned."""
+    """Seconds of fitting until each quality; they may be slightly more than planned."""
     return {
         f"{target}_db": next((r["fitted_s"] for r in series if r["psnr_db"] >= target), None)
         for target in TARGETS_DB
@@ -227,8 +229,9 @@ def _render_ms(field: Field, pose: Any, lens: Pinhole) -> float:
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
-    """PSNR against seconds from scratch, a panel a scene, a line a representation, to ``path`` (PNG)."""
-    from edge_server.report.style import CYCLE, GRAY, figure, label_lines
+    """Draw PSNR against seconds from scratch to ``path`` (PNG), a panel per scene, a line per
+    representation."""
+    from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
     scenes = [name for name, part in figures.items() if isinstance(part, dict) and "scene" in part]
     if not scenes:
@@ -252,7 +255,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Markdown tables: the scenes, the curves, rates on our own scenes, and what a start costs."""
+    """Markdown tables: the scenes, the curves, rates on synthetic scenes, and start-up costs."""
     scenes = {name: part for name, part in figures.items() if isinstance(part, dict) and "scene" in part}
     found = [
         (scene, name, rows)
@@ -313,7 +316,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def _main(field: str, only: str = "") -> None:
-    """In a process of its own: print the time until kernels are ready, and the memory that fitting takes.
+    """Print the time until kernels are ready, and the memory used by fitting; runs in its own process.
 
     only: "compile" leaves the fitting out.
     """

@@ -1,8 +1,8 @@
-"""Cost and gain of foreground segmentation, on images whose alpha is the truth (lego).
+"""Measures cost and gain of foreground segmentation, on images whose alpha is the truth (lego).
 
-The images have no background of their own, so they are composited over two: white, and a cluttered one. The
-clutter depends on the viewing direction alone, so that all cameras see the same place, infinitely far. On the
-clutter a field is fitted, for the same steps, to whole images, to segmented ones, and to the true alpha.
+The images have no background, so they are composited over two: white, and clutter. The clutter depends only
+on the viewing direction, so that all cameras see the same surroundings, infinitely far away. On the clutter a
+field is fitted, with the same number of steps, to whole images, to segmented ones, and to the true alpha.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from edge_server.foreground.foreground import Foreground, make_foreground
 from freshfield.geometry import world_rays
 from freshfield.machine_load import LoadMeter
 
-# Share of a side by which boxes are too large: the accuracy of a detector that was trained for the object.
+# Share of the image's side by which boxes are too large: the accuracy of a detector trained for the object.
 BOX_MARGIN = 0.005
 SIDES, ITERATIONS = (80, 160, 320), (1, 3, 5)
 FIELD = "ngp"
-_SEEN = 0.5  # of alpha: the object
+_SEEN = 0.5  # alpha from which a pixel belongs to the object
 _WAVES = 24
 _CLUTTER_SEED = 17
 
@@ -40,8 +40,8 @@ Mask = NDArray[np.bool_]
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """``masks``: IoU and milliseconds of each way to cut, by background. ``field``: PSNR on the object's
-    pixels of held-out views after the same steps. Raises BenchError."""
+    """Measure ``masks``: IoU and milliseconds of each segmentation, by background; and ``field``: PSNR on the
+    object's pixels of held-out views after the same number of steps. Raises BenchError."""
     # Full size for masks, half for the field.
     large, small = _views(1.0), _views(2.0)
     some = large[:: 25 if run.quick else 10]
@@ -63,7 +63,7 @@ def _views(scale: float) -> tuple[View, ...]:
 
 
 def true_mask(view: View) -> Mask:
-    """(H, W): the object, by the image's own alpha."""
+    """The object's pixels (H, W), by the image's alpha."""
     return view.image[..., 3] > 255 * _SEEN
 
 
@@ -72,7 +72,7 @@ def _white(view: View) -> NDArray[np.uint8]:
 
 
 def _clutter(view: View) -> NDArray[np.uint8]:
-    """Waves of all directions and some edges, in every color, with as much contrast as the object."""
+    """Composite over waves in all directions and some edges, in all colors, with the object's contrast."""
     _, rays = world_rays(view.intrinsics, view.camera_to_world)
     rng = np.random.default_rng(_CLUTTER_SEED)
     waves = rng.normal(0.0, 9.0, (_WAVES, 3))
@@ -100,7 +100,7 @@ def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
 
 
 def _masks(views: Sequence[View], compose: Callable[[View], NDArray[np.uint8]]) -> dict[str, Any]:
-    """By way to cut: mean and worst IoU with the truth, and median milliseconds an image."""
+    """By segmentation: mean and worst IoU with the truth, and median milliseconds per image."""
     boxes = {view.camera: true_box(view) for view in views}
     composed = [(view.camera, compose(view), true_mask(view)) for view in views]
     ways = {BOX: ForegroundConfig(boxes=boxes, segment=BOX)}
@@ -128,7 +128,7 @@ def _masks(views: Sequence[View], compose: Callable[[View], NDArray[np.uint8]]) 
 
 
 def _foreground_mask(image: NDArray[np.uint8]) -> Mask:
-    """The pixels that an image still shows: all of them where it was passed through whole."""
+    """The pixels that an image still shows; all if it was passed on whole."""
     return image[..., 3] > 0 if image.shape[2] == 4 else np.ones(image.shape[:2], np.bool_)
 
 
@@ -137,8 +137,8 @@ def _iou(a: Mask, b: Mask) -> float:
 
 
 def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
-    """By what was fitted: PSNR on the object's pixels of the views held out (every eighth), mean and seeds'
-    spread; IoU of the masks it was fitted with; seconds of fitting."""
+    """By set of training images: PSNR on the object's pixels of the held-out views (every eighth), mean and
+    range over seeds; IoU of the training masks; seconds of fitting."""
     training = [view for k, view in enumerate(views) if k % 8]
     held_out = views[::8]
     boxes = {view.camera: true_box(view) for view in training}
@@ -182,7 +182,7 @@ def _cut(cut: Foreground, view: View) -> View:
 
 
 def _with_alpha(seen: View, view: View) -> View:
-    """``seen`` with the true mask: the object's edges carry the background's color, as with any mask."""
+    """``seen`` with the true mask: the object's edges include the background's color, as with any mask."""
     mask = true_mask(view)
     image = np.dstack([np.where(mask[..., None], seen.image, 0), np.where(mask, 255, 0)]).astype(np.uint8)
     return dataclasses.replace(seen, image=image)

@@ -1,4 +1,5 @@
-"""A real edge server that trains, and a real client: how long an answer takes and whether memory grows."""
+"""Measures a real edge server that trains, with a real client: the time of answers and the growth of
+memory."""
 
 from __future__ import annotations
 
@@ -33,8 +34,8 @@ from freshfield.v1 import frames_pb2_grpc
 CAMERAS, SIZE = 18, 128
 RATES = (15, 33)
 TARGET_P99_MS = 20.0
-_IMAGES = 8  # different frames of a camera, shown in turn
-_START_S = 180.0  # compiling every kernel on a busy machine
+_IMAGES = 8  # number of different frames of a camera, sent in turn
+_START_S = 180.0  # longest start: compiling all kernels on a busy machine
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
@@ -48,7 +49,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _at_rate(
     out: Path, scene: Scene, frames: dict[str, list[bytes]], fps: float, seconds: float
 ) -> dict[str, Any]:
-    """One server, one rate. Raises BenchError."""
+    """Measure one server at one frame rate. Raises BenchError."""
     out.mkdir(parents=True)
     with _edge_server(out, list(frames), fps) as (process, address):
         return asyncio.run(_drive(process, address, out, scene, frames, fps, seconds))
@@ -58,8 +59,11 @@ def _at_rate(
 class _Tally:
     """Counts over all cameras.
 
-    answer_ms: of accepted frames since counting began.
-    missed: ticks at which the last frame had no answer yet (one frame unacknowledged, as a node keeps it).
+    counting: whether frames are counted now.
+    answer_ms: milliseconds from sending a frame to its answer.
+    missed: number of ticks at which the last frame had no answer yet (like a node, the client has at most one
+        unacknowledged frame).
+    refused: number of frames that were not accepted.
     """
 
     counting: bool = False
@@ -118,7 +122,7 @@ async def _drive(
 async def _camera(
     channel: Any, scene: Scene, camera: str, images: list[bytes], fps: float, tally: _Tally
 ) -> None:
-    """Push a frame a tick over one stream; a tick at which the last one is unanswered is missed."""
+    """Push a frame per tick over one stream; a tick at which the last frame is unanswered is missed."""
     lens, matrix = scene.cameras[camera]
     pose, clock, session = Pose.from_matrix(matrix), WallClock(), f"bench-{os.getpid()}"
     outgoing: asyncio.Queue[pb.PushRequest] = asyncio.Queue()
@@ -148,7 +152,7 @@ async def _camera(
 
 
 async def _until_training(process: subprocess.Popen[bytes], out: Path, cameras: list[Any]) -> None:
-    """Until the field has published twice: from then on it trains without a break."""
+    """Wait until the field has published twice; from then on it trains without a break. Raises BenchError."""
     begun = time.perf_counter()
     while _updates(out) < 2:
         for task in cameras:

@@ -2,11 +2,11 @@
 
 The limits are measured: random reads and writes of one vertex (two float32, as in the hash tables) in tables
 of several sizes, arithmetic in registers, divisions, and copies within a core's own cache. Multiply-adds of
-BLAS, on one large and one narrow matrix, are shown for comparison; they are no limit, because on a processor
-that BLAS was not tuned for they reach half of what is possible. A kernel's floor is the least time that all
-cores together need for the slowest of its reads, writes and arithmetic, which overlap. The rest of its time
-is spent on addresses, sampling, marching, branches and waiting. Measured for ``ngp`` and ``splat``: the
-default and the fastest field.
+BLAS, on one large and one narrow matrix, are shown for comparison; they are not a limit, because on a
+processor that BLAS was not tuned for they reach half of what is possible. A kernel's floor is the least time
+that all cores together need for the slowest of its reads, writes and arithmetic, which overlap. The rest of
+its time is spent on addresses, sampling, marching, branches and waiting. Measured for ``ngp`` and ``splat``,
+the default and the fastest field.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from edge_server.fields.splat.settings import SplatSettings
 from freshfield.machine_load import LoadMeter
 
 TABLES_MB = (1, 4, 64)
-CORNERS = 8  # of a cell, each read once a level and sample, and written once by its gradient
+CORNERS = 8  # corners of a cell, each read once per level and sample, and written once by its gradient
 WARM_STEPS = 600
-LEAST_SHARE = 0.01  # of a step: kernels below it have no row in the table
+LEAST_SHARE = 0.01  # share of a step below which kernels have no row in the table
 LIMITS = {
     **{f"reads_{mb}mb_m_per_s": f"million random reads a second from {mb} MB" for mb in TABLES_MB},
     **{f"adds_{mb}mb_m_per_s": f"million random additions a second to {mb} MB a core" for mb in TABLES_MB},
@@ -60,13 +60,14 @@ LIMITS = {
     "copies_gb_per_s": "GB copied a second within a core's cache",
 }
 
-# Operations of the Gaussians' kernels, counted in their sources: additions, multiplications, comparisons and
-# conversions, a multiplication with the addition that follows it as one. Of a pixel and a Gaussian in one of
-# its strips, forward (a power of 2 is 12 of them) and back (folding the sums of lanes is 11):
+# Numbers of operations of the Gaussians' kernels, counted in their sources: additions, multiplications,
+# comparisons and conversions; a multiplication with the following addition counts as one. Per pixel and
+# Gaussian in one of its strips, forward (12 of them for a power of 2) and backward (11 of them for adding up
+# lanes):
 COMPOSITING, COMPOSITING_BACK = 33, 31
-# Of a Gaussian: its projection; the backward pass of the projection and a step of Adam.
+# Per Gaussian: its projection; the backward pass of the projection and a step of Adam.
 PROJECTING, UPDATING = 300, 680
-# Moves of a sorted Gaussian (counted and moved, twice) and of a pair (counted, owned, listed).
+# Moves per sorted Gaussian (counted and moved, twice) and per pair (counted, owned, listed).
 SORTING, BINNING = 4, 3
 
 
@@ -85,9 +86,9 @@ class TimedPool(Pool):
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """The limits of the machine and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share
-    of a step, its milliseconds a step and the share of them that its floor explains."""
-    pool = TimedPool(cores())  # as many as the limits are measured with
+    """Measure the limits of the machine and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each
+    kernel's share of a step, its milliseconds per step and the share of these that its floor explains."""
+    pool = TimedPool(cores())  # as many threads as for the limits
     load = LoadMeter()
     limits = Limits(repeats=5 if run.quick else 15)
     figures: dict[str, Any] = {}
@@ -128,14 +129,14 @@ def _higher(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
 
 
 def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
-    """Millions of random vertex reads and of random vertex additions a second, all workers together, by
-    table size; billions of float32 multiply-adds a second, of any operations, of BLAS's multiply-adds
-    (2048 x 2048; 65536 x 32 x 32), of divisions, and of bytes copied from 256 kB to 256 kB."""
+    """Measure, for all workers together, millions of random vertex reads and random vertex additions a
+    second, by table size; and billions a second of float32 multiply-adds, of any operations, of BLAS's
+    multiply-adds (2048 x 2048; 65536 x 32 x 32), of divisions, and of bytes copied from 256 kB to 256 kB."""
     limits: dict[str, float] = {}
     rng = np.random.default_rng(0)
     for megabytes in TABLES_MB:
         vertices = megabytes * 2**20 // (4 * FEATURES)
-        # All workers read one table, as the fields do. Each adds to its own, as in the gradient's kernel.
+        # All workers read one table, as in the fields. Each adds to its own, as in the gradient's kernel.
         tables = np.zeros((pool.threads, vertices, FEATURES), np.float32)
         rows = rng.integers(0, vertices, PER_TASK).astype(np.uint32)
         add_s = median_s(repeats, partial(pool.run, random_adds, tables, rows))
@@ -193,8 +194,8 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:
     """Counts of a field's last step, on one image: Gaussians, visible Gaussians, pairs of a Gaussian and a
-    tile, and strips that are reached by pairs that changed a pixel (the other pairs are hidden). Some of
-    these strips may have been opaque already, so the floor is a little high where much is hidden."""
+    tile, and strips reached by pairs that changed a pixel (the other pairs are hidden). Some of these strips
+    may already have been opaque, so the floor is slightly too high if much is hidden."""
     raster, count = field._raster, len(field.cloud)
     lists, pairs = raster.lists, int(raster.lists.needed[0])
     used = (raster.sums[0, :pairs] != 0.0).any(axis=-1)
@@ -211,7 +212,7 @@ def _counted(field: SplatField) -> tuple[int, int, int, int]:
 
 
 def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: TimedPool) -> dict[str, Any]:
-    """Time of each kernel in the reported steps, and the parts of its floor, in milliseconds a step."""
+    """Time of each kernel in the reported steps, and the parts of its floor, in milliseconds per step."""
     spent_ms = {name: s / report.steps * 1e3 for name, s in sorted(pool.seconds.items(), key=lambda i: -i[1])}
     kernels: dict[str, Any] = {}
     for name, ms in spent_ms.items():
@@ -234,13 +235,13 @@ def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: Timed
 def _floors_of_ngp(
     samples: float, levels: int, widths: list[int], table_mb: float, limits: dict[str, float]
 ) -> dict[str, dict[str, float]]:
-    """Floors of the two kernels that take nearly all the time: milliseconds a step of reads, additions and
+    """Floors of the two kernels that take nearly all the time: milliseconds per step of reads, additions and
     multiply-adds at the machine's limits.
 
     table_mb: size of one level, which a pass reads.
 
-    The floor of ``scatter`` counts every sample, but the kernel leaves out those without a gradient (behind
-    the first opaque surface), so its share can exceed 1.
+    The floor of ``scatter`` counts all samples, but the kernel skips those without a gradient (behind the
+    first opaque surface), so its share can exceed 1.
     """
     size = min(TABLES_MB, key=lambda mb: abs(np.log(mb / table_mb)))
     vertices = samples * levels * CORNERS
@@ -260,10 +261,10 @@ def _floors_of_splat(
 ) -> dict[str, dict[str, float]]:
     """Floors of the four kernels of a step on one image, in milliseconds at the machine's limits.
 
-    gaussians: in the cloud.
-    seen: in the image.
-    pairs: of a Gaussian and a tile.
-    strips: in which pairs change a pixel.
+    gaussians: number of Gaussians in the cloud.
+    seen: number of Gaussians in the image.
+    pairs: number of pairs of a Gaussian and a tile.
+    strips: number of strips in which pairs change a pixel.
 
     Only operations count, although ``project`` and ``adam_step`` mostly rearrange numbers and ``bin_tiles``
     mostly sorts.
@@ -275,20 +276,20 @@ def _floors_of_splat(
         "train_tiles": {
             "arithmetic": strips * STRIP * (COMPOSITING + COMPOSITING_BACK) / operations,
             "divisions": strips * STRIP / divisions_ms,
-            "copies": strips * SAVED * 4 / copied,  # written once, read once
+            "copies": strips * SAVED * 4 / copied,  # written and read once
         },
         "project": {"arithmetic": gaussians * PROJECTING / operations},
         "bin_tiles": {"moves": (seen * SORTING + pairs * BINNING) / added},
         "adam_step": {
             "arithmetic": (seen * UPDATING + pairs * SUMS) / operations,
-            "divisions": seen * 2 * parameters / divisions_ms,  # roots take as long
+            "divisions": seen * 2 * parameters / divisions_ms,  # square roots take as long
             "copies": pairs * SUMS * 4 / 2 / copied,
         },
     }
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Markdown: the machine's limits, then a row a kernel."""
+    """Markdown tables: the machine's limits, and a row for each kernel."""
     limits = [(LIMITS[k], f"{v:,.0f}" if v >= 100 else f"{v:.1f}") for k, v in figures["machine"].items()]
     head = ("field, scene", "kernel", "ms a step", "of the step", "explained by limits", "by which, ms")
     rows = [

@@ -1,6 +1,6 @@
-"""The optional parts of the representations, and the scenes that call for them or do not.
+"""The optional parts of the representations, and scenes with and without a need for them.
 
-``bench options`` goes through ``OPTIONS``: another option is another line.
+``bench options`` measures all ``OPTIONS``; to add an option, add a line there.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from edge_server.fields import View
 from freshfield.geometry import so3_exp
 
 VIEWS, SIZE = 18, 128
-FEW = 6  # of the training views, spread over them
-GAIN_SPREAD = 0.2  # standard deviation of the logarithm of a camera's gain, a channel
+FEW = 6  # number of training views, evenly spread, of scenes with few views
+GAIN_SPREAD = 0.2  # standard deviation of the logarithm of a camera's gain in each channel
 POSE_M, POSE_DEG = 0.01, 1.0
-LATE_FRAMES = 4  # of 1/15 s: views up to 267 ms old
+LATE_FRAMES = 4  # frames of 1/15 s: views are up to 267 ms old
 
 
 @dataclass(frozen=True)
 class Option:
-    """One optional part of a representation. off, on: settings of a field. scenes: of ``SCENES``."""
+    """One optional part of a representation. off, on: options of a field. scenes: keys of ``SCENES``."""
 
     name: str
     off: Mapping[str, Any]
@@ -40,7 +40,6 @@ class Option:
     scenes: tuple[str, ...]
 
 
-# Another option is another line here.
 OPTIONS: tuple[Option, ...] = (
     Option("view-dependent color", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
     Option("exposure", {"exposure": False}, {"exposure": True}, ("room, gains", "room")),
@@ -80,9 +79,10 @@ OPTIONS: tuple[Option, ...] = (
 
 @dataclass(frozen=True)
 class Scene:
-    """What a field is fitted to and scored on: a still from scratch, or a sequence, updates after motion.
+    """The views that a field is fitted to and scored on: a still, from scratch, or a sequence, in updates.
+    Scores of a sequence are means over the updates.
 
-    late: views of a sequence are up to so many frames old. Scores of a sequence are means over the updates.
+    late: largest age of the views of a sequence, in frames.
     """
 
     still: MultiviewStill | None = None
@@ -142,7 +142,7 @@ MOVING = ("room, moving", "room, late", "kitchen, moving")
 
 
 def with_gains(views: Sequence[View], spread: float, seed: int = 3) -> tuple[View, ...]:
-    """The views, each with a gain a channel of its own, log-normal, 1 on average (geometric)."""
+    """Multiply each view with random gains, one per channel, log-normal with a geometric mean of 1."""
     gains = np.exp(np.random.default_rng(seed).normal(0.0, spread, (len(views), 3)))
     gains /= np.exp(np.log(gains).mean(axis=0))
     images = [np.clip(v.image[..., :3] * g + 0.5, 0.0, 255.0).astype(np.uint8) for v, g in zip(views, gains)]
@@ -150,8 +150,8 @@ def with_gains(views: Sequence[View], spread: float, seed: int = 3) -> tuple[Vie
 
 
 def displaced(views: Sequence[View], size_m: float, deg: float, seed: int = 5) -> tuple[View, ...]:
-    """The views, each pose off by ``size_m`` and ``deg`` on average, in any direction. The errors have a mean
-    of zero, because no image could tell their mean from a scene that stands elsewhere."""
+    """Displace the pose of each view by ``size_m`` and ``deg`` on average, in random directions. The errors
+    have a mean of zero, because a common error could not be distinguished from a displaced scene."""
     both = np.random.default_rng(seed).normal(size=(2, len(views), 3))
     both -= both.mean(axis=1, keepdims=True)
     turns, shifts = both / np.linalg.norm(both, axis=2).mean(axis=1)[:, None, None]
@@ -165,7 +165,7 @@ def displaced(views: Sequence[View], size_m: float, deg: float, seed: int = 5) -
 
 
 def missing(scenes: Iterable[str]) -> set[str]:
-    """Those scenes whose recordings are not there; prints why."""
+    """The scenes whose recordings are not available; prints the reasons."""
     out = set()
     for scene in sorted(scenes):
         recording = scene.split(",")[0]

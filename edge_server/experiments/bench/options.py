@@ -1,8 +1,8 @@
-"""Cost in time and gain in dB of each optional part of a representation.
+"""Measures cost in time and gain in dB of each optional part of a representation.
 
-Every option is measured off and on, everything else at its default: after the same number of steps (its gain)
-and after the same seconds (its gain for its time). Some scenes need an option (different gains of the
-cameras, slightly wrong poses, motion); on the others it should cost nothing. A representation without an
+Every option is measured off and on, with all others at their defaults: after the same number of steps (its
+gain) and after the same time (its gain including its cost). Some scenes need an option (different gains of
+the cameras, slightly wrong poses, motion); on the others it should not harm. A representation without an
 option has no rows for it.
 """
 
@@ -28,7 +28,14 @@ from freshfield.machine_load import LoadMeter
 
 @dataclass(frozen=True)
 class Workload:
-    """Budgets from scratch and of an update, in steps and seconds. warm_steps: before the first update."""
+    """The amount of work.
+
+    seeds: number of seeds.
+    steps, seconds: budgets of fits from scratch.
+    updates: number of updates of a sequence.
+    update_steps, update_s: budgets of an update.
+    warm_steps: steps before the first update.
+    """
 
     seeds: int
     steps: int
@@ -44,7 +51,7 @@ class Workload:
         return {f"{steps}_steps": Budget(steps=steps), **{f"{s:g}_s": Budget(seconds=s) for s in seconds}}
 
     def seconds_of(self, moving: bool) -> float:
-        """What one point takes, roughly."""
+        """Approximate time of one point."""
         once = sum(b.seconds or 0.01 * (b.steps or 0) for b in self.budgets(moving).values())
         return self.seeds * (once * (self.updates if moving else 1) + 0.01 * self.warm_steps * moving)
 
@@ -54,10 +61,10 @@ QUICK = Workload(1, 150, (2.5,), 4, 25, (0.25,), 300)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{points: {SCENE: {FIELD: {SETTINGS: figures}}}, rows: [...], left_out: {FIELD: {option: why}}}.
+    """Measure {points: {SCENE: {FIELD: {SETTINGS: figures}}}, rows: [...], left_out: {FIELD: {option: why}}}.
 
-    Points that several rows share (everything at its default) are measured once. BenchError: no option has
-    the name that was asked for.
+    Points that several rows share (with all options at their defaults) are measured once. Raises BenchError
+    for an unknown option.
     """
     workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
     if unknown := set(run.only) - {o.name for o in OPTIONS}:
@@ -102,7 +109,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _point(
     name: str, make: Callable[[str], Scene], scene: str, options: Mapping[str, Any], workload: Workload
 ) -> dict[str, Any]:
-    """One representation with some settings on one scene: medians over seeds."""
+    """Measure one representation with some options on one scene: medians over seeds."""
     make_field(name, options).warm_up()
     load, where = LoadMeter(), make(scene)
     fit = partial(_updates, where, workload) if where.sequence is not None else partial(_from_scratch, where)
@@ -141,7 +148,7 @@ def _from_scratch(where: Scene, model: Field, budget: Budget) -> _Fitted:
 
 
 def _updates(where: Scene, workload: Workload, model: Field, budget: Budget) -> _Fitted:
-    """Frame after frame of a sequence, from a field that has settled on the first."""
+    """Update a field frame by frame of a sequence, after it has converged on the first frame."""
     sequence, scorer = where.sequence, Scorer()
     assert sequence is not None
     model.fit(sequence.training(0, where.late), Budget(steps=workload.warm_steps))
@@ -159,8 +166,8 @@ def _updates(where: Scene, workload: Workload, model: Field, budget: Budget) -> 
 
 
 def rows(points: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Off beside on, for every option, scene and representation of which both are measured. points: as
-    ``measure`` keeps them."""
+    """Compare off and on for every option, scene and representation for which both are measured. points: as
+    in the result of ``measure``."""
     names = dict.fromkeys(name for of_scene in points.values() for name in of_scene)
     out = []
     for option in OPTIONS:
@@ -171,7 +178,7 @@ def rows(points: Mapping[str, Any]) -> list[dict[str, Any]]:
                 continue
             for scene in option.scenes:
                 known = points.get(scene, {}).get(name, {})
-                # Of an earlier run with other budgets, one side may still stand there.
+                # One side may be from an earlier run with other budgets.
                 budgets = [known[side]["settings"] for side in sides if side in known]
                 if len(budgets) == 2 and budgets[0] == budgets[1]:
                     row = {"option": option.name, "scene": scene, "field": name}
@@ -194,7 +201,7 @@ def _minus(a: float | None, b: float | None) -> float | None:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Two Markdown tables: fits from scratch, and updates after motion (moving pixels in parentheses)."""
+    """Two Markdown tables: fits from scratch, and updates during motion (moving pixels in parentheses)."""
     every = figures.get("rows", [])
     shown = dict.fromkeys(r["scene"] for r in every)
     texts = ["\n".join(f"- `{scene}`: {figures['scenes'][scene]}" for scene in shown)] if every else []

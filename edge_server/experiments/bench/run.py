@@ -1,4 +1,4 @@
-"""Shared by the parts of the bench: their request, the recordings, the settings of a result."""
+"""Code shared by the parts of the bench: their request, the recordings, the settings of a result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edge_server.experiments.common.result_store import ResultStore, settings_di
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
 from edge_server.fields.registry import settings_of
 
-# Recordings below the data folder: what is opened, and what is held out.
+# Recordings: path below the data folder, and held-out views.
 RECORDINGS = {
     "kitchen": ("blender_kitchen/transforms.json", "cam00"),
     "lego": ("lego_synthetic", "8"),
@@ -30,16 +30,17 @@ class BenchError(RuntimeError):
 
 @dataclass
 class BenchRun:
-    """What is asked of one part of the bench; a part uses what it needs.
+    """The request to one part of the bench; a part uses what it needs.
 
     quick: fewer repetitions.
-    folder: an empty folder for the part's temporary files.
-    lpips: folder of LPIPS weights; None: that of the environment.
-    fields: the representations to measure; none: all there are.
-    store: results of this part, those of an earlier run among them.
-    scenes, options: of field, track and drift, see the command; none: the part's own.
-    only: names of options to try; none: all.
-    model: a YOLO ONNX file instead of the shipped ones.
+    folder: an empty folder for temporary files.
+    lpips: folder of LPIPS weights; None: from the environment.
+    fields: the representations to measure; empty: all.
+    store: results of this part, including those of an earlier run.
+    scenes: the scenes to measure; empty: the part's default.
+    options: options of the representations.
+    only: names of the options (or of the parts of surface) to measure; empty: all.
+    model: a YOLO ONNX file; None: the shipped ones.
     """
 
     quick: bool
@@ -56,23 +57,24 @@ class BenchRun:
 def result_settings(
     workload: Any, name: str, options: Mapping[str, Any] | None = None, **more: Any
 ) -> dict[str, Any]:
-    """The settings that a result is stored with: how much was measured, and the representation's own.
+    """The settings with which a result is stored: of the workload and of the representation.
 
-    workload: a dataclass. name, options: of the representation.
+    workload: a dataclass.
+    name, options: name and options of the representation.
     """
     return {**dataclasses.asdict(workload), "defaults": settings_digest(name, options), **more}
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:
-    """Settings of a representation as text, without those at their default. ValueError for unknown settings
-    or values."""
+    """Options of a representation as text, without those at their defaults. Raises ValueError for unknown
+    options or invalid values."""
     usual, chosen = settings_of(name), settings_of(name, options)
     different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
     return ", ".join(f"{k}={v}" for k, v in different.items()) or "default"
 
 
 def data_file(name: str) -> Path:
-    """A file or folder of the data folder. DatasetError where FRESHFIELD_DATA is not set."""
+    """A file or folder of the data folder. Raises DatasetError if FRESHFIELD_DATA is not set."""
     data = os.environ.get("FRESHFIELD_DATA")
     if not data:
         raise DatasetError(f"set FRESHFIELD_DATA to the folder that holds {name.split('/')[0]}")
@@ -80,6 +82,6 @@ def data_file(name: str) -> Path:
 
 
 def open_recording(name: str, scale: float) -> MultiviewStill:
-    """One of ``RECORDINGS``, its images divided by ``scale``. DatasetError where it is not there."""
+    """Open one of ``RECORDINGS``. scale: divides the image sizes. Raises DatasetError."""
     path, holdout = RECORDINGS[name]
     return open_still(str(data_file(path)), holdout=holdout, scale=scale)

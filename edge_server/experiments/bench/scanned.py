@@ -1,10 +1,10 @@
-"""From pixels to the mesh of one object: the tile on its bench (scenario ``scan``), cut out in several ways.
+"""Measures meshes of one object: the tile on its bench (scenario ``scan``), segmented in several ways.
 
-A camera's viewpoints are those that the scenario asks its arm for. A field is fitted to whole
-images, and to images cut by the scenario's own ``edge.foreground``, by GrabCut in its detector's boxes, by
-these boxes alone, and by true masks. Of each the mesh is compared with the tile's surface, bench and tools
-not being part of it: error, the share of the surface within 3 mm of the mesh, and the share of the mesh that
-is tile. Of whole images, a mesh is also made within the tile's box in space, given by hand.
+The viewpoints are those of the scenario's arm. A field is fitted to whole images, and to images cut by the
+scenario's ``edge.foreground``, by GrabCut in its detector's boxes, by these boxes, and by true masks. Each
+mesh is compared with the tile's surface, without bench and tools: error, the share of the surface within 3 mm
+of the mesh, and the share of the mesh within 3 mm of the surface. From whole images, a mesh is also made
+within the tile's bounding box, given by hand.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from freshfield.machine_load import LoadMeter
 from freshfield.scenario import load
 
 SCENARIO = "scan"
-SPACING_M = 0.0015  # between points of the truth
-ABOVE_M = 0.015  # where a box by hand begins, above the lower end of the scene's bounds
+SPACING_M = 0.0015  # spacing of the points of the truth
+ABOVE_M = 0.015  # lower end of the box by hand, above that of the scene's bounds
 _WHOLE, _BY_HAND, _TRUE = "whole images", "whole images, mesh cut to a box by hand", "true masks"
 WAYS: tuple[str, ...] = (_WHOLE, "box", "grabcut", "detector", _TRUE)
 
@@ -46,9 +46,9 @@ Mask = NDArray[np.bool_]
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{views, size, steps, rows: {way: facts}}. BenchError: an extra is missing."""
+    """Measure {views, size, steps, rows: {way: facts}}. Raises BenchError if an extra is missing."""
     try:
-        import skimage  # noqa: F401 -- said before minutes of fitting, not after
+        import skimage  # noqa: F401 -- checked before the fits, which take minutes
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
     size, step_deg, steps = (96, 24.0, 100) if run.quick else (192, 15.0, 400)
@@ -69,7 +69,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     for way in WAYS:
         given, facts = _cut(way, views, masks, edge)
-        # Whole images go on beyond the tile: their field has no known end.
+        # Whole images show more than the tile, so the bounds of their field are unknown.
         field, began = make_field(edge.field, {} if way == _WHOLE else edge.field_options, seed=0), _now()
         field.fit(given, Budget(steps=steps))
         maps = make_depth_maps(field.snapshot(), given, MeshSettings())
@@ -89,7 +89,8 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _cut(
     way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfig
 ) -> tuple[list[View], dict[str, Any]]:
-    """The views as they are given to the field; their masks' IoU (mean, least) and milliseconds an image."""
+    """The views as given to the field; and the masks' IoU (mean, least) and milliseconds per image. Raises
+    BenchError."""
     if way == _WHOLE:
         return list(views), {}
     if way == _TRUE:
@@ -106,7 +107,7 @@ def _cut(
     out, ious = [], []
     for view, mask in zip(views, masks):
         image, weight = cut.apply(view.camera, view.image)
-        # An image in which nothing was found is used whole.
+        # An image in which nothing is found is used whole.
         found = found_mask(image, full=True)
         ious.append(0.0 if found is None else iou(found, mask))
         out.append(dataclasses.replace(view, image=image, weight=weight))
@@ -118,7 +119,7 @@ def _cut(
 
 
 def _box(scene: Scene) -> tuple[Corner, Corner]:
-    """The box that a person would put around the tile: its own, ending a little above the bench."""
+    """A bounding box of the tile as a person would choose it: its bounds, from slightly above the bench."""
     (x0, y0, z0), (x1, y1, z1) = make_scene(scene.name, {"count": 1}).bounds.tolist()
     return (x0, y0, z0 + ABOVE_M), (x1, y1, z1)
 
@@ -138,7 +139,7 @@ def _said(row: dict[str, Any]) -> str:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """One Markdown table: a row a way to cut."""
+    """A Markdown table with a row per segmentation."""
     about = (
         f"The tile on the bench of `{SCENARIO}`, {figures['views']} images of {figures['size']} x "
         f"{figures['size']}, {figures['field']}, {figures['steps']} steps; outside cores: "

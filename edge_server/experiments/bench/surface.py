@@ -1,10 +1,10 @@
-"""Mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
+"""Measures mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
 
 A field is fitted to a scan of ``tile`` from 0.3 m (``scenes.tile_scan``). After each fitting time its depth
 is compared with the exact depth, and meshes are made: from the depth of the field, and from depth sharpened
 by the images (``surface.refine_depth``), with truncated signed distances at several voxel sizes and with a
-fitted distance function. Row ``exact`` fuses the exact depth: the
-best that images of this size and these cameras allow.
+fitted distance function. Row ``exact`` fuses the exact depth, which is the best possible result with images
+of this size and these cameras.
 
 The same is measured from the viewpoints of scenario ``cell``, with its field after ``CELL_STEPS`` steps.
 """
@@ -50,14 +50,14 @@ from edge_server.surface.metrics import (
 from edge_server.surface.reconstruct import MeshSettings, make_depth_maps, mesh_from_depth_maps
 from freshfield.machine_load import LoadMeter
 
-# What is fitted, by name: representation and options.
+# Cases by name: representation and options.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "splat": ("splat", {}),
     "splat, planar": ("splat", {"flatten": 0.02, "align": 0.3}),
     "ngp": ("ngp", {}),
     "voxel": ("voxel", {}),
 }
-# Depth that meshes are made from, and the settings that make it.
+# Kinds of depth for meshes, and their settings.
 DEPTHS = {
     "of the field": MeshSettings(sharpen=False),
     "sharpened": MeshSettings(),
@@ -71,13 +71,13 @@ TARGET = (
 
 @dataclass(frozen=True)
 class Workload:
-    """How much is measured.
+    """The amount of work.
 
-    size: pixels a side of the images.
+    size: width and height of the images.
     fit_s: seconds of fitting after which meshes are made.
-    voxels_mm: of the sharpened meshes; the others are made at the middle one.
-    cases: of ``CASES``.
-    cell_sizes: pixels a side of the images from the cell's viewpoints.
+    voxels_mm: voxel sizes of the sharpened meshes; the others are made with the middle one.
+    cases: keys of ``CASES``.
+    cell_sizes: widths (and heights) of the images from the cell's viewpoints.
     """
 
     size: int
@@ -92,10 +92,11 @@ QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"), (128,))
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{cell: {SIZE: {...}}, scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}; the cell alone where
-    ``run.only`` says so. BenchError: scikit-image is missing."""
+    """Measure {cell: {SIZE: {...}}, scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}; only the
+    cell if ``run.only`` says so. Raises BenchError if scikit-image is missing, or for an unknown
+    ``run.only``."""
     try:
-        import skimage  # noqa: F401 -- said before minutes of fitting, not after
+        import skimage  # noqa: F401 -- checked before the fits, which take minutes
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
     if set(run.only) - {"cell"}:
@@ -116,7 +117,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
         "truth_points": len(truth.points), "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
     }  # fmt: skip
     exact = [exact_depth(close.scene, view) for view in close.views]
-    # Results of other stages are measured anew, those of other cases are not.
+    # Results with other settings are measured again; a change of the cases alone keeps them.
     about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm,
              "depths": list(DEPTHS)}  # fmt: skip
     store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
@@ -136,7 +137,7 @@ def _exact_meshes(
 
 
 def _cell(size: int) -> dict[str, Any]:
-    """The mesh as ``edge-server export`` makes it, from the cell's viewpoints, and the one of exact depth."""
+    """Measure the mesh of ``edge-server export`` from the cell's viewpoints, and the one from exact depth."""
     close = cell_scan(size)
     truth, exact = surface_truth(close, SPACING_M), [exact_depth(close.scene, v) for v in close.views]
     field = make_field(CELL_FIELD, close.options)
@@ -168,7 +169,7 @@ def _case(
     truth: Truth,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fits of one case, each continuing the one before."""
+    """Measure one case: fits that each continue the previous one."""
     representation, options = CASES[name]
     field = make_field(representation, {**close.options, **options})
     field.warm_up()
@@ -201,7 +202,7 @@ def _case(
 
 
 def _depth_error(maps: Sequence[DepthMap], exact: Sequence[NDArray[np.float64]]) -> dict[str, float]:
-    """Means over the maps, and the share of surface pixels that have a depth."""
+    """Mean depth errors over the maps, and the share of surface pixels that have a depth."""
     rows = [depth_error_mm(np.where(m.seen, m.depth, 0), e) for m, e in zip(maps, exact)]
     out = {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
     covered = [float(m.seen[np.isfinite(e)].mean()) for m, e in zip(maps, exact)]
@@ -209,7 +210,7 @@ def _depth_error(maps: Sequence[DepthMap], exact: Sequence[NDArray[np.float64]])
 
 
 def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, truth: Truth) -> dict[str, Any]:
-    """One mesh, measured. ``seconds`` are those of all stages after the depth maps."""
+    """Make and measure one mesh. ``seconds``: of all stages after the depth maps."""
     row: dict[str, Any] = {"method": method, "depth": depth, "voxel_mm": voxel_mm}
     began = time.perf_counter()
     try:

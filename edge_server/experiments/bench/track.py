@@ -1,9 +1,9 @@
-"""Updates after motion: the gap between a field that follows a moving scene and one fitted from scratch.
+"""Measures the gap between a field that follows a moving scene and one fitted from scratch.
 
 A field that has converged on the first frame gets a short update with all training views of the next frame,
 and so on; each update is scored on the held-out camera at its frame. At some frames a new field of the same
-representation is fitted to the same views for fifteen seconds: its score is the reference of the follower.
-Between those frames it is interpolated.
+representation is fitted to the same views for fifteen seconds; its score is the reference for the follower,
+and is interpolated between those frames.
 """
 
 from __future__ import annotations
@@ -40,18 +40,21 @@ from edge_server.fields.registry import field_names, make_field
 from freshfield.machine_load import LoadMeter
 
 NEAR_DB = 0.5
-FRESH_S = 15.0  # a fresh fit
+FRESH_S = 15.0  # duration of a fresh fit
 _METRICS = {"whole": "psnr_db", "moving": "psnr_moving_db"}
 SCENES = ("room", "kitchen")
 
 
 @dataclass(frozen=True)
 class Workload:
-    """How much is measured.
+    """The amount of work.
 
-    update_s: seconds of an update, each tried in a run of its own.
-    samples: frames at which a fresh field is fitted, among them the first one, where the follower starts.
-    options: settings of the field.
+    updates: number of updates of a run.
+    update_s: durations of an update, one run for each.
+    samples: number of frames at which a fresh field is fitted, including the first, where the follower
+        starts.
+    cameras, size, speed_m_per_s, fps: of the synthetic scene.
+    options: options of the field.
     """
 
     updates: int = 100
@@ -68,26 +71,26 @@ class Workload:
         return sorted({round(f) for f in np.linspace(0, self.updates, max(2, self.samples))})
 
     def seconds(self) -> float:
-        """Of all fits of one representation on one scene."""
+        """Duration of all fits of one representation on one scene."""
         return sum(self.update_s) * self.updates + FRESH_S * len(self.sampled())
 
 
 FULL = Workload()
 QUICK = Workload(updates=16, samples=3)
-# Of ``drift``: whether the quality of a field that follows a moving scene decreases.
+# For ``drift``: whether the quality of a field that follows a moving scene decreases.
 DRIFT, QUICK_DRIFT = Workload(updates=300), Workload(updates=32, update_s=(0.25,), samples=3)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{SCENE: {scene, baseline, FIELD: {fresh, RUN: {series, gaps, ...}}}} of the fields asked for.
+    """Measure {SCENE: {scene, baseline, FIELD: {fresh, RUN: {series, gaps, ...}}}} of the requested fields.
 
-    Recorded scenes need FRESHFIELD_DATA. BenchError: a scene that was asked for cannot be had.
+    Recorded scenes need FRESHFIELD_DATA. Raises BenchError if a requested scene is not available.
     """
     return _measured(run, QUICK if run.quick else FULL, SCENES)
 
 
 def measure_drift(run: BenchRun) -> dict[str, Any]:
-    """As ``measure``, with more updates, and of ``room`` alone unless scenes are asked for."""
+    """As ``measure``, with more updates, and only for ``room`` unless scenes are requested."""
     return _measured(run, QUICK_DRIFT if run.quick else DRIFT, SCENES[:1])
 
 
@@ -127,7 +130,7 @@ def _sequences(
 
 
 def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress: Progress) -> dict[str, Any]:
-    """One representation on one scene."""
+    """Measure one representation on one scene."""
     load, scorer = LoadMeter(), Scorer()
     figures: dict[str, Any] = {"fresh": {}}
     make_field(name, workload.options).warm_up()
@@ -163,7 +166,7 @@ def _run(
     field: Field, sequence: MultiviewSequence, workload: Workload, seconds: float,
     fresh: Mapping[str, Mapping[str, Any]], scorer: Scorer, progress: Progress, label: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """Updates of one length, one frame after the other."""
+    """Run updates of one duration, frame by frame."""
     rows: list[dict[str, Any]] = []
     for frame in range(1, workload.updates + 1):
         report = field.fit(sequence.training(frame), Budget(seconds=seconds))
@@ -179,7 +182,8 @@ def _run(
 def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Results of one run: the series, and the gap to the fresh fits in each metric.
 
-    rows: one an update. fresh: by frame (as text) the scores of the fresh fits.
+    rows: one per update.
+    fresh: frame (as text) -> scores of the fresh fit.
     """
     series = {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
     frames = [row["frame"] for row in rows]
@@ -198,11 +202,13 @@ def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, 
 def gaps(
     frames: Sequence[int], tracked: Sequence[float | None], fresh: Mapping[int, float]
 ) -> dict[str, Any]:
-    """The gap of a follower, fresh minus tracked in dB; every value None where nothing is known.
+    """The gap of a follower, fresh minus tracked in dB; all values are None if nothing is known.
 
-    frames, tracked: a score an update. fresh: scores of some frames, linearly interpolated over the others
-    (beyond the first and the last: as those). share_near: of the updates within NEAR_DB. first_tenth_db,
-    last_tenth_db: means; drift_db: the latter minus the former.
+    frames, tracked: frame and score of each update.
+    fresh: scores at some frames; linearly interpolated, and constant before the first and after the last.
+
+    Returns, with the mean of the fresh scores and the median gap, share_near: share of the updates within
+    NEAR_DB; first_tenth_db, last_tenth_db: mean gaps; drift_db: the latter minus the former.
     """
     names = ("fresh_mean_db", "share_near", "median_db", "first_tenth_db", "last_tenth_db", "drift_db")
     known = [(f, v) for f, v in zip(frames, tracked) if v is not None]
@@ -226,7 +232,7 @@ def _row(score: Score) -> dict[str, Any]:
 
 
 def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:
-    """(scene, representation, run's name, run, all of the representation) of everything measured."""
+    """Yield (scene, representation, name of the run, run, all results of the representation)."""
     for scene, part in figures.items():
         if not isinstance(part, dict):
             continue
@@ -238,8 +244,8 @@ def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str,
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
-    """PSNR over the updates with the fresh fits as markers, a row a scene, whole image and moving pixels, to
-    ``path`` (PNG). No file where there is nothing to draw."""
+    """Draw PSNR over the updates, with the fresh fits as markers, to ``path`` (PNG): a row per scene, with
+    whole image and moving pixels. Without results no file is written."""
     from edge_server.report.style import figure, label_lines
 
     found = list(_runs(figures))
@@ -257,8 +263,9 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
 
 def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
-    """The lines of all runs and the markers of the fresh fits. of_scene: see ``_runs``, without the scene."""
-    from edge_server.report.style import CYCLE, GRAY
+    """Draw the lines of all runs and the markers of the fresh fits. of_scene: as ``_runs``, without the
+    scene."""
+    from edge_server.report.style import CYCLE, GREY
 
     names = list(dict.fromkeys(name for name, *_ in of_scene))
     runs = list(dict.fromkeys(run for _, run, *_ in of_scene))
@@ -275,13 +282,13 @@ def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
 
 
 def _fresh(rows: Mapping[str, Any], key: str) -> tuple[list[int], list[float]]:
-    """Frames and values of what is known at the frames of the fresh fits."""
+    """Frames of the fresh fits with a value of ``key``, and these values."""
     known = [(int(frame), row[key]) for frame, row in rows["fresh"].items() if row[key] is not None]
     return [frame for frame, _ in known], [value for _, value in known]
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Every run as a row of one Markdown table; whole image, and moving pixels in parentheses."""
+    """A Markdown table with a row per run: whole image, and moving pixels in parentheses."""
     head = (
         "scene|representation|update|updates|PSNR dB (moving)|fresh fit dB|never updated dB|"
         f"within {NEAR_DB} dB of fresh|median gap dB|gap of the first, last tenth dB|"
@@ -290,7 +297,7 @@ def table(figures: dict[str, Any]) -> str:
     rows = []
     for scene, name, run, found, of_field in _runs(figures):
         whole, moving = found["whole"], found["moving"]
-        # At the first frame a field that is never updated is as good as any.
+        # Without the first frame, at which a field that is never updated is as good as the others.
         later = {"fresh": {f: row for f, row in of_field["fresh"].items() if f != "0"}}
         values = [_fresh(later, f"not_updated_{metric}")[1] for metric in _METRICS.values()]
         stayed = [statistics.fmean(v) if v else None for v in values]

@@ -1,1 +1,1 @@
-"""What benches, studies and trainings share: stored results, progress, machine load."""
+"""Code shared by benches, studies and trainings: stored results, statistics, progress, machine speed."""

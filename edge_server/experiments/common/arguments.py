@@ -1,4 +1,4 @@
-"""What the commands share: their parsers, arguments that several have, and how they end."""
+"""Parts that the commands share: parsers, common arguments, and error handling."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folders_of(args: argparse.Namespace) -> Folders:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """An argument type: a whole number of at least ``least``."""
+    """Argparse type: a whole number of at least ``least``."""
 
     def read(text: str) -> int:
         if not text.isdigit() or int(text) < least:
@@ -50,8 +50,8 @@ def at_least(least: int) -> Callable[[str], int]:
 
 
 def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """``KEY=VALUE`` words as settings of a field; values are YAML (8, 0.5, true, [0, 0, 1], white). Raises
-    OptionError."""
+    """Parse words ``KEY=VALUE`` to options of a field; values are YAML (8, 0.5, true, [0, 0, 1], white).
+    Raises OptionError."""
     options: dict[str, Any] = {}
     for word in words:
         key, equals, value = word.partition("=")

@@ -1,7 +1,7 @@
-"""How fast the machine is just now.
+"""Measures the machine's current speed.
 
 The speed of a shared machine changes: two cores may be the two threads of one core for an hour. That doubles
-the time of arithmetic and shows in no load, so measured times stand beside the machine's speed meanwhile.
+the time of arithmetic but does not show in the load, so measured times are reported with the machine's speed.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Row = dict[str, float]
 
 
 class MachineSpeed:
-    """Speed of the machine while something else is measured.
+    """Samples the speed of the machine while something else is measured.
 
-    ``sample`` now and then, some 50 ms each. ``medians`` are over the samples since its last call: billions
-    of float32 multiply-adds in registers a second, and millions of random reads a second, all cores together,
-    as ``bench limits`` measures both.
+    Call ``sample`` now and then (it takes some 50 ms). ``medians`` are over the samples since its last call:
+    billions of float32 multiply-adds in registers a second, and millions of random reads a second, of all
+    cores together, measured as in ``bench limits``.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class MachineSpeed:
         self._samples.append((multiply_adds(self._pool, REPEATS), reads(self._pool, MEGABYTES, REPEATS)))
 
     def medians(self) -> Row:
-        """{} where nothing was sampled."""
+        """Medians by name; {} without samples."""
         samples, self._samples = self._samples, []
         names = ("multiply_adds_g_per_s", f"reads_{MEGABYTES}mb_m_per_s")
         return {name: statistics.median(values) for name, values in zip(names, zip(*samples))}
@@ -90,7 +90,7 @@ def reads(pool: Pool, megabytes: int, repeats: int) -> float:
 
 
 def median_s(repeats: int, work: Callable[[], Any]) -> float:
-    """Median seconds that ``work`` takes, after one call that does not count."""
+    """Median seconds of ``repeats`` calls of ``work``, after one call that is not counted."""
     work()  # compiles, and warms the caches
     spent = []
     for _ in range(repeats):

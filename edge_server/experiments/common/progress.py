@@ -6,9 +6,9 @@ import time
 
 
 class Progress:
-    """How much of a long computation is done.
+    """Progress of a long computation.
 
-    total: all there is to do, in seconds, steps of fitting or any other measure of work.
+    total: amount of work, in seconds, fitting steps or any other unit.
     """
 
     def __init__(self, total: float) -> None:

@@ -1,7 +1,7 @@
-"""Results of a long computation, saved one by one as they come; a rerun computes only what is missing.
+"""Stores the results of a long computation one by one, so that a rerun computes only the missing ones.
 
-One store for all: ``bench`` and ``frontier`` keep their results within the JSON file that they write anyway,
-trials and evaluations in a file of lines that only grows.
+``bench`` and ``frontier`` keep their results in the JSON file that they write anyway, trials and evaluations
+in an append-only file of JSON lines.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Result = dict[str, Any]
 
 
 class ResultStore:
-    """Results by path, a name or several nested ones.
+    """Results by path: one name or several nested ones.
 
-    results: what is known, nested mappings with a result at the end of each path.
-    save: called with path and result as soon as there is a new one; it makes the result outlive the process.
+    results: the known ones, as nested mappings.
+    save: called with the path and the result of each new result, to store it permanently.
     """
 
     def __init__(
@@ -38,8 +38,9 @@ class ResultStore:
 
     @classmethod
     def in_lines(cls, path: Path) -> ResultStore:
-        """Results by content key in a file of JSON lines, ``{"key": ..., **result}``. A torn line counts as
-        none, and of several lines with one key the last one counts. OSError where it cannot be opened."""
+        """A store in a file of JSON lines, ``{"key": ..., **result}``, with one name as path. Incomplete
+        lines are ignored; of several lines with one key the last counts. Raises OSError if it cannot be
+        opened."""
         path.parent.mkdir(parents=True, exist_ok=True)
         results = {}
         for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
@@ -59,8 +60,8 @@ class ResultStore:
             self._lines.close()
 
     def find(self, *path: str, settings: Mapping[str, Any] | None = None) -> Result | None:
-        """The result at ``path`` if it is there, and was computed with the same settings on the same kind of
-        processor."""
+        """The result at ``path`` if it is known; with ``settings``, only if it was computed with these on the
+        same kind of processor."""
         found: Any = self.results
         for name in path:
             found = found.get(name) if isinstance(found, dict) else None
@@ -81,7 +82,7 @@ class ResultStore:
     def get(
         self, *path: str, compute: Callable[[], Result], settings: Mapping[str, Any] | None = None
     ) -> Result:
-        """The result at ``path``, computed where ``find`` does not find it.
+        """The result at ``path``, computed and stored if ``find`` does not find it.
 
         compute: called for a missing result.
         settings: JSON values; results of other settings count as missing.
@@ -94,8 +95,8 @@ class ResultStore:
 
 
 def content_key(parts: Any, length: int = 16) -> str:
-    """A key of everything that decides a result: JSON values, in any order of their names, and the processor
-    this runs on. Compiled kernels use what it has, and another kind rounds other last bits."""
+    """Hash (hex) of everything that determines a result: ``parts`` (JSON values; the order of names does not
+    matter) and the kind of processor, because kernels compiled for another kind round differently."""
     return hashlib.sha256(json.dumps([processor(), parts], sort_keys=True).encode()).hexdigest()[:length]
 
 
@@ -108,8 +109,8 @@ def processor() -> str:
 
 
 def settings_digest(name: str, options: Mapping[str, Any] | None = None) -> str:
-    """A digest of the settings that options of a representation come to. It belongs into the settings of a
-    result: with another default, another thing was measured. ValueError as ``make_field``."""
+    """Digest of all settings of a representation, given its name and options. Put it into the settings of a
+    result, because a changed default changes the result. Raises ValueError as ``make_field``."""
     return hashlib.sha256(repr(settings_of(name, options)).encode()).hexdigest()[:16]
 
 

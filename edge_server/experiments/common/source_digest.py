@@ -1,4 +1,4 @@
-"""A digest of the program's own source: stored results of other code do not count as known."""
+"""Digest of the program's own source, so that stored results of other code are not reused."""
 
 from __future__ import annotations
 

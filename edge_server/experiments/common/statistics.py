@@ -17,7 +17,7 @@ from edge_server.experiments.common.tables import number
 _LEVEL = 0.95
 _Curve = Mapping[float, Mapping[int, float | None]]
 _RESAMPLES = 2000
-# Fewest seeds that are resampled; fewer say too little about how seeds differ.
+# Least number of seeds for resampling; fewer say too little about how seeds differ.
 FEWEST = 5
 
 
@@ -73,7 +73,7 @@ def all_of(answers: Iterable[bool | None]) -> bool | None:
 
 
 def any_of(answers: Iterable[bool | None]) -> bool | None:
-    """Whether some answer is yes, likewise."""
+    """Whether some answer is yes: a single yes decides, otherwise one unknown (None) leaves it unknown."""
     return negated(all_of(map(negated, answers)))
 
 
@@ -114,9 +114,9 @@ def crossed(runs: Sequence[Mapping[int, float | None]]) -> Interval:
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where a curve is best, over seeds.
+    """The optimum of a curve over seeds.
 
-    x: of the best mean.
+    x: where the mean is best.
     low, high: ends of the 95 % interval of x by resampling seeds; NaN for fewer than ``FEWEST``.
     over_first, over_last: how much better the best is than the two ends of the curve. Chosen on one half of
         the seeds and measured on the other, and the other way round, because a maximum is biased upwards on
@@ -140,8 +140,11 @@ class Optimum:
 
 
 def optimum(curve: _Curve, lower_is_better: bool = False) -> Optimum:
-    """The optimum of a curve. curve: x -> seed -> value; seeds that lack a value anywhere are left out.
-    ValueError: none is left."""
+    """The optimum of a curve.
+
+    curve: x -> seed -> value; seeds that lack a value at any x are left out.
+    Raises ValueError if no seed is left.
+    """
     xs = sorted(curve)
     seeds = _common_seeds([curve])
     if not seeds:
@@ -185,7 +188,7 @@ def _chosen(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def at_its_best(curve: _Curve, lower_is_better: bool = False) -> dict[int, float]:
-    """seed -> value of the curve at its best point, which other seeds chose."""
+    """seed -> value of the curve at its best x, which is chosen on the other half of the seeds."""
     seeds = _common_seeds([curve])
     if not seeds:
         return {}
@@ -229,8 +232,8 @@ def move_of_optimum(
 def share_closed(
     policy: Mapping[int, float | None], base: Mapping[int, float | None], limit: Mapping[int, float | None]
 ) -> Interval:
-    """(policy - base) / (limit - base): the share of the way from ``base`` to ``limit``, a ratio of means
-    over the seeds that have all three; its interval by resampling seeds. NaN where the limit is no better."""
+    """(policy - base) / (limit - base), a ratio of means over the seeds that have all three, with an interval
+    by resampling seeds. NaN if the limit is not better than the base."""
     rows = [
         (p, b, n) for s in policy
         if (p := policy[s]) is not None and (b := base.get(s)) is not None and (n := limit.get(s)) is not None

@@ -21,7 +21,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def number(value: float | None, digits: int = 2, sign: str = "") -> str:
-    """A number with so many decimals; "-" where there is none. sign: "+" shows that of positive numbers."""
+    """Format a number with ``digits`` decimals; "-" if it is None or not finite. sign: "+" shows a plus."""
     return "-" if value is None or not math.isfinite(value) else f"{value:{sign}.{digits}f}"
 
 
@@ -31,13 +31,13 @@ def grouped(value: float | None, digits: int = 2) -> str:
 
 
 def median_or_none(values: Iterable[float | None]) -> float | None:
-    """The median of the values that are known; None where none is."""
+    """The median of the values that are not None; None if there are none."""
     known = [v for v in values if v is not None]
     return float(statistics.median(known)) if known else None
 
 
 def mean_or_none(values: Iterable[float | None]) -> float | None:
-    """The mean of the values that are known; None where none is."""
+    """The mean of the values that are not None; None if there are none."""
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known else None
 
@@ -46,8 +46,8 @@ def over_seeds(
     rows: Iterable[Mapping[str, Any]], keys: Sequence[str], names: Sequence[str],
     average: Callable[[Iterable[float | None]], float | None],
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Rows with the same values of ``keys`` as one: these values, how many ``seeds`` there were, and the
-    average of each of ``names``."""
+    """Merge the rows that agree in ``keys``: each result has these values, the number of rows as ``seeds``,
+    and the ``average`` of each of ``names``."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(row[key] for key in keys), []).append(row)

@@ -1,4 +1,4 @@
-"""How worker processes of a long computation begin, and how they end with their parent."""
+"""Starts worker processes of a long computation, and ends them with their parent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_V
 
 class _Process(SpawnProcess):
     def start(self) -> None:
-        """Start with Ctrl-C blocked, which the new process inherits: else it ends one that still imports."""
+        """Start with SIGINT blocked, which the new process inherits; otherwise Ctrl-C ends it during
+        imports."""
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             super().start()
@@ -26,7 +27,7 @@ class _Process(SpawnProcess):
 
 
 class WorkerContext(SpawnContext):
-    """Of processes that ``init_worker`` initializes: fresh ones, to which Ctrl-C never comes."""
+    """Context of worker processes that ``init_worker`` initializes: spawned, and never reached by Ctrl-C."""
 
     Process = _Process
 
@@ -47,13 +48,14 @@ def init_worker(threads: int) -> None:
 def end_at_once(pool: ProcessPoolExecutor) -> None:
     """Shut a pool down without waiting for what its processes are doing."""
     processes = list((pool._processes or {}).values())
-    manager: Any = pool._executor_manager_thread  # a thread, of which typeshed has another opinion
-    # First: a pool that finds its processes dead fails its futures, and one that was cancelled then raises.
+    manager: Any = pool._executor_manager_thread  # a thread; typeshed declares another type
+    # Shut down first: a pool that finds its processes dead fails its futures, and a cancelled one then
+    # raises.
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()
     if manager is not None:
-        manager.join()  # a second shutdown, as at the end of a with, would take the cancelling back
+        manager.join()  # a second shutdown, as at the end of a ``with``, would undo the cancelling
 
 
 def _end_with_parent() -> None:

@@ -1,4 +1,5 @@
-"""``edge-server fit``: a recorded data set without a network, fidelity over seconds of fitting."""
+"""``edge-server fit``: fits a field to a recorded data set without a network, and measures fidelity over
+time."""
 
 from __future__ import annotations
 
@@ -51,8 +52,8 @@ ends it early; report, pictures and checkpoint are written all the same, and --r
 """
 
 BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-_SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
-# Number of training views that are scored where no view is held out.
+_SCENE_SIZE = 128  # image width and height of a synthetic scene, before --scale
+# Number of training views that are scored if no view is held out.
 _SCORED_OF_TRAINING = 8
 
 
@@ -104,10 +105,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(request: argparse.Namespace) -> dict[str, Any]:
-    """Fit, measure and write everything to ``request.out``; returns the contents of report.json. request: of
-    the command line.
+    """Fit, measure and write everything to ``request.out``; returns the contents of report.json.
 
-    Raises DatasetError or OptionError for input that cannot be used.
+    request: the parsed command line.
+    Raises DatasetError or OptionError for invalid input.
     """
     from edge_server.fields.registry import make_field  # numba loads only once the options are read
 
@@ -187,7 +188,7 @@ class _Run:
         return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
-        """Load the files of ``finish``. OptionError where there are none."""
+        """Load the files that ``finish`` wrote. Raises OptionError if there are none."""
         try:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
@@ -207,7 +208,7 @@ class _Run:
                 self.model, self.data.training, self._score, marks_s(self.request.seconds), self._scored,
                 self.spent_s, self.spent_steps,
             )  # fmt: skip
-        except KeyboardInterrupt:  # during an evaluation: the last one scored stands
+        except KeyboardInterrupt:  # during an evaluation: the last complete one is kept
             done = False
         if not done:
             print("stopped early", flush=True)
@@ -271,7 +272,7 @@ class _Run:
 
 
 def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> str:
-    """One line for people: time, steps, scores and how many cores others kept busy."""
+    """A line of text: time, steps, scores and how many cores other processes used."""
     score = at.score
     words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
     words.append(f"PSNR {score.psnr_db:5.2f} dB" + (f" on {NOTHING_HELD_OUT}" if not held_out else ""))

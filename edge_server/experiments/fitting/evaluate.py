@@ -15,18 +15,18 @@ import numpy as np
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Field, FitReport, View
 
-# Dense where a field learns fastest; after that every 30 s.
+# Dense while a field learns fastest, then every 30 s.
 _MARKS_S = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 _THEN_EVERY_S = 30.0
 # The last slice is at least this share of the whole: the learning rate falls within a slice, and a field
-# needs a long one to settle.
+# needs a long one to converge.
 _LAST_SHARE = 0.4
 
 
 @dataclass(frozen=True)
 class Scored:
-    """Fidelity after ``seconds`` of fitting (evaluation not counted) and ``steps`` optimiser steps; steps
-    and loss are None where the slice was interrupted. slice_s: what the last slice took."""
+    """Fidelity after ``seconds`` of fitting (evaluation not counted) and ``steps`` optimizer steps; steps and
+    loss are None if the slice was interrupted. slice_s: duration of the last slice."""
 
     seconds: float
     slice_s: float
@@ -50,9 +50,11 @@ def fit_in_slices(
     spent_s: float = 0.0,
     spent_steps: int = 0,
 ) -> bool:
-    """Fit until each of ``until_s`` in turn and score; False if Ctrl-C ended it early (scored all the same).
+    """Fit until each of ``until_s`` in turn, and score. Returns False if Ctrl-C ended it early, also after
+    scoring.
 
-    spent_s, spent_steps: of an earlier run. Only fitting counts as time.
+    until_s: seconds of fitting, without evaluation.
+    spent_s, spent_steps: seconds and steps of an earlier run.
     """
     seconds, steps = spent_s, spent_steps
     for mark in until_s:
@@ -76,8 +78,8 @@ def fit_in_slices(
 
 @contextmanager
 def _ctrl_c() -> Iterator[threading.Event]:
-    """Whether Ctrl-C was pressed within the block, also where Python cannot raise it: in a callback of the
-    garbage collector the exception is printed and lost."""
+    """Record whether Ctrl-C was pressed within the block, also if Python cannot raise it: in a callback of
+    the garbage collector the exception is printed and lost."""
     pressed, before = threading.Event(), signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed

@@ -1,1 +1,1 @@
-"""``edge-server frontier``: what fidelity costs in time."""
+"""``edge-server frontier``: measures fidelity against computing time."""

@@ -1,4 +1,4 @@
-"""``edge-server frontier``: what fidelity costs in time."""
+"""``edge-server frontier``: measures fidelity against computing time, from scratch and of live updates."""
 
 from __future__ import annotations
 
@@ -59,12 +59,16 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is measured.
+    """The range of a measurement.
 
+    seeds: number of seeds.
     planned_s: seconds of fitting from scratch.
-    update_s: seconds an update takes.
-    run_s: virtual seconds of a moving run, or six updates where those take longer.
-    efforts: levels that moving runs are made with.
+    speeds: speeds of the moving scene, m/s.
+    update_s: seconds per update.
+    run_s: virtual seconds of a moving run; six updates if those take longer.
+    efforts: effort levels of the moving runs.
+    warm_steps: steps of the warm field before a moving run.
+    size: image width and height of the still scene.
     """
 
     seeds: int
@@ -101,7 +105,7 @@ FULL = Sweep(
     moving=update_time.MovingScene(cameras=19, size=128),
 )
 
-LAYERS_S = 0.02  # the shortest update of layers, which scenarios with layers have
+LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
 
 # The sweep of the shipped points, for scenarios without a frontier of their own. Unlike --quick, it measures
 # the cost of a step with as many and as large views as the runs have.
@@ -161,7 +165,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     options = parse_options(args.option)
     levels = [level for field in fields for level in effort_sweep.efforts(field, options)]
     for level in levels:
-        make_field(level.field, level.options)  # refuses wrong options now, not between two measurements
+        make_field(level.field, level.options)  # rejects wrong options now, not between two measurements
     still = open_still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
     args.out.mkdir(parents=True, exist_ok=True)
     file = FrontierFile(args.out / "frontier.json")
@@ -172,7 +176,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
 
 
 class FrontierFile:
-    """frontier.json: every finished point with the settings it was measured with, written as it goes."""
+    """The file frontier.json: every finished point with its settings, written after each new point."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -185,7 +189,7 @@ class FrontierFile:
         self._store = ResultStore(self.data["points"], lambda *_: self.write())
 
     def get(self, settings: Row, compute: Callable[[], Row]) -> tuple[Row, bool]:
-        """The point of these settings, and whether it had to be measured."""
+        """The point with these settings, and whether it had to be measured."""
         key = content_key(settings)
         known = self._store.find(key, settings=settings) is not None
         return self._store.get(key, compute=compute, settings=settings), not known
@@ -197,7 +201,7 @@ class FrontierFile:
 
 @dataclass
 class Frontier:
-    """One command: measures what is missing, then writes table, CSV, figures and conclusion."""
+    """A run of the command: measures the missing points, then writes tables, CSV, figures and conclusion."""
 
     out: Path
     file: FrontierFile
@@ -247,7 +251,7 @@ class Frontier:
         print(f"{self.file.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
 
     def _other_points(self) -> list[Row]:
-        """What FILE of --points holds of representations and efforts that are not measured now."""
+        """Points in the FILE of --points of representations and efforts that are not measured now."""
         assert self.points is not None
         known = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
         return [
@@ -282,8 +286,8 @@ class Frontier:
         return [e for e in self.levels if e.name in self.sweep.efforts]
 
     def _charged(self) -> dict[str, Compute]:
-        """Cost of an update of each effort in virtual time: measured on this machine with as many images as
-        the moving scene has, as large as those of figure 1."""
+        """Cost of an update of each effort in virtual time, measured on this machine with the number of
+        images of the moving scene and the image size of figure 1."""
         sweep, found = self.sweep, {}
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         for effort in self._live:
@@ -303,7 +307,7 @@ class Frontier:
         return found
 
     def _updates(self, charged: dict[str, Compute]) -> list[Row]:
-        """Figure 2: every update time of every effort, speed and seed, as means over the seeds."""
+        """Rows of figure 2 for every update time, effort and speed, as means over the seeds."""
         sweep, rows = self.sweep, []
         runs = list(product(self._live, sweep.speeds, self._seeds))
         times = {
@@ -311,7 +315,7 @@ class Frontier:
         }
         count = sum(len(times[effort.name]) for effort, _, _ in runs)
         for effort, speed, seed in runs:
-            # Made for the first new point only: a resumed sweep makes only what it still needs.
+            # Made only for the first new point, so a resumed sweep makes only those that it still needs.
             of = (sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
             start = cache(partial(update_time.WarmStart, *of))
             compute = charged[effort.label]
@@ -343,7 +347,7 @@ class Frontier:
 
 
 def _settings(effort: effort_sweep.Effort) -> Row:
-    """Settings of an effort that decide a result."""
+    """Settings of an effort that determine a result."""
     digest = settings_digest(effort.field, effort.options)
     return {"field": effort.field, "options": effort.options, "defaults": digest}
 

@@ -1,4 +1,5 @@
-"""Fidelity against seconds from scratch, for the effort levels of a field, with its Pareto front."""
+"""Measures fidelity against seconds of fitting from scratch, for the effort levels of a field, with the
+Pareto front."""
 
 from __future__ import annotations
 
@@ -17,11 +18,11 @@ from freshfield.machine_load import LoadMeter
 
 @dataclass(frozen=True)
 class Effort:
-    """A named way to spend time.
+    """A named effort level of a field.
 
-    field: the representation.
-    options: its settings.
-    still: tried on the still scene, too, not only on the moving one.
+    field: name of the representation.
+    options: its options.
+    still: whether it is also tried on the still scene, not only on the moving one.
     """
 
     field: str
@@ -35,9 +36,9 @@ class Effort:
 
 
 def efforts(field: str, options: dict[str, Any]) -> list[Effort]:
-    """The field's effort levels, cheapest first. Where the field knows layers, these are one more level, of
-    what moves only: they have none of their own, because effort sizes the static field, which delays no
-    update. ``options`` apply to all of them."""
+    """The field's effort levels, cheapest first. If the field supports layers, these are one more level, for
+    the moving scene only; layers have no effort levels, because effort sizes the static field, which delays
+    no update. ``options`` apply to all levels."""
     layers = [Effort(field, "layers", {"layers": True, **options}, still=False)]
     levels = [Effort(field, level, {"effort": level, **options}) for level in efforts_of(field)]
     return [*(layers if "layers" in option_help(field) else []), *levels]
@@ -46,7 +47,8 @@ def efforts(field: str, options: dict[str, Any]) -> list[Effort]:
 def fit_from_scratch(
     effort: Effort, still: MultiviewStill, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
-    """One point: a new field, ``seconds`` of fitting, its score on the held-out views and its cost."""
+    """Measure one point: fit a new field for ``seconds``; returns its score on the held-out views and its
+    cost."""
     model = make_field(effort.field, effort.options, seed=seed)
     model.warm_up()
     load = LoadMeter()
@@ -69,14 +71,14 @@ def fit_from_scratch(
 
 
 def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Points of the same effort and planned seconds (``planned_s``) over seeds, as their medians."""
+    """Medians over seeds of the points with the same effort and planned seconds (``planned_s``)."""
     names = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db",
              "ssim", "lpips", "outside_cores")  # fmt: skip
     return over_seeds(points, ("effort", "planned_s"), names, median_or_none)
 
 
 def mark_front(rows: Sequence[dict[str, Any]]) -> None:
-    """Set ``on_front`` of each row: no row with as little planned time has as high a PSNR."""
+    """Set ``on_front`` of each row: whether no other row with as little planned time has as high a PSNR."""
     best = float("-inf")
     for row in sorted(rows, key=lambda r: (r["planned_s"], -r["psnr_db"])):
         row["on_front"] = row["psnr_db"] > best
@@ -84,6 +86,6 @@ def mark_front(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def costs(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Milliseconds of a step from scratch by effort: medians over all points of the effort."""
+    """Milliseconds of a step by effort: medians over all points of the effort."""
     names = dict.fromkeys(row["effort"] for row in rows)
     return {name: statistics.median(r["ms_per_step"] for r in rows if r["effort"] == name) for name in names}

@@ -1,4 +1,4 @@
-"""The output of the frontier: two CSV files, two figures, a table and a conclusion for people."""
+"""Writes the output of the frontier: two CSV files, two figures, tables and a conclusion."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
 def write_output(out: Path, data: Row) -> str:
-    """frontier.csv, frontier.png and, where something moved, updates.csv and updates.png; returns the text
-    for the terminal."""
+    """Write frontier.csv, frontier.png and, with a moving scene, updates.csv and updates.png; returns the
+    text for the terminal."""
     rows, updates = data["from_scratch"], data["updates"]
     write_csv(out / "frontier.csv", _flat(rows))
     draw_frontier(out / "frontier.png", rows, data)
@@ -33,7 +33,7 @@ def write_output(out: Path, data: Row) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Effort levels by seconds: PSNR, SSIM, LPIPS; a star marks the Pareto front."""
+    """Table of effort levels and seconds with PSNR, SSIM and LPIPS; a star marks the Pareto front."""
     digits = {"seconds": 2, "steps": 0, "ms_per_step": 2, "psnr_db": 2, "ssim": 3, "lpips": 3}
     cells = [
         (row["effort"], *(number(row[name], n) for name, n in digits.items()), "*" if row["on_front"] else "")
@@ -45,7 +45,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def updates_table(rows: Sequence[Row]) -> str:
-    """What is shown by speed and seconds an update takes, and what was published."""
+    """Table of the shown and published fidelity by speed and seconds per update."""
     digits = {
         "speed_m_per_s": 1, "update_s": 2, "steps": 0, "shown_age_ms": 0, "shown_psnr_db": 2,
         "shown_psnr_moving_db": 2, "psnr_db": 2, "psnr_moving_db": 2,
@@ -76,7 +76,8 @@ def conclusion(rows: Sequence[Row]) -> str:
 
 
 def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """PSNR, SSIM and LPIPS of every effort level against seconds from scratch; the front in PSNR marked."""
+    """Draw PSNR, SSIM and LPIPS of every effort level against seconds from scratch, with the PSNR front
+    marked."""
     shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
     efforts = list(dict.fromkeys(row["effort"] for row in rows))
     looks = _line_styles([tuple(effort.split(" ", 1)) for effort in efforts])
@@ -100,9 +101,9 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """What is shown against seconds an update takes: a column for each speed, a color for each
-    representation, a line style for each effort, the best of all encircled. What was published is drawn for
-    one of them."""
+    """Draw the shown fidelity against seconds per update: a column for each speed, a color for each
+    representation, a line style for each effort, the best of all encircled. The published fidelity is drawn
+    for one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
     efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
     main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
@@ -156,7 +157,7 @@ def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
 
 
 def _flat(rows: Sequence[Row]) -> list[Row]:
-    """Without what is no single cell of a CSV file."""
+    """Rows without the values that do not fit in a single cell of a CSV file."""
     return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
 
 

@@ -1,8 +1,10 @@
-"""How long an update should take: what is shown of a moving scene in virtual time, by update time.
+"""Measures how long an update should take: the shown fidelity of a moving scene in virtual time, by update
+time.
 
 The field is warm: it has converged on the first instant and is not reset. A longer update fits its views
-better, but they are older when it is published. A field in layers follows arrivals instead: its time is that
-from one update to the next, and it begins with nothing, because what stands still is known from frames alone.
+better, but they are older when it is published. A field in layers follows arrivals instead: its update time
+is the time from one update to the next, and it starts empty, because it learns the static part from frames
+alone.
 """
 
 from __future__ import annotations
@@ -27,15 +29,16 @@ from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
 
-# Instants of a run at which what is shown is scored, and publications that are scored: they give the mean as
-# well as hundreds of them.
+# Number of instants of a run at which the shown image is scored, and of publications that are scored: their
+# mean is as good as that of hundreds.
 _INSTANTS, _SCORED = 40, 16
-# Publications of the first part of a run show the start more than the update time.
+# Share of a run at its start that is not counted: its publications depend more on the start than on the
+# update time.
 _SETTLED_SHARE = 0.25
-# To measure the cost of updates: steps of short and long ones, their number, time between their images.
+# To measure the cost of updates: steps of short and long ones, number of each, time between their images.
 _FEW, _MANY, _UPDATES, _BETWEEN_NS = 4, 20, 5, 250_000_000
-# A field in layers: seconds until it is warm, time of an update meanwhile, and steps of its static field,
-# which another core does.
+# Of a field in layers: seconds until it is warm, update time meanwhile, and steps per second of its static
+# field, which run on another core.
 _LEAD_S, _LEAD_UPDATE_S, _STATIC_STEPS_PER_S = 8.0, 0.02, 250.0
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 SHOWN_METRICS = tuple(f"shown_{name}" for name in SHOWN)
@@ -76,9 +79,8 @@ class MovingScene:
 
 
 class WarmStart:
-    """Cameras at one speed, which share their renderings, and a field that has converged on the first
-    instant, or one in layers, which follows arrivals for a while before each run.
-    """
+    """Cameras of a scene at one speed, which keep their renderings, and a warm field: converged on the first
+    instant, or in layers that follow arrivals for a while before each run."""
 
     def __init__(
         self,
@@ -107,7 +109,8 @@ class WarmStart:
         lpips: PerceptualMetric | None = None,
         every_s: float = 0.0,
     ) -> dict[str, Any]:
-        """Updates of ``steps`` for ``seconds`` of virtual time, from the warm field: mean scores.
+        """Run updates of ``steps`` for ``seconds`` of virtual time, starting with the warm field. Returns
+        mean scores.
 
         every_s: least time from one update to the next.
         """
@@ -147,9 +150,10 @@ class WarmStart:
     def lead(
         self, settings: RunSettings, scorer: Scorer | None = None, costs: UpdateCosts | None = None
     ) -> VirtualDeployment:
-        """A deployment of layers that are warm.
+        """A deployment with warm layers.
 
-        settings: of what is shown. costs: takes in the last third of its updates.
+        settings: how shown images are scored.
+        costs: records the last third of the updates.
         """
         settings = replace(
             settings, steps=static_steps(_LEAD_UPDATE_S), compute=Compute(),
@@ -171,12 +175,12 @@ class WarmStart:
 def measure_compute(
     moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int
 ) -> Compute:
-    """Time of updates of a warm field on this machine where the scene moves and every image is new:
-    ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
-    snapshot). Medians of ``_UPDATES`` short and as many long updates. Of layers ms_per_update and
+    """Measure the time of updates of a warm field on this machine while the scene moves and every image is
+    new: ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
+    snapshot), from medians of ``_UPDATES`` short and as many long updates. For layers ms_per_update and
     ms_per_view, in processor time and without the static field.
 
-    Others lengthen the time on the wall, further threads that of the processor: the shorter one counts.
+    Other processes lengthen the wall time, additional threads the processor time, so the shorter one is used.
     """
     start = WarmStart(moving, speed, field, options, 0, warm_steps)
     start.field.warm_up()
@@ -202,24 +206,24 @@ def measure_compute(
 
 
 def static_steps(update_s: float) -> int:
-    """Steps of the static field of layers beside an update."""
+    """Steps of the static field of layers during one update."""
     return max(1, round(_STATIC_STEPS_PER_S * update_s))
 
 
 def steps_for(update_s: float, compute: Compute) -> int:
-    """Optimiser steps that an update of about ``update_s`` has time for, at least one."""
+    """Number of optimizer steps for which an update of about ``update_s`` has time, at least one."""
     return max(1, round((update_s * 1e3 - compute.ms_per_update) / compute.ms_per_step))
 
 
 def best(rows: list[dict[str, Any]], metric: str = "shown_psnr_moving_db") -> dict[str, Any] | None:
-    """The row with the highest ``metric``; None where no row has it."""
+    """The row with the highest ``metric``; None if no row has it."""
     known = [row for row in rows if row[metric] is not None]
     return max(known, key=lambda row: row[metric]) if known else None
 
 
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the same field, effort, speed and planned update time as the mean of their seeds, with the
-    standard error of the two PSNRs shown (None for a single seed)."""
+    """Means over seeds of the rows with the same field, effort, speed and planned update time, with the
+    standard errors of the two shown PSNRs (None for a single seed)."""
     keys = ("field", "effort", "speed_m_per_s", "planned_update_s")
     names = ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, "shown_age_ms", *SHOWN_METRICS)
     means = over_seeds(rows, keys, names, mean_or_none)

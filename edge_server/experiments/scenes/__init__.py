@@ -1,1 +1,2 @@
-"""Input of experiments: multi-view stills and sequences, synthetic or recorded, with their truth."""
+"""Input data of experiments: multi-view stills and sequences, synthetic or recorded, with their true
+images."""

@@ -1,4 +1,5 @@
-"""A run's mesh against the surface that its cameras saw, where that is known: of a still synthetic scene."""
+"""Compares a run's mesh with the true surface that its cameras saw, which is known for static synthetic
+scenes."""
 
 from __future__ import annotations
 
@@ -16,13 +17,14 @@ from edge_server.surface.mesh import Mesh
 from edge_server.surface.metrics import TARGET_CHAMFER_MM, TARGET_COMPLETE, WITHIN_M, compare
 from freshfield.scenario import load
 
-# Between points of the truth: half of what counts as complete, and seconds instead of minutes of casting.
+# Spacing of the points of the truth: half the distance that counts as complete; casting the rays then takes
+# seconds instead of minutes.
 SPACING_M = 0.5 * WITHIN_M
 
 
 def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[dict[str, Any] | None, str]]:
-    """What ``edge-server export --measure`` does with a mesh: ``distances``, and one line for people. Raises
-    ScenarioError at once, before there is a mesh."""
+    """The function with which ``edge-server export --measure`` measures a mesh: it returns ``distances`` and
+    one line of text. Raises ScenarioError immediately, before there is a mesh."""
     return partial(_compare, still_scene(scenario))
 
 
@@ -38,8 +40,8 @@ def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> tuple[di
 
 
 def still_scene(scenario: str) -> Scene | None:
-    """A scenario's scene; None where nobody knows the surface: recorded data, real cameras, a scene that
-    moves. Raises ScenarioError."""
+    """A scenario's scene; None if its surface is unknown: with recorded data, real cameras or a moving scene.
+    Raises ScenarioError."""
     loaded = load(scenario)
     source = source_config(loaded)
     if not isinstance(source, WorldConfig):
@@ -49,8 +51,8 @@ def still_scene(scenario: str) -> Scene | None:
 
 
 def distances(mesh: Mesh, scene: Scene, views: Sequence[View]) -> dict[str, Any]:
-    """``surface.metrics.Comparison`` of a mesh with what cameras see of a scene, and the targets. Raises
-    SurfaceError where one of the two is empty."""
+    """The ``surface.metrics.Comparison`` of a mesh with the surface that cameras see of a scene, and the
+    targets. Raises SurfaceError if one of the two is empty."""
     found = compare(mesh, surface_truth(Scan(scene, tuple(views)), SPACING_M))
     return {
         **dataclasses.asdict(found),

@@ -1,4 +1,4 @@
-"""A scene that moves, instant by instant, with all its cameras: the synthetic room, or a recording."""
+"""A moving scene, frame by frame, with all its cameras: a synthetic scene or a recording."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class MultiviewSequence:
-    """Frames 0, 1, 2, ... of a moving scene, without end: it repeats.
+    """Frames 0, 1, 2, ... of a moving scene, without end, because it repeats.
 
+    period_ms: time between frames.
     cameras: name -> (intrinsics, camera-to-world), in the order of training.
-    held_out: those of them that are scored and not trained on.
-    key: frame -> identity of its images; equal keys, equal images.
-    image: (camera, key) -> image, the same object whenever it is asked for.
-    before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
-    bounds: held-out camera -> by how much a pixel differs at least where it moves.
+    held_out: the cameras that are scored and not trained on.
+    key: frame -> key of its images; frames with equal keys have equal images.
+    image: (camera, key) -> image; every call returns the same object.
+    before: (camera, frame) -> the camera's images ``LAGS_MS`` earlier.
+    bounds: held-out camera -> least difference of a pixel that counts as moving.
     """
 
     name: str
@@ -52,10 +53,10 @@ class MultiviewSequence:
         return f"{self.name}: {count} views of {lens.width} x {lens.height}"
 
     def training(self, frame: int, late: int = 0) -> tuple[View, ...]:
-        """The views of all training cameras at a frame, with its instant as their time of capture.
+        """The views of all training cameras at a frame.
 
         late: the first camera's view is of this frame, the next one's of the frame before, and so on to
-        ``late`` frames before, then this one again: what a network with delays leaves an edge with.
+            ``late`` frames before, then of this one again, as at an edge behind a network with delays.
         """
         names = [camera for camera in self.cameras if camera not in self.held_out]
         return tuple(self._view(camera, frame - k % (late + 1)) for k, camera in enumerate(names))
@@ -65,7 +66,8 @@ class MultiviewSequence:
         return tuple(self._view(camera, frame) for camera in self.held_out)
 
     def score(self, field: Renderer, frame: int, scorer: Scorer) -> Score:
-        """How well ``field`` shows a frame to the held-out cameras, whole and where it moves."""
+        """Mean score of ``field`` at a frame over the held-out cameras: of whole images and of moving
+        pixels."""
         scores = []
         for view in self.truth(frame):
             shown = field.render(view.camera_to_world, view.intrinsics).color
@@ -84,14 +86,14 @@ class MultiviewSequence:
 def synthetic_sequence(
     name: str = "room", cameras: int = 19, size: int = 128, fps: float = 15.0, **params: Any
 ) -> MultiviewSequence:
-    """A scene of ours, its first camera held out. params: of the scene (``speed_m_per_s``). Raises
-    camera_node's SceneError."""
+    """A synthetic scene with its first camera held out. size: width and height in pixels. params: parameters
+    of the scene (``speed_m_per_s``). Raises camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size, **params})
     loop = max(1, round(scene.period_s * fps))  # a scene repeats after a whole number of frames
 
     @cache
     def before(camera: str, key: int) -> list[Image]:
-        # An analytic scene is known at any instant, before the first frame and between two frames too.
+        # An analytic scene is known at any instant, also before the first frame and between two frames.
         return [scene.render(camera, key / fps - lag / 1e3) for lag in LAGS_MS]
 
     return MultiviewSequence(

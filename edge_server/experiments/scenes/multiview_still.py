@@ -1,4 +1,4 @@
-"""Views that stand still, by name: a synthetic scene at one instant, or a recorded data set."""
+"""Views of one instant, by name: of a synthetic scene or a recorded data set."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WHITE: Color = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class MultiviewStill:
-    """What a field is fitted to and scored on. background: under transparent images."""
+    """The views that a field is fitted to and scored on. background: color behind transparent images."""
 
     name: str
     training: tuple[View, ...]
@@ -48,7 +48,12 @@ def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 
 def open_still(
     scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0
 ) -> MultiviewStill:
-    """A scene of ours by name, or the path of a recorded data set. Raises SceneError or DatasetError."""
+    """Open ``scene``: the name of a synthetic scene, or the path of a recorded data set.
+
+    size: width and height in pixels of a synthetic scene.
+    holdout, scale, frame: as in ``load_recorded``, for a data set.
+    Raises SceneError or DatasetError.
+    """
     if scene in SCENES:
         return synthetic_still(scene, size=size)
     data = load_recorded(Path(scene), holdout, scale, frame)
@@ -59,7 +64,7 @@ def open_still(
 
 def smallest_angle_deg(still: MultiviewStill) -> float:
     """The smallest angle between the viewing directions of a held-out and a training camera: how far a field
-    has to go beyond its training views."""
+    must extrapolate from its training views."""
     forward = [
         np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
     ]
@@ -69,7 +74,7 @@ def smallest_angle_deg(still: MultiviewStill) -> float:
 def mean_baselines(
     training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
 ) -> dict[str, float | None]:
-    """PSNR of the baselines without a field, means over the held-out views, None without any. color: the
+    """PSNR of the baselines without a field, as means over the held-out views; None without any. color: the
     background."""
     found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
     names = ("mean_color_db", "nearest_view_db")
@@ -77,7 +82,8 @@ def mean_baselines(
 
 
 def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
-    """Settings of a field of whoever knows where a scene is, what is behind it, and how near cameras come."""
+    """Options of a field for a scene whose place and background are known. nearest_m: least distance of
+    cameras."""
     low, high = scene.bounds
     return {
         "centre_m": [float(c) for c in 0.5 * (low + high)],

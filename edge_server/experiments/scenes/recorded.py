@@ -1,4 +1,4 @@
-"""A recorded data set as the views of one instant, split into those trained on and those held out."""
+"""Loads a recorded data set as the views of one instant, split into training and held-out views."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import Dataset, DatasetError
 from edge_server.fields import View
 
-# For --holdout: what the data set itself keeps for testing.
+# Value of --holdout for the split that the data set itself defines.
 OWN_SPLIT = "split"
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Views of one instant. file: what was read. instant: which one, for people; empty where nothing moves.
-    missing: entries of the file whose images do not exist."""
+    """Views of one instant.
+
+    file: the file that was read.
+    instant: the instant as text; empty if nothing moves.
+    missing: number of entries of the file whose images do not exist.
+    """
 
     file: Path
     training: tuple[View, ...]
@@ -29,14 +33,14 @@ class Recorded:
 def load_recorded(
     path: Path, holdout: str = "8", scale: float = 1.0, frame: int = 0, name: str | None = None
 ) -> Recorded:
-    """The views of a data set, images decoded, alpha kept.
+    """Load the views of a data set, with decoded images including alpha.
 
-    path: the folder of a data set, or the file that describes it. holdout: ``8`` holds out every 8th view
-    (the first, the ninth, ...), ``0`` none, ``split`` those that the data set itself keeps for testing, else
-    names of images or cameras with commas between. scale: images are divided by it. frame: which instant of
-    a set that moves, from 0. name: of the format (``sources.datasets.formats``), instead of recognising
-    it.
-
+    path: the folder of a data set, or the file that describes it.
+    holdout: ``8`` holds out every 8th view (the first, the ninth, ...), ``0`` none, ``split`` those that the
+        data set itself keeps for testing; else names of images or cameras, separated by commas.
+    scale: divides the image sizes.
+    frame: number of the instant of a moving data set, from 0.
+    name: name of the format (``sources.datasets.formats``); None recognizes it.
     Raises camera_node's DatasetError.
     """
     file, dataset = open_dataset(path, scale, name)
@@ -48,8 +52,8 @@ def load_recorded(
 def split(
     views: Sequence[View], holdout: str, own: Collection[str] = ()
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """(training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views that the data set
-    itself holds out. Raises DatasetError."""
+    """Split views into (training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views
+    that the data set itself holds out. Raises DatasetError."""
     every = int(holdout) if holdout.strip().isdigit() else None
     if holdout.strip() == OWN_SPLIT:
         if not own:
@@ -78,7 +82,7 @@ def _is_called(view: View, name: str) -> bool:
 
 
 def _views(dataset: Dataset, frame: int) -> tuple[list[View], str]:
-    """One view a camera of a set that moves, else one a record; and which instant."""
+    """One view per camera of a moving data set, else one per record; and the instant as text."""
     if dataset.moving:
         cameras = {camera: dataset.of(camera) for camera in dataset.cameras}
         count = min(len(records) for records in cameras.values())
@@ -87,7 +91,7 @@ def _views(dataset: Dataset, frame: int) -> tuple[list[View], str]:
         found = {camera: records[frame] for camera, records in cameras.items()}
         instant = f"frame {frame} of {count}"
     else:
-        # Photos of one camera are told apart by their names, a still rig by its cameras.
+        # Photos of one camera are distinguished by their names, those of a static rig by its cameras.
         rig = len(dataset.cameras) == len(dataset)
         found = {(r.camera if rig else r.name): r for r in dataset}
         instant = ""

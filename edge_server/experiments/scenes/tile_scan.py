@@ -1,7 +1,8 @@
-"""A scan of ``tile`` from close by, and the exact surface it shows: what meshes are measured on.
+"""A close scan of ``tile`` and the exact surface that it shows, for measuring meshes.
 
-Cameras stand ``DISTANCE_M`` from a grid of points on the tile, as an arm would hold one: straight above each
-point, and tilted to four sides. They see neither the tile's lower side nor its carrier's walls head-on.
+Cameras are ``DISTANCE_M`` from a grid of points on the tile, as an arm would hold one: straight above each
+point, and tilted to four sides. They do not see the tile's lower side, and its carrier's walls only
+obliquely.
 """
 
 from __future__ import annotations
@@ -31,30 +32,31 @@ FOV_DEG = 50.0
 RASTER_M = tuple((x, y, 0.03) for y in (-0.13, 0.0, 0.13) for x in (-0.19, -0.065, 0.065, 0.19))
 ANGLES_DEG = ((0.0, 88.0), (0.0, 45.0), (90.0, 45.0), (180.0, 45.0), (270.0, 45.0))
 SPACING_M = 0.0005  # between points of the truth
-_FINE = 3  # rays a pixel side for the truth: closer than its spacing
-_SAME = 2e-3  # of the distance: a ray that ends this near to its target has reached it
+_FINE = 3  # rays per pixel side for the truth, so that they are closer than its spacing
+_SAME = 2e-3  # share of the distance: a ray that ends this near to its target has reached it
 
 
 @dataclass(frozen=True)
 class Scan:
-    """scene: with the close cameras. views: what they took, supersampled."""
+    """A scan. scene: the scene with the close cameras. views: their images, supersampled."""
 
     scene: Scene
     views: tuple[View, ...]
 
     @property
     def options(self) -> dict[str, object]:
-        """Settings of a field that a robot cell knows."""
+        """Options of a field that are known in a robot cell."""
         return known_options(self.scene, 0.3 * DISTANCE_M)
 
 
 def scan(size: int = 256, raster: tuple[tuple[float, float, float], ...] = RASTER_M) -> Scan:
-    """``size`` pixels a side; five cameras a point of ``raster``."""
+    """Scan with images of ``size`` x ``size`` pixels from five cameras per point of ``raster``."""
     return _scan_from([on_sphere(p, DISTANCE_M, a, e) for p in raster for a, e in ANGLES_DEG], size, FOV_DEG)
 
 
 def cell_scan(size: int) -> Scan:
-    """The tile from the viewpoints of scenario ``cell``, with exact poses, and ``size`` pixels a side."""
+    """Scan of the tile from the viewpoints of scenario ``cell``, with exact poses and images of ``size`` x
+    ``size`` pixels."""
     source = source_config(load("cell"))
     assert isinstance(source, WorldConfig) and source.arm is not None and source.arm.path is not None
     assert source.horizontal_fov_deg is not None
@@ -73,7 +75,7 @@ def _scan_from(poses: Sequence[Array], size: int, fov_deg: float) -> Scan:
 
 
 def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
-    """Distance (H, W) along the ray through every pixel's centre, inf where it meets nothing."""
+    """Distance (H, W) along the ray through every pixel's center; inf if it meets nothing."""
     renderer = replace(scene, params=replace(scene.params, supersample=1)).view(
         view.intrinsics, view.camera_to_world
     )
@@ -81,7 +83,7 @@ def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
 
 
 def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
-    """The object's surface that the scan's cameras see, see ``surface.metrics``."""
+    """The object's surface that the scan's cameras see (``surface.metrics.Truth``)."""
     placed = place_static(scan.scene.world.static_parts)
     parts = scan.scene.object_parts
     parts = len(placed.parts) if parts is None else parts
@@ -110,7 +112,7 @@ def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
 def _sees(
     view: View, placed: PlacedParts, points: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether a camera sees surface points (N, 3) with ``normals`` (N, 3)."""
+    """Whether a camera sees each of the surface points (N, 3) with ``normals`` (N, 3); returns (N,)."""
     pose, lens = view.camera_to_world, view.intrinsics
     with np.errstate(invalid="ignore"):
         at = lens.project((points - pose[:3, 3]) @ pose[:3, :3])

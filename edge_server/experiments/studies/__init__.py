@@ -1,4 +1,4 @@
-"""Studies: the thesis's figures and a few it does not have, as commands with verdicts.
+"""Studies: the thesis's figures and some additional ones, as commands with verdicts.
 
 A study (``study.Study``) defines points, each a ``trial.Trial``. ``engine`` runs the trials without stored
 results; ``common.statistics`` compares seeds. A new study needs one class file and a line in

@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_study(name: str) -> Any:
-    """The study of that name; its module is imported only now."""
+    """Import and make the study of that name."""
     module, cls, _ = STUDIES[name]
     return getattr(importlib.import_module(f"edge_server.experiments.studies.{module}"), cls)()
 
@@ -126,7 +126,7 @@ def _run(name: str, request: StudyRequest, engine: Engine) -> None:
 
 
 def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[str]:
-    """The names of studies, if the request suits all of them; else StudyError."""
+    """Return the names of studies. Raises StudyError if the request does not suit all of them."""
     if request.seeds is not None and not 1 <= request.seeds <= 10_000:
         raise StudyError(f"--seeds: expected 1 to 10000, got {request.seeds}")
     if request.episodes is not None and not 1 <= request.episodes <= SEEDS_A_PURPOSE:

@@ -77,9 +77,9 @@ def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]
 
 
 def draw_trials(path: Path, request: StudyRequest, rows: Sequence[tuple[str, Sequence[Trial]]]) -> None:
-    """Draw the truth and the last rendering of each trial, a row for each (title, trials).
+    """Draw the truth and the last rendering of each trial, one row of images for each (title, trials).
 
-    The value of a trial's policy is in milliseconds.
+    The values of the trials' policies must be in milliseconds.
     """
     shown = []
     for title, trials in rows:

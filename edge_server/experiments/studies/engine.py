@@ -41,8 +41,10 @@ Task = list[dict[str, Any]]
 
 
 def run_task(task: Task, folders: Folders, kind: str | None = None) -> list[Row]:
-    """Return the results of a task's trials, in order. Every backend runs this function. kind: of processor
-    that they are stored for; StudyError on another."""
+    """Return the results of a task's trials, in order. Every backend runs this function.
+
+    kind: the kind of processor that results are stored for; None: any. Raises StudyError on another kind.
+    """
     if kind is not None and kind != processor():
         raise StudyError(
             f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor"
@@ -52,8 +54,13 @@ def run_task(task: Task, folders: Folders, kind: str | None = None) -> list[Row]
 
 @dataclass
 class Engine:
-    """jobs: processes; 1 runs everything in this one. ray: address of a cluster (``auto``, ``local`` or
-    host:port), instead of processes. say: called with each line of progress."""
+    """Runs trials and stores their results in ``folder``.
+
+    folders: data sets and weights.
+    jobs: number of processes; 1 runs everything in this one.
+    ray: address of a Ray cluster (``auto``, ``local`` or host:port) to use instead of processes.
+    say: called with each line of progress.
+    """
 
     folder: Path
     folders: Folders = field(default_factory=Folders)
@@ -153,7 +160,7 @@ def _start_ray(ray: Any, where: str) -> None:
 
 
 def content_key(trial: Trial, folders: Folders) -> str:
-    """What a result is kept under: the trial, the source that computes it, the data it reads."""
+    """The key of a stored result: a hash of the trial, the source that computes it and the data it reads."""
     scenario = trial.scenario()
     parts = {
         "trial": trial.mapping(),
@@ -168,7 +175,8 @@ def content_key(trial: Trial, folders: Folders) -> str:
 
 @cache
 def _data_digest(folder: Path | None, name: str | None) -> str | None:
-    """Of a recorded data set: names and sizes of its files, and what its small ones say."""
+    """Digest of a recorded data set: names and sizes of its files, and the contents of its small text
+    files."""
     if name is None:
         return None
     path = Path(name) if folder is None else folder / name
@@ -197,7 +205,7 @@ def _weights_digest(folder: Path | None) -> str | None:
 
 
 def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
-    """Keys in groups that share pictures and moments; the longest first would need a guess, so as given."""
+    """Group keys into tasks whose trials share images and instants, in the given order."""
     groups: dict[tuple[Any, ...], list[str]] = {}
     for key, trial in wanted.items():
         kind = (trial.field, json.dumps(trial.field_options, sort_keys=True))

@@ -27,14 +27,16 @@ Unit = NDArray[np.float32]
 
 
 def distortions(reference: Unit) -> dict[str, Unit]:
-    """Figure 3.6's three distortions of an image (H, W, 3) in [0, 1], each with the PSNR it has there, as
-    nearly as possible, so that SSIM and LPIPS can be compared."""
+    """Figure 3.6's three distortions of an image (H, W, 3) in [0, 1], each with nearly the PSNR of the
+    thesis, so that SSIM and LPIPS can be compared."""
     return {case: _with_psnr(reference, case, THESIS[case][0]) for case in THESIS}
 
 
 def distorted(reference: Unit, case: str, strength: float) -> Unit:
-    """One distortion. strength: the shift of all values, the sigma of the blur in image widths, or the weight
-    of a shifted copy."""
+    """Apply one distortion. case: a key of THESIS.
+
+    strength: the shift of all values, the sigma of the blur in image widths, or the weight of a shifted copy.
+    """
     height, width = reference.shape[:2]
     if case == "brightness shift":
         return np.clip(reference + strength, 0.0, 1.0).astype(np.float32)
@@ -47,7 +49,7 @@ def distorted(reference: Unit, case: str, strength: float) -> Unit:
     return ghost
 
 
-# Highest strength of each.
+# Highest strength of each distortion.
 _STRONGEST = {"brightness shift": 0.5, "Gaussian blur": 0.1, "local ghosting": 1.0}
 
 

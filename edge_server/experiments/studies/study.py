@@ -20,8 +20,11 @@ HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
 
 
 class Metric(NamedTuple):
-    """label: of an axis. lower: whether lower is better. digits: of its figures. least: smallest difference
-    that supports a claim."""
+    """A measured quantity.
+
+    label: text of the axis. lower: whether lower is better. digits: decimals in texts.
+    least: smallest difference that supports a claim.
+    """
 
     label: str
     lower: bool
@@ -47,14 +50,16 @@ Curve = dict[float, dict[int, float | None]]
 
 @dataclass(frozen=True)
 class StudyRequest:
-    """What the command asks for; None or no case selects the study's default.
+    """The options of the command; None or no case selects the study's default.
 
     quick: a small pass.
     out: folder of tables and figures.
     seeds: number of repetitions of a point.
     field: representation of the trials that do not name one themselves.
-    jobs, cases, episodes: of studies that train: processes, words in the names of the selected cases, and
-        episodes of a training.
+    scenes: names of the scenes.
+    jobs: number of processes.
+    cases: words in the names of the selected cases, for studies that consist of cases.
+    episodes: episodes of one training, for studies that train.
     """
 
     quick: bool
@@ -108,7 +113,8 @@ class StudyRequest:
         return found
 
     def trial(self, scene: str, **more: Any) -> Trial:
-        """The usual trial of a scene, with the image size and the steps of the self. more: of ``Trial``."""
+        """The usual trial of a scene, with the image size and the steps of a quick or full pass. more:
+        further arguments of ``Trial``."""
         sized: Row = {"size": 64, "steps": 150} if self.quick else {"size": 128, "steps": 400}
         if recording(scene) is not None:
             scale = 2.0 if self.quick else 1.0
@@ -119,7 +125,7 @@ class StudyRequest:
         self, scene: str, seeds: Iterable[int], conditions: Sequence[tuple[Row, Row]], x: str,
         values: Mapping[str, Sequence[float]], ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
     ) -> list[Point]:  # fmt: skip
-        """For every seed: use-all and each value of each policy in every condition, and points without delay.
+        """Points of every seed: in each condition use-all and each value of each policy; and without delay.
 
         conditions, ideals: (labels in the table, settings of the trial) of each.
         x: label that holds the value.
@@ -254,7 +260,7 @@ class Study:
 class SceneStudy(Study):
     """A study that has the same points in each scene, and judges one scene after the other.
 
-    scenes: where none are asked for.
+    scenes: the default scenes.
     """
 
     scenes: tuple[str, ...] = ("room",)
@@ -273,7 +279,8 @@ class SceneStudy(Study):
 
 
 def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
-    """Run what is missing, write OUT/NAME.csv, .json, .md and figures, return the verdicts."""
+    """Run the trials without stored results, write OUT/NAME.csv, .json, .md and figures, and return the
+    verdicts. Raises StudyError."""
     request.out.mkdir(parents=True, exist_ok=True)
     points = study.points(request)
     table = Table(points, engine.run([p.trial for p in points], study.name))

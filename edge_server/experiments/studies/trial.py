@@ -31,12 +31,12 @@ from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_seque
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
 WORLD_FPS = 100 / 3
-# Scenes that are not called as the scenario is that they come from.
+# Scenes whose name differs from that of their scenario.
 SCENARIOS = {"room": "room19"}
 # Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096
-# Random instants at which a publication is looked at, one in each such part of the time that it is shown.
+# Number of random instants at which a publication is scored, one in each equal part of the time it is shown.
 _SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
 
@@ -45,11 +45,20 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Trial:
-    """scene: a shipped scenario, or a key of ``SCENARIOS``. size: image width and height of a
-    world; recordings: divided by ``scale``. channel: scenario section. steps: optimizer steps per update.
+    """One trial.
+
+    scene: a shipped scenario, or a key of ``SCENARIOS``.
+    channel: the scenario's section.
+    policy, value: name of the policy and its parameter.
+    size: image width and height of a synthetic world.
+    scale: divides the image sizes of a recording.
+    cameras: number of cameras of a synthetic world.
+    steps: optimizer steps per update.
     scratch: restart the field at each update (thesis); otherwise it stays warm, and the first update has
-    ``first_steps``. compute: charged ms_per_step and ms_per_update; empty in the thesis. decisions: number
-    scored, every ``every_ms``; a warm field skips the first ``settle``."""
+        ``first_steps``.
+    compute: charged ms_per_step and ms_per_update; empty in the thesis.
+    decisions: number of decisions scored, ``every_ms`` apart; a warm field skips the first ``settle``.
+    """
 
     scene: str
     seed: int
@@ -120,13 +129,13 @@ class Trial:
 
 
 def scenario_of(scene: str, seed: int = 0) -> Scenario:
-    """The scenario that a scene comes from. Raises ScenarioError."""
+    """The shipped scenario of a scene. Raises ScenarioError."""
     return load(SCENARIOS.get(scene, scene), seed)
 
 
 @lru_cache
 def recording(scene: str) -> str | None:
-    """The data that a scene plays, relative to the data folder; None for a world of our own. Raises
+    """The data set that a scene plays, relative to the data folder; None for a synthetic world. Raises
     ScenarioError."""
     source = scenario_of(scene).source
     return None if source.get("kind") == "world" else str(source.get("data", ""))
@@ -141,14 +150,15 @@ class Stage:
 
 
 def run_trial(trial: Trial, folders: Folders) -> Row:
-    """Means over the trial's decisions.
+    """Run a trial. Returns means over its decisions.
 
-    psnr_db, psnr_moving_db, ssim, lpips: at publication, the thesis's measure; None where there are none.
-    shown_psnr_db and so on: of what a deployment shows that decides anew at each publication
-    (``_shown_scores``). views: number of used views. aaoi_ms: their mean age at publication (6.35).
-    age_sum_ms: sum of the ages of all cameras (5.8). wait_ms: from decision to publication. decisions: their
-    number.
-
+    psnr_db, psnr_moving_db, ssim, lpips: at publication, the thesis's measure; None without a score.
+    shown_psnr_db, ...: at random instants, of what a deployment shows (``_shown_scores``).
+    views: number of used views.
+    aaoi_ms: their mean age at publication (6.35).
+    age_sum_ms: sum of the ages of all cameras (5.8).
+    wait_ms: from decision to publication.
+    decisions: number of decisions.
     Raises ScenarioError or DatasetError.
     """
     rows: list[Row] = []
@@ -215,14 +225,15 @@ def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
 
 
 def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: np.random.Generator) -> Row:
-    """``fidelity.scorer.SHOWN`` of the publication, carried on to random instants until the next one.
+    """Scores (``fidelity.scorer.SHOWN``) of the publication, extrapolated to random instants until the next
+    one.
 
-    A deployment that decides again as soon as it has published shows a picture for as long as the next one
-    takes: its wait and its computing. A policy that waits for more views is looked at for longer before it
-    shows anything newer. We assume at most one publication a capture period: without it a policy that does
-    not wait would publish at every arrival, and be some ms fresher than this says.
+    A deployment that decides again as soon as it has published shows an image for as long as the next one
+    takes: its wait and its computing. So the image of a policy that waits for more views is shown for longer.
+    At most one publication a capture period is assumed; otherwise a policy that does not wait would publish
+    at every arrival, and be some ms fresher than this says.
 
-    Instants are random where the truth is known at any; of a recording they are those of its frames.
+    The instants are random if the truth is known at any instant; in a recording they are those of its frames.
     """
     truth, began_ns = deployment.truth, publication.published_ns
     if truth is None:
@@ -272,7 +283,7 @@ def _field(trial: Trial) -> Any:
 def _rendered(
     trial: Trial, deployment: VirtualDeployment, present_ns: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The held-out camera's truth and what the field shows of it."""
+    """The held-out camera's true image and the field's rendering of it, uint8 (H, W, 3)."""
     if deployment.truth is None:
         raise ScenarioError(f"study {trial.scene}: no camera is held out, so there is nothing to show")
     image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)

@@ -28,14 +28,21 @@ from freshfield.files import write_json
 from freshfield.transport import Transport
 
 ANSWERS = "answers.json"
-SHOWN_S = 10.0  # that the page has to fetch the plan, before the server ends
+SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends
 ShowPlan = Callable[[list[str], bytes], None]
-VIEWS = 8  # of a reconstruction, where the budget is of meters only
+VIEWS = 8  # views of a reconstruction, if the budget is only in meters
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """views: of each reconstruction. count: of them. questions: to ask. steps: of each fit. out: folder."""
+    """A comparison of reconstructions.
+
+    views: number of views of each reconstruction.
+    count: number of reconstructions.
+    questions: number of questions.
+    steps: optimizer steps of each fit.
+    out: output folder.
+    """
 
     views: int
     count: int
@@ -48,11 +55,13 @@ class Comparison:
 def compare(
     stage: Stage, about: Comparison, who: str, page: tuple[str, int], transport: Transport
 ) -> tuple[PreferenceSession, ShowPlan | None]:
-    """The session once it is finished, and what shows the plan on the page, where there is one. It goes on
-    from OUT/answers.json, which is written after each answer.
+    """Run a session until it is finished; returns it and, with a page, the function that shows the plan
+    there. It continues from OUT/answers.json, which is written after each answer.
 
-    who: PERSON, or the taste of a simulated expert. page: host and port. Raises ViewpointError for answers
-    of another session, OptionError and TransportError where the page cannot be served.
+    who: PERSON, or the taste of a simulated expert.
+    page: host and port.
+    Raises ViewpointError for answers of another session, and OptionError or TransportError if the page cannot
+    be served.
     """
     plans = varied_plans(stage, about.count, about.views, about.seed)
     steps = StepFeatures(stage.candidates)
@@ -87,7 +96,7 @@ def _on_the_page(
 ) -> tuple[PreferenceSession, ShowPlan]:  # fmt: skip
     from edge_server.page.preferences import PageError, PreferencePage
 
-    transport.guard(page[0], "preference page", http=True)  # before minutes are spent on fits
+    transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
 
     def progress(k: int) -> None:
         print(
@@ -113,5 +122,5 @@ def _on_the_page(
 
 
 def learn(stage: Stage, session: PreferenceSession, views: int, seed: int) -> CandidatePolicy:
-    """The policy of what the answers say, trained by PPO (4.14)."""
+    """Train a policy by PPO on the reward model of the answers (4.14)."""
     return train_policy(stage.candidates, session.model.reward, PolicyConfig(views=views), seed)[0]

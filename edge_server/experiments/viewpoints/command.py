@@ -111,7 +111,8 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def read_budget(text: str) -> Budget:
-    """``8`` is views, ``2.5m`` meters of path, ``8,2.5m`` both. Raises OptionError or ViewpointError."""
+    """Parse a budget: ``8`` is views, ``2.5m`` meters of path, ``8,2.5m`` both. Raises OptionError or
+    ViewpointError."""
     views: int | None = None
     path_m: float | None = None
     try:

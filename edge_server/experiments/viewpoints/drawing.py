@@ -1,4 +1,4 @@
-"""Candidates as seen from above the target, and the paths of plans (figure 4.7)."""
+"""Draws candidates as seen from above the target, and the paths of plans (figure 4.7)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.report.style import CYCLE, GRAY, INK, figure
 from edge_server.viewpoints.capture_planner import Plan
 
-_A_ROW = 3  # plans
+_A_ROW = 3  # panels per row
 
 
 def draw_plan(path: Path, stage: Stage, plans: Sequence[tuple[str, Plan]]) -> None:
-    """Draw the candidates by their value at each plan's last choice, and its path; a panel for each of
-    (title, plan)."""
+    """Draw one panel for each (title, plan): the candidates, colored by their value at the plan's last
+    choice, and its path."""
     candidates = stage.candidates
     azimuth = np.arctan2(candidates.directions[:, 0], -candidates.directions[:, 1])
     zenith_deg = np.rad2deg(np.arccos(np.clip(candidates.directions[:, 2], -1.0, 1.0)))

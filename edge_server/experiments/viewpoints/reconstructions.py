@@ -1,4 +1,4 @@
-"""Reconstructions of different views, for people and simulated experts to compare."""
+"""Reconstructions from different views, to be compared by people and simulated experts."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from freshfield.geometry import so3_exp
 
 Array = NDArray[np.float64]
 
-# Pictures of a reconstruction along the path, side by side in rows of one JPEG.
+# Number of images of a reconstruction along the path, and of columns in their common JPEG.
 FRAMES, COLUMNS = 24, 6
 _WIDEST_PX = 320
 _FARTHEST_DEG = 60.0  # from the middle of the path
-_QUALITY = 92  # of the JPEG: its own faults are not to be compared
+_QUALITY = 92  # JPEG quality, so that its artifacts do not affect the comparison
 
 
 def varied_plan(stage: Stage, k: int, views: int) -> Plan:
-    """Plan ``k`` of many that differ: by several selectors, each third one of one side only."""
+    """Plan ``k`` of many different ones: made by several selectors, every third of one side only."""
     rng = np.random.default_rng(k)
     candidates = stage.candidates
     if k % 3 == 1:
@@ -48,13 +48,13 @@ def varied_plan(stage: Stage, k: int, views: int) -> Plan:
 
 
 def taste_score(stage: Stage, field: Field, taste: str) -> float:
-    """The score of a taste (``experts.TASTES``), over the views held out."""
+    """The score of a field by a taste (``experts.TASTES``), over the held-out views."""
     shown = [field.render(v.camera_to_world, v.intrinsics).color for v in stage.held_out]
     return judge(taste, shown, [to_unit(v.image, background=stage.background) for v in stage.held_out])
 
 
 def viewing_path(candidates: Candidates, frames: int = FRAMES) -> list[Array]:
-    """Poses (4, 4) of a short way round the target, through the middle of the reachable candidates."""
+    """Poses (4, 4) along an arc round the target, through the middle of the reachable candidates."""
     reachable = np.flatnonzero(candidates.reachable)
     away = candidates.directions[reachable]
     pose = candidates.poses[reachable[np.argmax(away @ away.mean(axis=0))]]
@@ -72,7 +72,7 @@ def viewing_path(candidates: Candidates, frames: int = FRAMES) -> list[Array]:
 
 
 def sprite(stage: Stage, field: Field) -> bytes:
-    """A reconstruction along the path: a JPEG with FRAMES pictures, COLUMNS in a row."""
+    """Render a reconstruction along the path, as a JPEG with FRAMES images, COLUMNS in a row."""
     lens = stage.candidates.lens
     lens = lens.scaled(min(1.0, _WIDEST_PX / lens.width))
     shown = [to_bytes(field.render(pose, lens).color) for pose in viewing_path(stage.candidates)]
@@ -82,13 +82,14 @@ def sprite(stage: Stage, field: Field) -> bytes:
 
 
 def varied_plans(stage: Stage, count: int, views: int, seed: int) -> list[Plan]:
-    """``count`` plans that differ, fewer where the candidates give no more."""
+    """``count`` different plans; fewer if some of them are equal."""
     plans = [varied_plan(stage, seed * count + k, views) for k in range(count)]
     return list({tuple(plan.order): plan for plan in plans}.values())
 
 
 def identity(stage: Stage, plans: Sequence[Plan], steps: int, seed: int) -> str:
-    """A digest of what reconstructions are made of: the scene as it is seen, and how a field is fitted."""
+    """Digest of everything that determines reconstructions: plans, held-out images and settings of the
+    fits."""
     found = hashlib.sha256(repr(([p.order for p in plans], stage.options, steps, seed)).encode())
     for view in stage.held_out:
         found.update(view.image.tobytes())
@@ -98,9 +99,11 @@ def identity(stage: Stage, plans: Sequence[Plan], steps: int, seed: int) -> str:
 def sprites(
     stage: Stage, plans: list[Plan], steps: int, seed: int, folder: Path, progress: Callable[[int], None]
 ) -> list[bytes]:
-    """The ``sprite`` of each plan, kept in ``folder`` for the next time.
+    """The ``sprite`` of each plan, cached in ``folder``.
 
-    progress: called with the number of each that is made. Raises OSError."""
+    progress: called with the index of each new one.
+    Raises OSError.
+    """
     about = {"scenario": stage.name, "made_of": identity(stage, plans, steps, seed)}
     files = [folder / f"{k:03d}.jpg" for k in range(len(plans))]
     try:
@@ -109,7 +112,7 @@ def sprites(
     except (OSError, ValueError):
         pass
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "about.json").unlink(missing_ok=True)  # until all are of this kind
+    (folder / "about.json").unlink(missing_ok=True)  # until all files are new
     for k, plan in enumerate(plans):
         write_bytes(files[k], sprite(stage, stage.fit(plan.views, steps, seed)))
         progress(k)

@@ -1,4 +1,4 @@
-"""Where a capture takes place: the candidates of a scenario, their pictures, and what is held out."""
+"""The stage of a capture: the candidate viewpoints of a scenario, their images, and the held-out views."""
 
 from __future__ import annotations
 
@@ -25,16 +25,24 @@ from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_p
 from edge_server.viewpoints.policy import Embed
 from freshfield.scenario import Scenario, load
 
-_EMBEDDING = 8  # numbers a picture
-# Held-out viewpoints of a synthetic scene, on the candidates' sector between them.
+_EMBEDDING = 8  # numbers per image
+# Number of held-out viewpoints of a synthetic scene, between the candidates in their sector.
 HELD_OUT = 20
-_BETWEEN = 0.25  # of the sector: see ``half_hemisphere``
+_BETWEEN = 0.25  # offset of ``half_hemisphere``
 
 
 @dataclass
 class Stage:
-    """name: of the scenario. candidates: with reachability. held_out: views that no capture takes. options:
-    of the field, as far as the scene is known. background: under transparent images."""
+    """The stage of a capture.
+
+    name: name of the scenario.
+    candidates: viewpoints, with their reachability.
+    held_out: views that no capture takes.
+    options: options of the field that are known from the scene.
+    background: color behind transparent images.
+    scene: the synthetic scene; None for a recording.
+    recorded: the candidates' views in a recording.
+    """
 
     name: str
     candidates: Candidates
@@ -46,7 +54,7 @@ class Stage:
     _taken: dict[int, View] = field(default_factory=dict)
 
     def take(self, k: int) -> View:
-        """The picture at candidate k, rendered where the scene is synthetic, and kept."""
+        """The view at candidate k; of a synthetic scene it is rendered and cached."""
         if self.scene is None:
             return self.recorded[k]
         if k not in self._taken:
@@ -54,26 +62,28 @@ class Stage:
         return self._taken[k]
 
     def fit(self, views: Sequence[View], steps: int, seed: int, representation: str = "splat") -> Field:
-        """A field fitted to the views from scratch."""
+        """Fit a new field to the views."""
         made = make_field(representation, self.options, seed=seed)
         made.fit(list(views), Budget(steps=steps))
         return made
 
     def score(self, made: Field, scorer: Scorer) -> Score:
-        """Mean fidelity on the views held out."""
+        """Mean fidelity on the held-out views."""
         return score_views(made, self.held_out, scorer)[0]
 
 
 def open_stage(
     name: str, count: int = 100, size: int | None = None, data: Path | None = None, scale: float = 1.0
 ) -> Stage:
-    """The stage of a scenario, a file or the name of a shipped one.
+    """Open the stage of a scenario: a file or the name of a shipped one.
 
     A synthetic world has ``count`` candidates on a half-hemisphere round its object, at the distance of the
-    scenario's held-out camera or of its arm's path; an arm says which of them it reaches. Of a recording the
-    candidates are the views that it has, every eighth is held out. size: pixels a side of a world's images,
-    None: the scenario's. scale: recorded images are divided by it.
+    scenario's held-out camera or of its arm's path; with an arm, only those that it reaches are reachable.
+    The candidates of a recording are its training views; every eighth view is held out.
 
+    size: width and height of a world's images; None: the scenario's.
+    data: folder of recorded data sets.
+    scale: divides the sizes of recorded images.
     Raises ScenarioError, DatasetError or ViewpointError.
     """
     scenario = load(name)
@@ -107,7 +117,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
     tests = half_hemisphere(target, radius_m, lens, HELD_OUT, offset=_BETWEEN, **sector)
     if path is not None:
         candidates = candidates.within(_arm_reaches(scenario, source, candidates))
-        # What the robot cannot show is not asked for either.
+        # Viewpoints that the robot cannot reach are not scored either.
         reached = tests.within(_arm_reaches(scenario, source, tests)).reachable
         tests = Candidates(tests.poses[reached], lens, target, reached[reached])
     held_out = tuple(_render(scene, f"test{k:02d}", tests, k) for k in range(len(tests)))
@@ -139,9 +149,10 @@ def _render(scene: Scene, name: str, candidates: Candidates, k: int) -> View:
 
 
 def open_embedder(background: Color) -> tuple[Embed | None, str | None]:
-    """(pictures to embeddings by the shipped YOLO backbone (4.8), None), or (None, why there is none).
+    """Returns (function from images to embeddings by the shipped YOLO backbone (4.8), None), or (None, reason
+    why it is not available).
 
-    background: under transparent pictures.
+    background: color behind transparent images.
     """
     try:
         embedder = make_embedder(EmbeddingConfig(dim=_EMBEDDING))

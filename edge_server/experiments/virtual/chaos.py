@@ -1,4 +1,5 @@
-"""``edge-server chaos``: deployments in virtual time with faults from seeds; what must hold after each."""
+"""``edge-server chaos``: runs deployments in virtual time with faults drawn from seeds, and checks
+invariants."""
 
 from __future__ import annotations
 
@@ -58,14 +59,15 @@ it takes, and the command that repeats it is printed.
 _SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0,
                         epoch_ms=100.0, score_every_ms=None)  # fmt: skip
 RECOVERY_S = 2.0
-# Of a link: in service, waiting and not sampled yet; a queue's limit may count the frame in service apart.
+# Most frames inside a link: a queue's limit, plus the frame in service and the one not sampled yet.
 _MOST_INSIDE = QUEUE_LIMIT + 2
 
 
 def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
-    """One seed, twice. only: numbers of its faults that happen; None: all.
+    """Run one seed twice. only: numbers of the faults to carry out; None: all.
 
-    Returns {seed, problems: one line each, faults, digest, recovery_ms, counts: of the ledgers' accounting}.
+    Returns seed, faults and problems (one line each); and, unless an exception was raised, digest,
+    recovery_ms and counts (of the ledgers' accounting).
     """
     scenario = scenario_of(seed)
     faults = [f for f in draw_faults(seed, scenario.training) if only is None or f.number in only]
@@ -73,7 +75,7 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
     try:
         cameras = training_cameras(scenario)  # of both runs: each frame is rendered once
         first, second = (_run(scenario, cameras, faults) for _ in range(2))
-    except Exception as error:  # a part of the program broke: that is what is looked for
+    except Exception as error:  # finding such failures is the purpose
         place = traceback.extract_tb(error.__traceback__)[-1]
         found["problems"] = [f"{type(error).__name__} in {Path(place.filename).name}, {place.name}: {error}"]
         return found
@@ -101,8 +103,8 @@ def _run(scenario: Scenario, cameras: list[Camera], faults: Sequence[Fault]) -> 
 
 @contextmanager
 def _warnings_are_expected() -> Iterator[None]:
-    """No warnings of what the faults bring about: files that cannot be written, and nodes that look like two
-    of one name, since their clocks have stepped back."""
+    """Suppress warnings that the faults cause: of files that cannot be written, and of nodes that look like
+    two with one name because their clocks stepped back."""
     logs = [logging.getLogger(name) for name in ("freshfield.files", "edge_server.live.ingest")]
     before = [log.level for log in logs]
     for log in logs:
@@ -115,7 +117,7 @@ def _warnings_are_expected() -> Iterator[None]:
 
 
 def _accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
-    """The ledgers' accounting against what really happened."""
+    """Problems of the ledgers' accounting, compared with what really happened."""
     if account.contradictions and not deployment.lines_lost:
         yield f"contradiction: {account.contradictions[0]}"
     if account.lines_lost > deployment.lines_lost:
@@ -139,7 +141,7 @@ def _accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
 
 
 def _state(deployment: ChaosDeployment) -> Iterator[str]:
-    """Bounds of queues and memory, and numbers that are none."""
+    """Violated bounds of queues and memory, and numbers that are not finite."""
     if deployment.most_inside > _MOST_INSIDE:
         yield f"{deployment.most_inside} frames inside a link, at most {_MOST_INSIDE} expected"
     if deployment.damaged_admitted:
@@ -160,8 +162,9 @@ def _state(deployment: ChaosDeployment) -> Iterator[str]:
 
 
 def _recovery_ms(deployment: ChaosDeployment, faults: Sequence[Fault]) -> float | None:
-    """From the end of the last fault until every camera has arrived again and the field was published anew;
-    None where that never happened. A clock that stepped back is behind for as long as it stepped."""
+    """Time from the end of the last fault until a frame of every camera has arrived and the field was
+    published again; None if that did not happen. After a clock stepped back, it counts from when the clock
+    has caught up."""
     back_ms = max((-f.value for f in faults if f.kind == "clock_step"), default=0.0)
     over_ms = max((f.at_ms + f.for_ms for f in faults), default=FAULTS_OVER_S * 1e3)
     over_ns = round((over_ms + max(0.0, back_ms)) * 1e6)
@@ -181,7 +184,8 @@ def _recovery(recovery_ms: float | None) -> Iterator[str]:
 
 
 def shrink(seed: int, numbers: Sequence[int], problem: str) -> list[int]:
-    """The faults that it takes for a seed to fail as it does: without any one of them it does not."""
+    """Reduce the faults ``numbers`` of a failing seed to a subset with which it still fails with the same
+    kind of problem, but no longer if any single one is removed."""
     kind = _kind(problem)
     kept, size = list(numbers), len(numbers)
     while size:
@@ -247,7 +251,7 @@ def _results(args: argparse.Namespace, store: ResultStore) -> Iterator[dict[str,
 
 
 def _failure(found: dict[str, Any], only: Sequence[int] | None) -> str:
-    """What is wrong with a seed, the faults that it takes, and the command that repeats it."""
+    """Text with the problems of a seed, the faults needed for them, and the command that repeats them."""
     seed, problems = found["seed"], found["problems"]
     numbers = [
         f.number for f in draw_faults(seed, scenario_of(seed).training) if only is None or f.number in only

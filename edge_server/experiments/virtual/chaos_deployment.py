@@ -1,10 +1,10 @@
 """A deployment in virtual time whose processes crash, stall and lose their disks; each writes its ledger.
 
-What lives in a process dies with it. Node: captures and the waiting frame. Emulator: links and what is inside
-them. Edge: buffer, sessions, policy, decisions and what the field has learned since its last checkpoint. What
-happens to a frame is written to the ledger of the process that would write it live, and counted in ``really``
-whether that process can still write or not, so that the accounting of the ledgers can be compared with what
-really happened.
+A crash loses the state of the process. Node: captures and the waiting frame. Emulator: links and the frames
+inside them. Edge: buffer, sessions, policy, decisions and what the field has learned since its last
+checkpoint. Each event of a frame is written to the ledger of the process that would write it live, and
+counted in ``really`` even if that process cannot write, so that the ledgers' accounting can be compared with
+what really happened.
 """
 
 from __future__ import annotations
@@ -39,19 +39,25 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, seed_sequence
 from freshfield.v1 import frames_pb2 as pb
 
-# A slow disk takes as long for a checkpoint as for so many lines.
+# On a slow disk a checkpoint takes as long as this many lines.
 _CHECKPOINT_LINES = 20
-# A node asks for the edge's time this often; until then it goes by the clock before a step.
+# Period of a node's clock exchanges; until the next one it does not know of a step of its clock.
 _CLOCK_PERIOD_NS = 10**9
 
 
 class ChaosDeployment(VirtualDeployment):
-    """``run``, then ``end``. faults: carried out at their instants. out: of ledgers and checkpoint.
+    """Call ``run``, then ``end``.
 
-    really: frames and copies by what became of them, with the names of ``FrameCounts``; refusals as
-    ``rejected:reason``, those of unknown origin as ``strangers``. arrivals: instants of deliveries by camera.
-    damaged_admitted: frames taken in although their checksum was wrong.
-    most_inside: most frames that a link held. lines_lost: to full disks. restarts: of processes, by role.
+    faults: carried out at their instants. out: folder of the ledgers and the checkpoint.
+
+    Attributes:
+    really: numbers of frames and copies by their outcome, with the names of ``FrameCounts``; refusals as
+        ``rejected:reason``, those of unknown origin as ``strangers``.
+    arrivals: instants of deliveries, by camera.
+    damaged_admitted: number of frames admitted although their checksum was wrong.
+    most_inside: largest number of frames inside a link.
+    lines_lost: number of ledger lines lost to full disks.
+    restarts: number of restarts, by role.
     """
 
     def __init__(
@@ -90,7 +96,7 @@ class ChaosDeployment(VirtualDeployment):
             self.at(round(fault.at_ms * 1e6), partial(getattr(self, f"_do_{fault.kind}"), fault))
 
     def end(self) -> None:
-        """All processes end in order, the node first."""
+        """End all processes cleanly, the node first."""
         now_ns = self.clock.now_ns()
         for frame in self._waiting.values():
             self._count("waiting", "node", frame)
@@ -158,7 +164,7 @@ class ChaosDeployment(VirtualDeployment):
             self._stand(fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6))
 
     def _stand(self, role: str, until_ns: int) -> None:
-        """A process does nothing until then."""
+        """Let a process do nothing until ``until_ns``."""
         self._stalled.add(role)
         self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
         self.at(until_ns, lambda: self._go_on(role))
@@ -190,7 +196,7 @@ class ChaosDeployment(VirtualDeployment):
         self._after(fault, space_again)
 
     def _do_slow_disk(self, fault: Fault) -> None:
-        """A process stands for ``value`` ms after each line of its ledger, and a checkpoint takes long."""
+        """A process pauses for ``value`` ms after each line of its ledger, and checkpoints take long."""
         line_ns = round(fault.value * 1e6)
         self._line_ns[fault.target] += line_ns
 
@@ -227,7 +233,7 @@ class ChaosDeployment(VirtualDeployment):
         self._stand("edge", over_ns)
 
     def _do_hostile(self, fault: Fault) -> None:
-        """Messages to the edge from somebody who is no node of this deployment."""
+        """Send messages to the edge that come from no node of this deployment."""
         if "edge" in self._down | self._stalled:
             return
         for _ in range(round(fault.value)):
@@ -249,7 +255,7 @@ class ChaosDeployment(VirtualDeployment):
                 self.really.update(("captured", "sent", f"rejected:{reason}" if reason else "delivered"))
 
     def _garble(self) -> pb.PushRequest:
-        """A message with one to three fields out of place; its checksum is right most of the time."""
+        """A message with one to three invalid fields; its checksum is right most of the time."""
         rng, cameras = self._rng, list(self._cameras)
         camera = self._cameras[cameras[rng.integers(len(cameras))]]
         shot, now_ns = camera.capture(0), self.clock.now_ns()
@@ -308,7 +314,7 @@ class ChaosDeployment(VirtualDeployment):
         self._waiting[frame.camera] = frame
 
     def _send_waiting(self) -> None:
-        """What waits at the node leaves, once both the node and the emulator run."""
+        """Send the frames that wait at the node, if both the node and the emulator run."""
         if {"node", "emulator"} & (self._down | self._stalled):
             return
         for frame in self._waiting.values():
@@ -364,7 +370,7 @@ class ChaosDeployment(VirtualDeployment):
     # --- processes ------------------------------------------------------------------------------------
 
     def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
-        """An edge's updater as it is after a start; resume: from the last checkpoint, if there is one."""
+        """The updater of an edge that was just started. resume: load the last checkpoint, if there is one."""
         scenario, config = self.scenario, read_config(self.scenario)
         field = make_field(config.field, config.field_options, seed=scenario.seed)
         file = self._out / "field.npz"
@@ -378,7 +384,7 @@ class ChaosDeployment(VirtualDeployment):
         self._ledgers[role] = Ledger(self._out, role, "chaos", self.clock.now_ns())
 
     def _count(self, what: str, role: str, frame: Frame) -> None:
-        """Something happened to a frame: count it, and let a process write it."""
+        """Count an event of a frame, and write it to the ledger of ``role``."""
         self.really[what] += 1
         event, _, detail = what.partition(":")
         self._write(role, event, frame.camera, frame.session, frame.sequence, detail)

@@ -1,8 +1,9 @@
-"""``edge-server costs``: what the updates of a scenario take on this machine, for virtual time to charge.
+"""``edge-server costs``: measures the time of a scenario's updates on this machine, to be charged in virtual
+time.
 
-The deployment runs in virtual time with updates of several lengths; each is timed, and the times are fitted
-by so much an update, a step and a frame taken in. What runs beside an update live, the training and the
-renderings of the static field of layers, is not charged.
+The deployment runs in virtual time with updates of several lengths. Each is timed, and a cost per update, per
+step and per frame taken in is fitted to the times. The training and rendering of the static field of layers,
+which live run beside the updates, are not charged.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _SHARES = (0.2, 0.6, 1.0)
 # The first part of a run builds the field; a busy machine's slowest updates are left out.
 _SETTLED_SHARE, _SLOWEST_SHARE = 0.5, 0.1
 _EPOCH_MS = 40.0
-# Parts of an update that live have a thread of their own.
+# Parts of an update that live run in their own thread.
 _BESIDE = ("static field", "static renders")
 
 
@@ -66,7 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dict[str, Any]:
-    """The costs (``ComputeConfig``) as ``compute``, and how they were found."""
+    """Measure the costs of a scenario's updates. seconds: virtual time of each of three runs.
+
+    Returns ``compute`` (the fields of ``ComputeConfig``) and how it was measured. Raises ScenarioError,
+    DatasetError, or ValueError if there are too few updates.
+    """
     scenario = dataclasses.replace(
         scenario, edge={**scenario.edge, "policy": {"name": "all"}, "compute": "zero", "embedding": None}
     )
@@ -84,7 +89,7 @@ def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dic
 
 
 def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
-    """Non-negative least squares of milliseconds. rows: (n, 3), steps, frames taken in, milliseconds."""
+    """Fit the costs by non-negative least squares. rows: (n, 3): steps, frames taken in, milliseconds."""
     kept = rows[rows[:, 2] <= np.quantile(rows[:, 2], 1.0 - _SLOWEST_SHARE)]
     design = np.column_stack([kept[:, :2], np.ones(len(kept))])
     a_step, a_view, an_update = (round(float(ms), 3) for ms in nnls(design, kept[:, 2])[0])
@@ -92,13 +97,13 @@ def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
 
 
 def beside_s(field: Any) -> float:
-    """Seconds that updates of ``field`` have spent by now on what is done beside them live."""
+    """Seconds that updates of ``field`` have spent so far on parts that live run beside them."""
     parts: dict[str, float] = getattr(field, "part_s", {})
     return sum(parts.get(part, 0.0) for part in _BESIDE)
 
 
 class UpdateCosts:
-    """What updates of a field in layers take, by the processor time of the thread."""
+    """Measures the processor time (of this thread) of the updates of a field in layers."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
@@ -106,12 +111,13 @@ class UpdateCosts:
         self._most_pixels: int | None = None
 
     def watch(self, field: Any) -> None:
-        """Have the field measure its parts by the time of this thread, which others cannot slow down."""
+        """Make the field measure its parts by this thread's processor time, which other load affects
+        little."""
         if hasattr(field, "part_s"):
             field.now = field.part_s.now = time.thread_time
 
     def published(self, updates: FieldUpdater, counts: bool) -> None:
-        """Take an update in. counts: or leave it out."""
+        """Record an update. counts: False leaves it out of the costs."""
         parts: dict[str, float] = getattr(updates.field, "part_s", {})
         spent_s = sum(parts.values()) - beside_s(updates.field)
         if counts:
@@ -120,8 +126,8 @@ class UpdateCosts:
         self._seen, self._spent_s = updates.buffer.arrivals, spent_s
 
     def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
-        """Of an update, and of each frame that has arrived: least squares over the updates, and what decoding
-        a frame of ``items`` takes."""
+        """Milliseconds of an update (update_ms) and of each frame that arrived (view_ms): least squares over
+        the updates, plus the time to decode a frame of ``items``."""
         frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
         if not spent_ms.any():
             return {"update_ms": 0.0, "view_ms": 0.0}
@@ -135,7 +141,7 @@ class UpdateCosts:
 
 
 def _timed(scenario: Scenario, steps: int, seconds: float, data: Path | None) -> NDArray[np.float64]:
-    """(n, 3): steps, frames taken in and milliseconds of the updates of a run."""
+    """Steps, frames taken in and milliseconds of the updates of a run, (n, 3)."""
     settings = RunSettings(steps=steps, epoch_ms=_EPOCH_MS, score_every_ms=None)
     deployment = build_deployment(scenario, settings, data=data)
     updates, fit = deployment.updates, deployment.updates.fit

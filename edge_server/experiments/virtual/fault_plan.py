@@ -38,10 +38,15 @@ _SMALL: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """kind: crash, stall, full_disk and slow_disk of the process ``target``, ``value``: whether an edge that
-    crashed resumes its last checkpoint, milliseconds that a line takes on a slow disk; away and clock_step
-    (by ``value`` ms) of the camera ``target``; hostile (``value`` messages), policy (``target``) and
-    checkpoint at the edge. for_ms: until it is over, where it lasts."""
+    """A fault.
+
+    kind: of a process: crash, stall, full_disk, slow_disk; of a camera: away, clock_step; of the edge:
+        hostile, policy, checkpoint.
+    at_ms: when it begins. for_ms: how long it lasts; 0 for an instantaneous one.
+    target: the process, the camera, or the new policy.
+    value: of crash, whether an edge resumes its last checkpoint; of slow_disk, ms a line; of clock_step, ms;
+        of hostile, the number of messages.
+    """
 
     number: int
     kind: str
@@ -75,7 +80,7 @@ def scenario_of(seed: int) -> Scenario:
             "name": f"chaos-{seed}",
             "seed": seed,
             "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
-            # A motion of its own: frames that no other seed needs are not kept on disk.
+            # With its own motion, its frames, which no other seed needs, are not kept on disk.
             "source": {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
                        "motion_seed": seed, "params": {"supersample": 1}},
             "channel": channel,

@@ -1,4 +1,5 @@
-"""A scenario file as a deployment in virtual time: the same cameras, channel, policy and field as live."""
+"""Builds a deployment in virtual time from a scenario: the same cameras, channel, policy and field as
+live."""
 
 from __future__ import annotations
 
@@ -41,17 +42,16 @@ def build_deployment(
     truth: Truth | None = None,
     embedder: Embedder | None = None,
 ) -> VirtualDeployment:
-    """``scenario`` in virtual time, from its seed.
+    """Build the deployment of ``scenario`` in virtual time, with the scenario's seed.
 
     settings: how it runs.
-    field: one to go on with; None makes the scenario's.
+    field: to continue with; None makes the scenario's.
     scorer: None scores without LPIPS.
-    cameras: of ``training_cameras``, where several runs share what was rendered.
+    cameras: result of ``training_cameras``, to share rendered frames between runs; None opens them.
     data: folder of recorded data sets.
     on_published: called with each publication.
-    truth: of ``build_truth``, where several runs share it.
-    embedder: one that several runs share.
-
+    truth: result of ``build_truth``, to share it between runs; None builds it.
+    embedder: to share it between runs; None: as the scenario says.
     Raises ScenarioError or DatasetError.
     """
     edge = read_config(scenario)
@@ -74,8 +74,8 @@ def build_deployment(
 
 
 def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camera]:
-    """The training cameras as a node would host them. ScenarioError for real cameras and for cameras on an
-    arm, which run in real time only."""
+    """The training cameras as a node would host them. Raises ScenarioError for real cameras and for cameras
+    on an arm, which run only in real time."""
     source = source_config(scenario)
     if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
         raise ScenarioError(
@@ -88,7 +88,8 @@ def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camer
 def build_truth(
     scenario: Scenario, source: SourceConfig, edge: EdgeConfig, scorer: Scorer, data: Path | None = None
 ) -> Truth | None:
-    """The exact scene where the world is synthetic, else the held-out captures; None where nothing is."""
+    """The exact scene if the world is synthetic, else the held-out captures; None if no camera is held
+    out."""
     if not scenario.held_out:
         return None
     if isinstance(source, WorldConfig):

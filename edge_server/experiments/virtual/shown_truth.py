@@ -1,11 +1,10 @@
-"""What was shown at random instants, beside what a perfect field could have shown at the same ages.
+"""Compares images shown at random instants with those of a perfect field that has views of the same ages.
 
-The synthetic world is known at any instant, so that of each picture it can be asked:
+The synthetic world is known at any instant, so for each image shown two things can be computed:
 
-* how late its moving pixels are: the content lag, tau at which truth(t - tau) matches them best;
-* what a perfect field would show that knows no more than the views of the publication: the true scene, in
-  which every rigid part has kept, since the instant up to which something is known, the linear and angular
-  velocity that it had then (``carried_on``).
+* the content lag of its moving pixels: the tau at which truth(t - tau) matches them best;
+* the image of a perfect field that knows the scene up to some instant and extrapolates it: since then every
+  rigid part has kept its linear and angular velocity (``carried_on``).
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ from edge_server.live.state import Publication
 from freshfield.geometry import Array, Pinhole, so3_exp, so3_log
 from freshfield.scenario import Scenario, ScenarioError
 
-# Instants are multiples of this, so that a scene that repeats is rendered once for all runs. A multiple of it
-# is every lag of the moving pixels and every scene's period.
+# Instants are multiples of this, so that a periodic scene is rendered once for all runs. Every lag of the
+# moving pixels and every scene's period is a multiple of it.
 GRID_NS = 5_000_000
 LONGEST_LAG_MS, EARLIEST_LAG_MS = 600.0, -100.0
 _IMAGES_KEPT = 4096
-_MOMENT_S = 1e-3  # over which velocities are taken
+_MOMENT_S = 1e-3  # time difference for velocities
 PARTS = ("whole", "moving", "still")
 PERFECT = ("newest", "mean", "frozen")
 
 
 def carried_on(body: MovingBody, known_s: float) -> MovingBody:
-    """The body as it is known at an instant: later, each part keeps the velocities that it had then."""
+    """The body extrapolated from the instant ``known_s``: each part keeps the velocities that it had then."""
     then, before = body.matrices(known_s), body.matrices(known_s - _MOMENT_S)
     shift = (then[:, :3, 3] - before[:, :3, 3]) / _MOMENT_S
     turn = np.stack([so3_log(_rotation(a) @ _rotation(b).T) for a, b in zip(then, before)]) / _MOMENT_S
@@ -59,9 +58,9 @@ def _rotation(matrix: Array) -> Array:
 
 
 class KnownWorld:
-    """The synthetic world of a scenario as one of its held-out cameras sees it, at multiples of GRID_NS.
+    """The synthetic world of a scenario, seen by its first held-out camera at multiples of GRID_NS.
 
-    ScenarioError: nothing is held out, or the source is not a world.
+    Raises ScenarioError if no camera is held out, or the source is not a world.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -85,14 +84,17 @@ class KnownWorld:
         return self._expose(self._renderer).image(index * GRID_NS / 1e9)
 
     def carried(self, known_ns: float, present_ns: int) -> NDArray[np.uint8]:
-        """What is known at one instant, carried on to another."""
+        """Image of the scene known at ``known_ns`` and extrapolated to ``present_ns``, uint8 (H, W, 3)."""
         bodies = tuple(carried_on(body, known_ns / 1e9) for body in self._world.moving_bodies)
         world = dataclasses.replace(self._world, moving_bodies=bodies)
         return self._expose(self._renderer.for_world(world)).image(present_ns / 1e9)
 
     def lag_ms(self, shown: NDArray, index: int, pixels: NDArray[np.bool_]) -> float | None:
-        """Tau at which the truth of ``index`` minus tau matches ``pixels`` (H, W) of a picture best; None
-        where there are none. Between instants of the grid a parabola interpolates."""
+        """The lag at which the earlier truth matches ``pixels`` (H, W) of the image ``shown`` best, by a
+        parabola between grid instants; None without such pixels.
+
+        index: the instant of ``shown``, in multiples of GRID_NS.
+        """
         if not pixels.any():
             return None
         steps = range(int(EARLIEST_LAG_MS * 1e6) // GRID_NS, int(LONGEST_LAG_MS * 1e6) // GRID_NS + 1)
@@ -108,13 +110,13 @@ class KnownWorld:
 
 @dataclass
 class ShownTruth:
-    """A ``Truth`` of a deployment that keeps more than a score of what is shown: ``instants``.
+    """A ``Truth`` of a deployment that keeps more than scores of what is shown: ``instants``.
 
-    from_ns: what is shown before is not looked at.
-    instants: of each picture when it was looked at, its mean squared errors (``PARTS``; None where nothing
-    moves), those of the perfect field that knows the scene up to the capture of the newest view (``newest``)
-    and up to the mean capture of all cameras' newest views (``mean``), and of the scene as it was at the
-    latter (``frozen``), content lag and ages.
+    from_ns: earlier images are ignored.
+    instants: one mapping for each image shown: its instant, its mean squared errors (by ``PARTS``; None if
+        nothing moves), those of a perfect field that knows the scene up to the capture of the newest view
+        (``newest``) and up to the mean capture of all cameras' newest views (``mean``), those of the scene as
+        it was at the latter (``frozen``), content lag and ages.
     """
 
     world: KnownWorld
@@ -123,7 +125,7 @@ class ShownTruth:
     _publication: Publication | None = None
 
     def published(self, publication: Publication) -> None:
-        """To be called with each publication of the deployment."""
+        """Call this with each publication of the deployment."""
         self._publication = publication
 
     def nearest_ns(self, present_ns: int) -> int:
@@ -133,7 +135,7 @@ class ShownTruth:
         return self.world.image(round(present_ns / GRID_NS)), self.world.lens, self.world.pose
 
     def score(self, field: Any, present_ns: int) -> None:
-        """Keep an instant, instead of a score."""
+        """Add to ``instants``; returns no score."""
         publication, world = self._publication, self.world
         if present_ns < self.from_ns or publication is None:
             return

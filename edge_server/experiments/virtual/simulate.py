@@ -104,9 +104,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def summary(
     scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float
 ) -> dict[str, Any]:
-    """A run's frame counts, means over its last fifth, and the digest that tells runs apart.
+    """A run's frame counts, means over its last fifth, and a digest for comparing runs, as plain values.
 
-    last_fifth: at publication, the thesis's measure. shown: at random instants, of what was shown then.
+    last_fifth: scores at publication, the thesis's measure. shown: scores of the images at random instants.
     """
     publications = deployment.publications
     shown = [s for s in deployment.shown if s.published_ns >= 0.8e9 * seconds]
@@ -143,7 +143,8 @@ def digest(deployment: VirtualDeployment) -> str:
 
 
 def write_output(out: Path, found: dict[str, Any], publications: Sequence[Publication]) -> None:
-    """OUT/simulation.json, and OUT/series.jsonl with a line for each publication, as a live run has it."""
+    """Write OUT/simulation.json, and OUT/series.jsonl with a line for each publication, as a live run does.
+    Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "simulation.json", found)
     lines = [json.dumps(dataclasses.asdict(p)) for p in publications]
@@ -206,7 +207,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _epoch_ms(config: EdgeConfig) -> float:
-    """Least time between two decisions: what a live update may spend, where updates follow arrivals."""
+    """Least time between two decisions: a live update's time if updates follow arrivals, else _CYCLE_MS."""
     return config.update_ms if config.updates == "arrivals" else _CYCLE_MS
 
 

@@ -1,9 +1,9 @@
 """A whole deployment in virtual time: cameras -> links -> gate -> buffer -> updates -> publications.
 
-It uses the live parts with a virtual clock. One seed makes a run repeatable bit for bit, faults included.
-``Compute`` sets the cost of an update; the present is the instant at which that cost has elapsed.
-A frame is captured, encoded and checksummed only when an update uses it or a fault damages it. This changes
-no result, because nothing reads a frame before.
+It uses the live parts with a virtual clock. With one seed a run repeats bit for bit, faults included.
+``Compute`` sets the cost of an update; an update is published when that cost has elapsed. A frame is
+captured, encoded and checksummed only when an update uses it or a fault damages it, which does not change
+results, because nothing reads a frame earlier.
 """
 
 from __future__ import annotations
@@ -74,15 +74,16 @@ class RunSettings:
     """How a deployment runs in virtual time.
 
     steps: optimizer steps of an update.
-    first_steps: of the first update (0: as the others).
-    compute: what an update is charged.
+    first_steps: those of the first update; 0: as the others.
+    compute: cost of an update in virtual time.
     epoch_ms: least time between two decisions.
     grace_ms: how long the first update waits for cameras that have not reported.
-    score_every_ms: publications nearer than this to the last scored one are not scored; None scores nothing.
-    shown_every_ms: what is shown is scored at seeded random instants, one in each such period; None: never.
-    first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
-        it, so that policies that take different times decide at the same instants.
+    score_every_ms: least time between two scored publications; None scores none.
+    shown_every_ms: the image shown is scored at one seeded random instant in each such period; None: never.
+    first_ms: instant of the first decision; later ones are whole numbers of epochs after it, so that policies
+        that take different times decide at the same instants. None: as soon as possible.
     scratch: every update starts with an empty field, as in the thesis.
+    Raises ValueError for values out of range.
     """
 
     steps: int
@@ -108,34 +109,39 @@ class RunSettings:
 
     @property
     def most_new(self) -> int | None:
-        """Number of frames that an update takes in, where each is charged: what lets it last two epochs; the
-        others are left out. None: all."""
+        """Largest number of frames that an update takes in, such that it lasts at most two epochs (but at
+        least LEAST_TAKEN); None, if frames are not charged: all."""
         if not (self.epoch_ms and self.compute.ms_per_view):
             return None
         left_ms = 2.0 * self.epoch_ms - self.compute.ms_per_update - self.compute.ms_per_step * self.steps
         return max(int(left_ms / self.compute.ms_per_view), LEAST_TAKEN)
 
     def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
-        """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
+        """Instant of the next decision, after one at ``decided_ns`` whose update is done at ``done_ns``.
+
+        origin_ns: start of the run.
+        """
         epoch_ns = round(self.epoch_ms * 1e6)
         if self.first_ms is None:
             return decided_ns + epoch_ns
         first_ns = origin_ns + round(self.first_ms * 1e6)
-        # One epoch on at least, and none that has passed meanwhile.
+        # At least one epoch later, and not in the past.
         passed = max(decided_ns + 1, done_ns) - first_ns
         return first_ns + -(-passed // epoch_ns) * epoch_ns
 
 
 class VirtualDeployment:
-    """Runs ``updates`` on what ``cameras`` send over the channel. ``run`` may be called again to go on.
+    """Runs ``updates`` on the frames that ``cameras`` send over the channel. ``run`` may be called
+    repeatedly.
 
-    cameras: the training cameras, as a node would host them; their names are the buffer's.
-    channel: its model.
+    cameras: the training cameras, as a node would host them, in the order of the buffer's cameras.
+    channel: configuration of the emulated channel.
     updates: the edge: buffer, policy and field.
-    settings: how it runs; others apply from the next decision on.
-    seed: of the channel.
-    truth: what publications are scored against.
+    settings: how it runs; may be replaced, which takes effect at the next decision.
+    seed: of the channel and the random instants.
+    truth: reference images for scores; None scores nothing.
     on_published: called with each publication.
+    Raises ValueError if the cameras are not the buffer's.
     """
 
     def __init__(
@@ -155,18 +161,19 @@ class VirtualDeployment:
         self.truth = truth
         self.publications: list[Publication] = []
         self.shown: list[Score] = []
-        """Scores of what was shown: at each instant the newest publication, carried on to that instant."""
+        """Scores of the image shown at random instants: the newest publication, extrapolated to the
+        instant."""
         self.shown_age_ms: list[float] = []
-        """Mean age of the views of what was shown, at the same instants."""
+        """Mean age of the views in the image shown, at the same instants."""
         self.captured: Counter[str] = Counter()
         self.delivered: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
         self.failed: Counter[str] = Counter()
-        """Captures that a source could not give, by camera; noticed when a decision wanted them."""
+        """Number of captures that a source could not make, by camera; noticed when a decision uses them."""
         self.next_policy: Policy | None = None
-        """Takes the policy's place at the next decision, as live."""
+        """Replaces the policy at the next decision, as live."""
         self.session = SESSION
-        """Of the frames captured from now on."""
+        """Session id of the frames captured from now on."""
         self._on_published = on_published
         self._origin_ns = updates.start_ns  # of the cameras' ticks
         self._channel_origin_ns = updates.start_ns
@@ -188,18 +195,18 @@ class VirtualDeployment:
         self._instants = self._shown_instants(seed)
         self._show_ns = next(self._instants)
         self.decided_ns = updates.start_ns
-        """Instant of the decision that is being carried out, or was last."""
+        """Instant of the current or last decision."""
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._edge = self._run_edge()
         self._wake = next(self._edge)
 
     def at(self, at_ns: int, action: Callable[[], None]) -> None:
-        """Call ``action`` at an instant of the clock, before all else that happens then."""
+        """Call ``action`` at an instant of the clock, before other events of that instant."""
         heapq.heappush(self._agenda, (at_ns, next(self._order), action))
 
     def run(self, seconds: float) -> list[Publication]:
-        """Go on for ``seconds`` of virtual time; returns the publications of that time."""
+        """Continue for ``seconds`` of virtual time. Returns the publications of that time."""
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         known = len(self.publications)
         while True:
@@ -233,13 +240,13 @@ class VirtualDeployment:
 
     @property
     def capture_period_ns(self) -> int:
-        """Of the fastest camera."""
+        """Capture period of the fastest camera."""
         return round(1e9 / max(float(camera.fps) for camera in self._cameras.values()))
 
     def with_images(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
-        """Frames of the buffer with their images and poses, made now; without those that a source cannot
-        give. A frame that is used again stays the same object and is decoded once. Public for those who
-        decide in the place of this deployment's own edge."""
+        """Frames of the buffer with their images and poses, which are made now; frames that a source cannot
+        make are left out. A frame that is used again stays the same object and is decoded once. Public for
+        code that decides instead of this deployment's edge."""
         made = []
         for item in items:
             camera, sequence = item.frame.camera, item.frame.sequence
@@ -285,7 +292,7 @@ class VirtualDeployment:
         )
 
     def _wake_ns(self) -> int:
-        """Instant at which the edge's loop goes on, if nothing arrives before."""
+        """Instant at which the edge's loop continues, if nothing arrives before."""
         return self._wake.at_ns
 
     def _due_ns(self, name: str) -> int:
@@ -311,8 +318,8 @@ class VirtualDeployment:
         self._send(frame, now_ns)
 
     def _stamp(self, name: str, now_ns: int) -> tuple[int, int]:
-        """What a camera's clock shows, and the node's estimate of the edge's clock minus that one: a clock
-        exchange that takes no time knows it exactly."""
+        """What a camera's clock shows, and the node's estimate of the edge's clock minus that one, which is
+        exact because clock exchanges take no time here."""
         stamped_ns = self._node_clocks[name].stamp_ns(now_ns)
         return stamped_ns, now_ns - stamped_ns
 
@@ -331,7 +338,7 @@ class VirtualDeployment:
                 self._deliver(event.transit.item, event.transit.flips)
 
     def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> str | None:
-        """A frame arrives at the edge; the reason if it is refused."""
+        """Deliver a frame to the edge. Returns the reason if it is refused, else None."""
         now_ns = self.clock.now_ns()
         try:
             if flips:
@@ -368,7 +375,7 @@ class VirtualDeployment:
     # --- the edge -------------------------------------------------------------------------------------
 
     def _run_edge(self) -> Generator[WakeCondition, None, None]:
-        """The edge's loop; it yields when it wants to go on."""
+        """The edge's loop; it yields the condition on which it continues."""
         updates, settings = self.updates, self.settings
         steps = settings.first_steps
         if settings.first_ms is None:
@@ -378,7 +385,7 @@ class VirtualDeployment:
         while True:
             settings = self.settings
             steps = steps or settings.steps
-            # A field begins with all that has come; only then does it know what a frame takes.
+            # The first update takes in all frames that have arrived; later ones are limited.
             most_new = settings.most_new if self.publications else None
             if self.next_policy is not None:
                 updates.policy, self.next_policy = self.next_policy, None
@@ -422,7 +429,7 @@ class VirtualDeployment:
 
     def _selection_with_images(self, selection: Selection) -> Selection:
         """The selection with images."""
-        # Earlier ones first: of a camera's frames the one made last is kept longest.
+        # Earlier frames first: of a camera's frames, the one made last is kept longest.
         earlier = self.with_images(selection.earlier)
         return dataclasses.replace(
             selection, others=self.with_images(selection.others), earlier=earlier,
@@ -450,7 +457,7 @@ class VirtualDeployment:
         return publication.scored(score)
 
     def _shown_instants(self, seed: int) -> Iterator[int]:
-        """Seeded random instants that have nothing to do with the cameras' phase."""
+        """Seeded random instants, independent of the cameras' phase."""
         every_ms, truth = self.settings.shown_every_ms, self.truth
         if every_ms is None or truth is None:
             while True:

@@ -11,8 +11,8 @@ Topics, CAMERA being a camera's id:
     /scores              freshfield.Decision          JSON: the same with its fidelity, when that is known
 
 A message's log time is its arrival at the edge, its publish time the capture, both on the edge's clock.
-Header and image hold everything that was sent; the other topics repeat it in terms that viewers know. Chunks
-are not compressed: payloads already are, and whatever was written before a cut can be read.
+Header and image hold everything that was sent; the other topics repeat it in formats that viewers know.
+Chunks are not compressed: payloads already are, and a truncated file stays readable up to the cut.
 
 Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (extra ``mcap``), which only
 ``writer`` and ``reader`` import.

@@ -1,4 +1,5 @@
-"""Read the frames of a session, also of a file that was cut short: the index first, payloads on request."""
+"""Reads the frames of a recorded session, also of a truncated file. Indexes the file first; payloads are read
+on request."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ except ImportError:
 
 _IN_CHUNKS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _RECORD_HEAD = struct.Struct("<BQ")
-# Times, uncompressed size, checksum, and the length of the compression's name.
+# Start and end time, uncompressed size, checksum, length of the compression's name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _KEPT_CHUNKS = 4
 # What damaged records raise; lz4's errors are plain RuntimeErrors.
@@ -44,7 +45,8 @@ _UNREADABLE = (
 
 
 class _Location(NamedTuple):
-    """Location of a message's record: in the file, or in the records of the compressed chunk at ``chunk``."""
+    """Location of a message's record: offset in the file, or in the decompressed records of the chunk whose
+    body is at file offset ``chunk``."""
 
     chunk: int | None
     offset: int
@@ -53,7 +55,7 @@ class _Location(NamedTuple):
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """A frame as it arrived, its payload still in the file. arrived_ns: on the edge's clock."""
+    """A recorded frame whose payload is still in the file. arrived_ns: arrival on the edge's clock."""
 
     header: pb.FrameHeader
     arrived_ns: int
@@ -61,11 +63,12 @@ class SessionFrame:
 
 
 class Session:
-    """The frames of a recording by camera, in the order of arrival. Thread-safe.
+    """A recording, opened and indexed. Thread-safe.
 
+    frames: by camera, in the order of arrival.
     messages: number of complete messages by topic.
-    cut: one line on what is missing of a file that was not closed or is damaged; else None.
-    Raises SessionError, OSError.
+    cut: one line on what is missing if the file was not closed or is damaged; else None.
+    Raises SessionError if it is no MCAP file, OSError if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -94,7 +97,7 @@ class Session:
             self.cut = f"{path}: {', '.join(parts)}: {sum(self.messages.values())} complete messages are used"
 
     def payload(self, frame: SessionFrame) -> bytes:
-        """The payload of one of ``frames``, byte for byte. SessionError where the file has changed."""
+        """The payload of one of ``frames``, byte for byte. Raises SessionError if it cannot be read again."""
         try:
             return bytes(CompressedImage.FromString(_message(self._body(frame.location)).data).data)
         except (DecodeError, *_UNREADABLE) as error:
@@ -116,9 +119,9 @@ class Session:
     # --- the index --------------------------------------------------------------------------------
 
     def _read_all(self) -> int | None:
-        """Index every complete message. Returns where the complete part ends, None for a closed file."""
+        """Index every complete message. Returns the end of the complete part, None for a closed file."""
         heads, end = self._heads()
-        # A closed file repeats its channels at the end: a damaged chunk takes only its own messages with it.
+        # Channels first: a closed file repeats them at its end, so a damaged chunk loses only its messages.
         for wanted in (Opcode.CHANNEL, None):
             for opcode, at, size in heads:
                 whole = at + size <= self._size
@@ -129,7 +132,8 @@ class Session:
         return end
 
     def _heads(self) -> tuple[list[tuple[int, int, int]], int | None]:
-        """(opcode, offset, size) of the file's records, of which the last may be cut, and where they end."""
+        """(opcode, offset, size) of the file's records, the last perhaps truncated; and the end of the
+        complete ones, None for a closed file."""
         heads: list[tuple[int, int, int]] = []
         at = len(MCAP0_MAGIC)
         while at + _RECORD_HEAD.size <= self._size:
@@ -211,7 +215,8 @@ class Session:
 
 
 def _unpack(chunk: Chunk) -> bytes:
-    """A chunk's records. Decompressors make as much as the data asks for, unless they are told the most."""
+    """Decompress a chunk's records. The size is bounded, because decompressors otherwise allocate whatever
+    the data declares."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes, more than {MAX_CHUNK_BYTES}")

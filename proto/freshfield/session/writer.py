@@ -1,4 +1,4 @@
-"""Write a session. One thread at a time may use the writer."""
+"""Writes a session."""
 
 from __future__ import annotations
 
@@ -33,15 +33,18 @@ try:
 except ImportError:
     raise SessionError(INSTALL) from None
 
-# A process that is killed loses at most one chunk, besides what its thread had not written yet.
+# A killed process loses at most one chunk, and what its writing thread had not handed over yet.
 _CHUNK_BYTES = 256 * 1024
 
 
 class SessionWriter:
-    """A session being written. messages: number of messages written."""
+    """A session being written; not thread-safe. messages: number of messages written."""
 
     def __init__(self, path: Path, about: Mapping[str, str]) -> None:
-        """path: must not exist; OSError where it cannot be written. about: metadata of the session."""
+        """path: file that must not exist yet. about: metadata of the session.
+
+        Raises OSError if the file exists or cannot be written.
+        """
         self.messages = 0
         self._file = path.open("xb")
         self._mcap = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
@@ -52,7 +55,7 @@ class SessionWriter:
         self._lenses: dict[str, bytes] = {}
 
     def frame(self, request: pb.PushRequest, arrived_ns: int) -> None:
-        """A frame that arrived at ``arrived_ns`` on the edge's clock."""
+        """Write all messages of a frame that arrived at ``arrived_ns`` on the edge's clock."""
         header = request.header
         camera, captured_ns = header.camera_id, header.generated_ns + header.clock_offset_ns
         times = (arrived_ns, max(0, captured_ns), header.sequence & 0xFFFFFFFF)
@@ -81,18 +84,23 @@ class SessionWriter:
     def data(
         self, topic: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int
     ) -> None:
-        """A JSON message. name: of its schema."""
+        """Write a JSON message.
+
+        name, schema: name and JSON schema of the topic's messages.
+        t_ns: log and publish time.
+        Raises ValueError for NaN or infinity.
+        """
         self._register(topic, name, MessageEncoding.JSON, lambda: self._mcap.register_schema(
             name, SchemaEncoding.JSONSchema, json.dumps(schema).encode()
         ))  # fmt: skip
         self._add(topic, json.dumps(values, allow_nan=False).encode(), t_ns, t_ns, 0)
 
     def flush(self) -> None:
-        """Give finished chunks to the system."""
+        """Hand finished chunks to the operating system."""
         self._file.flush()
 
     def close(self, counts: Mapping[str, int]) -> None:
-        """Write the index and ``counts``, and close the file."""
+        """Write the index and ``counts`` (as metadata), and close the file. Raises OSError."""
         try:
             self._mcap.add_metadata("counts", {name: str(count) for name, count in counts.items()})
             self._mcap.finish()
@@ -112,7 +120,7 @@ class SessionWriter:
         self._add(topic, message.SerializeToString(), log_ns, publish_ns, sequence)
 
     def _register(self, topic: str, name: str, encoding: str, new_schema: Callable[[], int]) -> None:
-        """The channel of a new topic, and the schema of a new ``name``."""
+        """Register the channel of a new topic, and the schema of a new ``name``."""
         if topic not in self._channels:
             if name not in self._schemas:
                 self._schemas[name] = new_schema()

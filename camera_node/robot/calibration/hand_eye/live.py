@@ -34,7 +34,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
 
     board, lens: the target, and a lens that replaces the camera's own.
     setup: eye-in-hand or eye-to-hand.
-    Raises CalibrationError, and as what it opens: scenario, files, camera, arm.
+    Raises CalibrationError, and the errors of what it opens: scenario, files, camera, arm.
     """
     if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
         raise CalibrationError("--want-mm, --seconds: expected positive numbers")

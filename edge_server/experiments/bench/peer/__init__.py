@@ -1,4 +1,5 @@
-"""``edge-server bench peer``: the race is in ``race``; a peer is one file and one line there."""
+"""``edge-server bench peer``: compares our fields with other programs. To add a peer, add a file here and a
+line in ``race``."""
 
 from edge_server.experiments.bench.peer.race import measure, table
 

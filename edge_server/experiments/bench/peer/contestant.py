@@ -1,4 +1,4 @@
-"""What takes part in the race."""
+"""A contestant of the race."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class PeerMissing(RuntimeError):
 
 @dataclass(frozen=True)
 class Contestant:
-    """A method with a scene to learn.
+    """A method that is trained on a scene.
 
-    train: trains for about so many seconds; returns the seconds that it took.
-    render: a view as float32 (H, W, 3) in [0, 1].
-    steps: optimizer steps until now.
+    train: trains for about the given seconds; returns the seconds that it took.
+    render: renders a view as float32 (H, W, 3) in [0, 1].
+    steps: number of optimizer steps so far.
     close: called once, at the end.
     """
 
@@ -32,6 +32,6 @@ class Contestant:
 
 
 def on_white(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """An image (H, W, 3 or 4) as colors (H, W, 3) in [0, 1], over white."""
+    """Convert an image (H, W, 3 or 4) to colors (H, W, 3) in [0, 1], over white."""
     unit = image.astype(np.float32) / 255.0
     return unit[..., :3] * unit[..., 3:] + (1.0 - unit[..., 3:]) if unit.shape[2] == 4 else unit

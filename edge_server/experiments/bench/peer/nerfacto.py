@@ -1,4 +1,4 @@
-"""nerfstudio's nerfacto in its torch implementation, which is what runs without a GPU."""
+"""nerfstudio's nerfacto in its torch implementation, which runs without a GPU."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from edge_server.experiments.bench.peer.contestant import Contestant, PeerMissin
 from edge_server.experiments.scenes.multiview_still import MultiviewStill
 from edge_server.fields import View
 
-# Rays of a step: with its default of 4096 one step takes half a minute on two cores.
+# Rays per step; with the default of 4096 one step takes half a minute on two cores.
 RAYS = 1024
-# What its users set for the scenes of Blender's data set: an object around the origin, cameras 4 away.
+# The usual settings for the scenes of the Blender data set: an object at the origin, cameras at a distance of
+# 4.
 BLENDER = {
     "near_plane": 2.0, "far_plane": 6.0, "proposal_initial_sampler": "uniform",
     "disable_scene_contraction": True, "background_color": "white",
@@ -25,8 +26,8 @@ BLENDER = {
 
 
 def nerfacto(scene: str, still: MultiviewStill, seed: int) -> Contestant:
-    """nerfacto with its own defaults (for ``lego``: ``BLENDER``) but fewer rays a step and no refinement of
-    exact poses. PeerMissing: nerfstudio cannot be imported."""
+    """nerfacto with its defaults (for ``lego``: ``BLENDER``), but fewer rays per step and no refinement of
+    the poses, which are exact. Raises PeerMissing if nerfstudio cannot be imported."""
     try:
         import torch
         import torchmetrics.image.lpip
@@ -35,13 +36,14 @@ def nerfacto(scene: str, still: MultiviewStill, seed: int) -> Contestant:
         from nerfstudio.models import nerfacto as peer
     except ImportError as error:
         raise PeerMissing(f"nerfstudio cannot be imported: {error}") from None
-    # The model makes an LPIPS network for its own evaluation, which needs torchvision and a download.
+    # Replaced because the model makes an LPIPS network for its evaluation, which needs torchvision and a
+    # download.
     torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = torch.nn.Identity
     logging.getLogger("nerfstudio").setLevel(logging.ERROR)
     torch.manual_seed(seed)
     blender = scene == "lego"
     place = (np.zeros(3), 1.0) if blender else _normalization(still.training)
-    edge = 1.5 if blender else 1.0  # of the scene box, as its loaders have it
+    edge = 1.5 if blender else 1.0  # half side of the scene box, as in nerfstudio's loaders
     config = peer.NerfactoModelConfig(
         implementation="torch",
         camera_optimizer=CameraOptimizerConfig(mode="off"),
@@ -90,7 +92,7 @@ def nerfacto(scene: str, still: MultiviewStill, seed: int) -> Contestant:
 
 
 def _cameras(views: Sequence[View], centre: NDArray[np.float64], scale: float) -> Any:
-    """As nerfstudio has them: OpenGL's axes, positions (world - centre) * scale."""
+    """Convert cameras to nerfstudio's: OpenGL's axes, positions (world - centre) * scale."""
     import torch
     from nerfstudio.cameras.cameras import Cameras, CameraType
 
@@ -120,7 +122,7 @@ def _callbacks(model: Any) -> tuple[list[Any], list[Any]]:
 
 
 def _normalization(views: Sequence[View]) -> tuple[NDArray[np.float64], float]:
-    """Centre and scale that put all cameras into [-1, 1]^3, as nerfstudio's loader does."""
+    """Center and scale that put all cameras into [-1, 1]^3, as in nerfstudio's loader."""
     places = np.stack([v.camera_to_world[:3, 3] for v in views])
     centre = places.mean(axis=0)
     return centre, float(1.0 / np.abs(places - centre).max())

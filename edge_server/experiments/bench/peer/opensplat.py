@@ -21,15 +21,17 @@ from edge_server.export.transforms import write_transforms
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 
-# It needs first positions: so many surface points of our own field after so many seconds. They are a gift.
+# OpenSplat needs initial positions: this number of surface points of our field, fitted for this many seconds.
+# Their time is not counted.
 POINTS, POINTS_S = 10_000, 2.0
 START_S = 120.0
 
 
 def opensplat(folder: Path, still: MultiviewStill, seed: int) -> Contestant:
-    """OpenSplat with its own defaults, but images in full size from the start. It renders the held-out view
-    itself after every tenth step, which is counted for it: some 3 %. Its process is stopped while it is
-    scored. PeerMissing: no program ``opensplat``, or it does not start."""
+    """OpenSplat with its defaults, but images in full size from the start. It renders the held-out view
+    itself after every tenth step, which is included in its time (some 3 %). Its process is stopped while it
+    is scored.
+    Raises PeerMissing if there is no program ``opensplat``, or it does not start."""
     program = shutil.which("opensplat")
     if program is None:
         raise PeerMissing("no program opensplat on the PATH")

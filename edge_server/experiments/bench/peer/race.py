@@ -1,7 +1,7 @@
-"""Seconds to a quality, beside peers on the same machine in the same run.
+"""Measures seconds to a quality, of our fields and of peers on the same machine in the same run.
 
-Every contestant gets the same training views and is scored on all held-out views, as their mean PSNR; time
-spent on that is not counted for anybody. docs/fields.md says how to set up each peer.
+Every contestant gets the same training views and is scored by the mean PSNR of all held-out views; the time
+for scoring is not counted. docs/fields.md says how to set up each peer.
 """
 
 from __future__ import annotations
@@ -30,17 +30,19 @@ from edge_server.fields.registry import make_field
 from freshfield.machine_load import LoadMeter
 
 TARGETS_DB = (20, 25)
-# Seconds of fitting at most, and runs with seeds of their own.
+# Longest fitting time in seconds, and number of runs with different seeds.
 QUICK, FULL = (60.0, 1), (300.0, 3)
-# Seconds of fitting before the first evaluation; every further slice is longer by the factor.
+# Seconds of fitting before the first evaluation, of our fields and of peers; each further slice is longer by
+# the factor.
 _FIRST_S, _FIRST_PEER_S, _GROWTH = 0.25, 4.0, 1.5
-# Recordings, and by what their images are divided.
+# Recordings, and the divisors of their image sizes.
 SCALES = {"lego": 4.0, "kitchen": 1.0}
 OURS = ("splat", "ngp")
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """For every scene, contestant and run the seconds to each quality, and the best reached."""
+    """Measure for every scene, contestant and run the seconds to each quality, and the best quality. Raises
+    BenchError."""
     (limit_s, runs), store = QUICK if run.quick else FULL, run.store
     stills: dict[str, MultiviewStill] = {}
     for scene, scale in SCALES.items():
@@ -70,7 +72,7 @@ def _about(still: MultiviewStill, about: dict[str, Any]) -> dict[str, Any]:
     return {**about, **mean_baselines(still.training, still.held_out, still.background)}
 
 
-# (still, seed) -> who is to train on it. Raises PeerMissing.
+# (still, seed) -> contestant to be trained on it. Raises PeerMissing.
 _Enter = Callable[[MultiviewStill, int], Contestant]
 
 
@@ -95,7 +97,7 @@ def _race(enter: _Enter, still: MultiviewStill, seed: int, limit_s: float, ours:
             scores = [psnr(contestant.render(view), truth) or 0.0 for view, truth in truths]
             now_db = statistics.fmean(scores)
             for target in TARGETS_DB:
-                if now_db >= target:  # between two evaluations in a straight line
+                if now_db >= target:  # linearly interpolated between two evaluations
                     at_s = float(np.interp(target, [best, now_db], [evaluated_s, spent]))
                     reached.setdefault(target, at_s)
             best, evaluated_s = max(best, now_db), spent
@@ -116,7 +118,7 @@ def _ours(name: str, still: MultiviewStill, seed: int) -> Contestant:
 
 
 def _plain_torch(still: MultiviewStill, seed: int) -> Contestant:
-    """``ngp`` in plain torch, with as many rays a step as the kernels take when they have settled."""
+    """``ngp`` in plain torch, with as many rays per step as the kernels use after they have settled."""
     from edge_server.fields.ngp.torch_field import NgpTorchField  # imports torch
 
     settled = make_field("ngp", seed=seed)
@@ -142,7 +144,8 @@ def _of_field(field: Field, still: MultiviewStill) -> Contestant:
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """A row for every scene and contestant: medians over the runs, and in brackets their range."""
+    """A table with a row for every scene and contestant: medians over the runs, and their range in
+    parentheses."""
     rows = []
     for scene in SCALES:
         found = {n: list(r.values()) for n, r in figures.get(scene, {}).items() if n != "about"}
@@ -168,7 +171,7 @@ _T = tuple(f"{t}" for t in TARGETS_DB)
 
 
 def _median(runs: list[dict[str, Any]], target: str) -> float:
-    """Seconds, infinite where half of the runs or more did not get there."""
+    """Median seconds to the target; infinite if half of the runs or more did not reach it."""
     return statistics.median(r["seconds_to"][target] or float("inf") for r in runs)
 
 

@@ -1,4 +1,5 @@
-"""What is shown at random instants of synthetic scenes, and where the decibels go. In virtual time."""
+"""Measures, in virtual time, the images shown at random instants of synthetic scenes, and the causes of their
+errors."""
 
 from edge_server.experiments.bench.shown.output import draw, table
 from edge_server.experiments.bench.shown.runs import measure

@@ -1,7 +1,7 @@
-"""How cost grows with cameras, image size, speed and moving bodies: one factor at a time, from ``room``.
+"""Measures how cost grows with cameras, image size, speed and people: one factor at a time, from ``room``.
 
-A run in virtual time follows arrivals as ``room`` ships it. At first computing is free and its processor time
-is measured; from then on it is charged, and updates take in no more frames than they have time for.
+A run in virtual time follows arrivals, as the shipped ``room`` does. At first computing is free and its
+processor time is measured; then it is charged, and updates take in no more frames than they have time for.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from edge_server.experiments.virtual.virtual_deployment import RunSettings
 from freshfield.scenario import Scenario
 
 FREE_S, SETTLING_S, SCORED_S = 7.0, 1.0, 4.0
-SETTINGS = replace(LAYERS_RUN, steps=5)  # of the static field: about what one more core does meanwhile
-_SHED, _BUSY = 0.01, 0.9  # shares from which a point is saturated
+SETTINGS = replace(LAYERS_RUN, steps=5)  # of the static field, about as many as another core does meanwhile
+_SHED, _BUSY = 0.01, 0.9  # share of shed frames and following cores above which a point is saturated
 _SCORES = ("psnr_db", "psnr_moving_db", "psnr_still_db")
 _COSTS = ("update_ms", "view_ms", "following_cores", "static_cores")
 _ROOM = (12, 128, 128, 15.0, 1.0, 1)
 _FACTORS = ("cameras", "width", "height", "fps", "speed, m/s", "people")
-# Name of a factor -> points, with the values of _FACTORS that differ from room's.
+# Factor -> points: the values of _FACTORS that differ from those of room.
 POINTS: dict[str, tuple[dict[str, float], ...]] = {
     "cameras": ({"cameras": 4}, {"cameras": 6}, {}, {"cameras": 18}, {"cameras": 18, "fps": 30.0}),
     "image": ({"width": 64, "height": 64}, {}, {"width": 320, "height": 240}, {"width": 640, "height": 480}),
@@ -51,7 +51,7 @@ _TEXT = (
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{FACTOR: {POINT: figures}}; a point of ``room`` itself once, under its first factor."""
+    """Measure {FACTOR: {POINT: figures}}; a point that is in several factors is measured once."""
     seconds = (1.0, 0.2, 0.5) if run.quick else (FREE_S, SETTLING_S, SCORED_S)
     done: dict[str, Any] = {}
     for factor, points in POINTS.items():
@@ -126,7 +126,7 @@ def _run(
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """Every point, and where it saturates."""
+    """A text with the saturated points, and a table of all points."""
     head = (
         "varied|cameras|image|frames a second|m/s|people|whole, dB|moving|still|age shown, ms|an update, ms|"
         "a frame, ms|following cores|static cores|updates a second|shed"
@@ -157,7 +157,7 @@ def _is_saturated(found: Mapping[str, Any]) -> bool:
 
 
 def draw(figures: Mapping[str, Any], path: Path) -> None:
-    """Decibels, age shown and cores against each factor, a column a factor, to ``path`` (PNG)."""
+    """Draw PSNR, shown age and cores against each factor, one column per factor, to ``path`` (PNG)."""
     from edge_server.report.style import CYCLE, INK, figure
 
     panels = (

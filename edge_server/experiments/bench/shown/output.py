@@ -1,4 +1,4 @@
-"""Tables and the picture of what is shown."""
+"""Tables and figure of ``bench shown``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _CEILINGS_TEXT = (
 
 
 def table(figures: Figures) -> str:
-    """All figures as Markdown, and what they mean."""
+    """All figures as Markdown, with explanations."""
     meaning = []
     for name in list(figures)[:1]:
         lags = [_mean(figures[name].get(v, {}).values(), "lag_ms", "p50") for v in ("shown", "before")]
@@ -72,7 +72,7 @@ def table(figures: Figures) -> str:
 
 
 def _trends(figures: Figures) -> list[str]:
-    """What long runs show minute by minute, with a heading; nothing without such runs."""
+    """Table of long runs minute by minute, with a heading; empty without such runs."""
     runs = {name: run for name in figures if (run := _first(figures, name, "shown")) and "by_minute" in run}
     if not runs:
         return []
@@ -86,7 +86,8 @@ def _trends(figures: Figures) -> list[str]:
 
 
 def _slower_table(figures: Figures) -> list[str]:
-    """Rows on slower processors beside the same on this one, with a heading; nothing without such runs."""
+    """Table of rows on slower processors and the same rows on this one, with a heading; empty without such
+    runs."""
     slower = {row.name: row for row in ROWS if row.slower > 1.0 and row.name in figures and not row.minutes}
     if not slower:
         return []
@@ -144,13 +145,13 @@ def _ceilings_table(figures: Figures) -> str:
 
 
 def _own(figures: Figures) -> list[str]:
-    """The scenes that have costs of their own."""
+    """The scenes with their own costs."""
     others = {row.name for row in ROWS if row.charged_as}
     return [name for name in figures if name not in others]
 
 
 def _first(figures: Figures, name: str, variant: str) -> dict[str, Any] | None:
-    """A row's run of one variant with the first seed."""
+    """The run with the first seed of a row's variant; None if there is none."""
     return next(iter(figures[name].get(variant, {}).values()), None)
 
 
@@ -166,7 +167,7 @@ def _pair(run: Figures | None) -> str:
 
 
 def _shares(figures: Figures, name: str) -> list[float]:
-    """``_SHARES`` of the squared error of a row's moving pixels; empty where they cannot be told apart."""
+    """``_SHARES`` of the squared error of a row's moving pixels; empty if they cannot be separated."""
     runs = [_first(figures, name, v) for v in (FIRST_VARIANT, "computing free", "shown")]
     known = [run for run in runs if run and run["squared_error"]["moving"]]
     if len(known) < len(runs):
@@ -179,8 +180,8 @@ def _shares(figures: Figures, name: str) -> list[float]:
 
 
 def draw(figures: Figures, path: Path) -> None:
-    """Moving PSNR shown, before and at each ceiling, and the shares of the error, a line a scene, to ``path``
-    (PNG)."""
+    """Draw the moving PSNR of each variant and of the perfect field, and the shares of the error, one line
+    per scene, to ``path`` (PNG)."""
     from edge_server.report.style import CYCLE, figure
 
     names = [name for name in _own(figures) if _first(figures, name, "shown")]

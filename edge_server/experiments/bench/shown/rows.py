@@ -1,4 +1,4 @@
-"""The scenes of the table: shipped ones, some that nothing was tuned on, and the general cases."""
+"""The scenes of ``bench shown``: shipped ones, some that nothing was tuned on, and special cases."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from freshfield.scenario import Scenario, load, parse
 
 FIRST_SEED = 7
 DRAWN = (101, 102, 103)
-# Not all cores: what is charged is measured on one.
+# One thread, because the charged costs are those of one core.
 _LAYERS = {
     "field": "splat", "field_options": {"layers": True, "threads": 1}, "policy": {"name": "all"},
     "updates": "arrivals", "lpips": "none", "grace_ms": 1000.0,
@@ -25,12 +25,14 @@ EDGES: dict[str, dict[str, Any]] = {"layers": _LAYERS, "before": _BEFORE}
 class Row:
     """One scene.
 
-    base: a scenario, shipped or a file. changes: keys of its sections, instead of its own.
-    seeds: how often what is shown is measured, with seeds from FIRST_SEED on.
-    split: whether network and computing are told apart.
-    minutes: of a long run, to see whether age or fidelity has a trend.
-    charged_as: the row whose costs are charged, which has to be known; only what is shown is measured then.
-    slower: how many times as much is charged: a processor of 1 / ``slower`` the speed.
+    base: a scenario, shipped or a file.
+    changes: section -> keys that replace those of the base.
+    seeds: number of seeds of variants that are repeated, from FIRST_SEED on.
+    split: whether the effects of network and computing are separated.
+    minutes: duration of a long run, which shows trends of age or fidelity; 0: a usual run.
+    charged_as: name of the row whose costs are charged, which must be known; then only variant "shown" is
+        measured.
+    slower: factor of the charged costs, as of a processor with 1 / ``slower`` of the speed.
     """
 
     name: str
@@ -59,8 +61,8 @@ class Row:
 
 
 def drawn(seed: int) -> Row:
-    """A scene that nothing was tuned on: place, walk, speed, number and lens of the cameras, and network are
-    drawn from the seed."""
+    """A scene that nothing was tuned on: scene, walk, speed, number and field of view of the cameras, and
+    network are drawn from the seed."""
     rng = np.random.default_rng([seed, 31])
     base = str(rng.choice(["room", "tower"]))
     source: dict[str, Any] = {
@@ -108,7 +110,7 @@ ROWS: tuple[Row, ...] = (
         for speed, slower in (("half", 2.0), ("a quarter of", 4.0))
         for row in (Row("room", split=False), *_HARD)
     ),
-    # Offered twice what it can take. Ages follow from what is charged, so that small pictures will do.
+    # Offered twice as many frames as it can take. Ages depend on the charged costs, so small images suffice.
     replace(
         _case("a quarter of the speed, ten minutes", source={"width": 32, "height": 32}),
         minutes=10,
@@ -119,7 +121,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def find(names: tuple[str, ...]) -> list[Row]:
-    """The rows of these names, and any other scenario of a synthetic world by its name or file; all ROWS
-    without names."""
+    """The rows with these names; other names are scenarios of synthetic worlds, by name or file. Without
+    names all ROWS."""
     known = {row.name: row for row in ROWS}
     return [known.get(name) or Row(name, name) for name in names] or list(ROWS)

@@ -1,9 +1,9 @@
-"""Runs of the table: what is shown, and the same where computing is free and where nothing is late.
+"""Runs of ``bench shown``: as deployed, with free computing, and with nothing late.
 
-``layers`` is the splat field in layers on arrivals, a decision each 20 ms; ``before`` the same field without
-layers, in cycles of 250 ms. Computing is charged as measured on one core: an update of layers by the part
-times of the run in which nothing is late, without the training and the renderings of the static field, which
-another core does; a cycle by what docs/studies.md charges.
+``layers`` is the splat field in layers on arrivals, with a decision every 20 ms; ``before`` is the same field
+without layers, in cycles of 250 ms. Computing is charged as measured on one core: an update of layers by the
+part times of the run in which nothing is late, without the training and the renderings of the static field,
+which another core does; a cycle by the costs in docs/studies.md.
 """
 
 from __future__ import annotations
@@ -38,9 +38,14 @@ _CYCLE_RUN = replace(LAYERS_RUN, steps=60, epoch_ms=250.0, compute=_CYCLE)
 
 @dataclass(frozen=True)
 class Variant:
-    """edge: of ``rows.EDGES``. late: the scene's own network, else an ideal one. charged: computing takes
-    time. splits: tells network and computing apart. repeats: runs with each seed of a row, else with the
-    first."""
+    """A variant of a run.
+
+    edge: a key of ``rows.EDGES``.
+    late: use the scene's network, else an ideal one.
+    charged: charge computing.
+    splits: whether it serves only to separate the effects of network and computing.
+    repeats: run with each seed of a row, else only with the first.
+    """
 
     edge: str
     late: bool = True
@@ -49,13 +54,13 @@ class Variant:
     repeats: bool = False
 
     def settings(self, compute: Compute) -> RunSettings:
-        """compute: what an update of layers takes."""
+        """The settings of a run. compute: cost of an update of layers."""
         if self.edge == "before":
             return _CYCLE_RUN
         return replace(LAYERS_RUN, compute=compute) if self.charged else LAYERS_RUN
 
 
-FIRST_VARIANT = "nothing late"  # measures what the others are charged
+FIRST_VARIANT = "nothing late"  # measures the costs that the others are charged
 VARIANTS = {
     FIRST_VARIANT: Variant("layers", late=False, charged=False),
     "shown": Variant("layers", repeats=True),
@@ -65,8 +70,8 @@ VARIANTS = {
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
-    """{ROW: {VARIANT: {seed: means over the instants of the last third, of a long run of all but its first
-    minute}}}. BenchError: a scenario cannot run."""
+    """Measure {ROW: {VARIANT: {seed: means over the instants of the last third, or of all but the first
+    minute of a long run}}}. Raises BenchError."""
     seconds = QUICK_SECONDS if run.quick else SECONDS
     try:
         for row in find(run.scenes):
@@ -85,7 +90,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultStore, seconds: float) -> None:
-    """One run, unless it is known."""
+    """Do one run, unless it is known. Raises BenchError or ScenarioError."""
     variant, scenario = VARIANTS[name], row.scenario(seed, VARIANTS[name].edge)
     if not variant.late:
         scenario = replace(scenario, channel={"preset": "ideal"})
@@ -115,7 +120,8 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
 
 
 def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: float) -> dict[str, Any]:
-    """One deployment, its last third, or all but its first minute."""
+    """Run one deployment; returns means over its last third, or over all but its first minute. Raises
+    ScenarioError."""
     truth = ShownTruth(world, from_ns=round(min(2.0 * seconds / 3.0, SETTLED_S) * 1e9))
     costs = UpdateCosts()
 
@@ -155,8 +161,8 @@ def by_minute(instants: Sequence[dict[str, Any]]) -> list[dict[str, float]]:
 
 
 def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """psnr_db, squared_error by part; the perfect field's of ``newest``, ``mean`` and ``frozen``; lag_ms p50
-    and p95; mean ages."""
+    """Means over instants: psnr_db and squared_error by part, also of the perfect fields ``newest``, ``mean``
+    and ``frozen``; mean ages; and p50 and p95 of lag_ms."""
     lags = [i["lag_ms"] for i in instants if i["lag_ms"] is not None]
     found: dict[str, Any] = {
         "instants": len(instants),

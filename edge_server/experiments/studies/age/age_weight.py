@@ -1,4 +1,4 @@
-"""Equation 5.8: the best threshold and the best wait against the weight of timeliness."""
+"""Equation 5.8: best threshold and best wait as a function of the weight of timeliness."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from edge_server.experiments.studies.study import (
 )
 from edge_server.report.style import CYCLE, figure, label_lines
 
-# Weight of one second of age against a mean squared error of 0.01 (20 dB).
+# Weights of one second of age relative to a mean squared error of 0.01 (20 dB).
 LAMBDAS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
 QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
-# Ages that count: those of all cameras at the edge, as (5.8) is printed, or of the used views, as (6.35).
+# Sums of ages: of all cameras at the edge, as in (5.8), or of the used views, as in (6.35).
 SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
 PIXELS = (("psnr_moving_db", "where it moves"), ("psnr_db", "whole image"))
 POLICIES = ("threshold", "wait")
@@ -35,7 +35,7 @@ class Weighing(SceneStudy):
     title = "The weight of timeliness in the objective (equation 5.8)"
 
     def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
-        # The thresholds are the trials of ``mat`` and known where that study has been run.
+        # The trials of the thresholds are those of ``mat``, and known if that study was run.
         settings = {"channel": {"preset": "ch5", "discipline": "drop-new"}}
         omegas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS,
                   "wait": QUICK_WAITS if request.quick else WAITS}  # fmt: skip
@@ -74,7 +74,7 @@ class Weighing(SceneStudy):
 
 
 def _falls(move: Interval) -> bool | None:
-    """Whether the best omega falls: yes, no (it stays or rises), or undecided."""
+    """Whether the best omega falls: True, False (it stays or rises), or None (undecided)."""
     if move.high < 0.0:
         return True
     return False if move.low >= 0.0 else None

@@ -1,4 +1,5 @@
-"""Figures 6.5 and 6.6: LPIPS and age against the number of images, cameras looking in and out."""
+"""Figures 6.5 and 6.6: LPIPS and age against the number of images, with cameras looking inward and
+outward."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from edge_server.experiments.studies.study import (
 
 COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
 QUICK_COUNTS = (3, 6, 10, 14, 18)
-# Scene, the thesis's representation for it, and what it found from few to many images.
+# Scene -> the thesis's representation, its figure, and its result from few to many images.
 SCENES = {
     "room": ("nerfacto", "looking in (6.5)", "LPIPS .323 to .101, mean age 16 to 82 ms"),
     "tower": ("splat", "looking out (6.6)", "LPIPS .472 to .214, mean age 37 to 146 ms"),
@@ -68,7 +69,7 @@ class Images(SceneStudy):
 
 
 def _best_count(about: str, metric: str, curve: Curve) -> Verdict:
-    """Whether fewer images than all are best."""
+    """The verdict whether fewer images than all are best."""
     _, lower, digits, least = METRICS[metric]
     best = optimum(curve, lower)
     better = f", {best.over_last.text(digits)} better than all of them" if best.x < max(curve) else ""

@@ -1,4 +1,4 @@
-"""Figures 5.6 and 5.7: fidelity against the maximum age of information that a used view may have."""
+"""Figures 5.6 and 5.7: fidelity against the maximum age of information of used views."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Mat(SceneStudy):
         return found
 
     def _draw_instants(self, request: StudyRequest, table: Table) -> None:
-        """Figure 5.7: one instant under three thresholds."""
+        """Draw figure 5.7: one instant with three thresholds."""
         common: dict[str, Any] = {"seed": 3, "channel": {"preset": "ch5"}, "lpips": False}
         rows = [
             (scene, [request.trial(scene, policy="threshold", value=v, **common) for v in SHOWN])

@@ -17,7 +17,7 @@ from edge_server.report.style import CYCLE, figure, label_lines
 
 DELAYS_MS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0)
 QUICK_DELAYS_MS = (20.0, 60.0, 180.0)
-# The same thresholds at every delay: in a grid that grows with the delay, any optimum would grow with it.
+# The same thresholds for every delay: if the grid grew with the delay, every optimum would grow with it.
 GAMMAS = (30.0, 45.0, 60.0, 75.0, 90.0, 120.0, 165.0, 240.0, 330.0, 480.0, 700.0, 1000.0)
 QUICK_GAMMAS = (45.0, 75.0, 120.0, 180.0, 300.0, 500.0, 900.0)
 CLAIM = "the best threshold grows with the mean delay (5.8)."
@@ -60,8 +60,8 @@ class MatDelay(SceneStudy):
         slope, _ = move_of_optimum(curves, METRICS[metric].lower)
         without = [f"{d:g}" for d, o in best.items() if o.interior(METRICS[metric].least) is not True]
         text = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
-        # Fidelity that only rises or only falls has its best at the same end of the grid at every delay, so
-        # the slope is zero.
+        # Fidelity that only rises or only falls is best at the same end of the grid for every delay, so the
+        # slope is zero.
         none = f"; that it falls on both sides is not shown at {', '.join(without)} ms" if without else ""
         return Verdict(
             f"{scene}, {METRICS[metric].label}",

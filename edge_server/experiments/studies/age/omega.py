@@ -1,4 +1,5 @@
-"""Figures 6.3 and 6.4: threshold and wait against omega, in two traffic states, and where frames overtake."""
+"""Figures 6.3 and 6.4: threshold and wait against omega, in two traffic states, also with parallel
+transmission."""
 
 from __future__ import annotations
 
@@ -25,8 +26,9 @@ from edge_server.experiments.studies.trial import recording
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (15.0, 45.0, 75.0, 120.0, 240.0)
-# In words; channel; the optimum of threshold and the plateau of wait that the thesis names (6.5). Its two
-# traffic states, and the high one as 6.4.2 describes it literally: every frame is transmitted at once.
+# State -> its name in texts, the channel, and the thesis's optimum of threshold and start of the plateau of
+# wait (6.5). The thesis's two traffic states, and the high one as literally described in 6.4.2: every frame
+# is transmitted at once.
 STATES: dict[str, tuple[str, dict[str, Any], float, float]] = {
     "high": ("high traffic", {"preset": "ch6-high"}, 50.0, 62.0),
     "low": ("low traffic", {"preset": "ch6-low"}, 72.0, 105.0),
@@ -38,7 +40,7 @@ _METRICS = (
     "psnr_db", "psnr_moving_db", "shown_psnr_db", "shown_psnr_moving_db", "ssim", "lpips", "f_w",
     "f_w_corrected",
 )  # fmt: skip
-# A curve is on its plateau where it is this near to its best.
+# A curve is on its plateau if it is this near to its best value.
 _NEAR = {
     "psnr_db": 0.3, "psnr_moving_db": 0.3, "shown_psnr_db": 0.3, "shown_psnr_moving_db": 0.3, "ssim": 0.01,
     "lpips": 0.01, "f_w": 0.05, "f_w_corrected": 0.05,
@@ -114,7 +116,7 @@ class Omega(SceneStudy):
                 f"waiting longer never makes it worse by more than {_NEAR[metric]:g} "
                 f"(a plateau from {STATES[state][3]:g} ms on, 6.5.2)."
             )
-            # It is not enough that no fall is seen: the loss at the end must be known to be small.
+            # It is not enough that no fall is measured: the loss at the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))
         text = (
             f"best at {best.x:g} ms{best.spread}, {loss.text(digits)} better than the largest omega; "
@@ -132,7 +134,7 @@ class Omega(SceneStudy):
         return found
 
     def _draw_instants(self, request: StudyRequest, scene: str) -> None:
-        """Figure 6.4: one decision under both policies at three omegas."""
+        """Draw figure 6.4: one decision of both policies with three omegas."""
         common: dict[str, Any] = {"channel": {"preset": "ch6-high"}, "lpips": False, "every_ms": 2400.0}
         rows = [
             (f"{scene}, {p}", [request.trial(scene, seed=3, policy=p, value=v, **common) for v in SHOWN])
@@ -142,7 +144,7 @@ class Omega(SceneStudy):
 
 
 def _is_better(about: str, claim: str, over: Interval, metric: str) -> Verdict:
-    """Whether a difference of a metric is an improvement."""
+    """The verdict whether a difference of a metric is an improvement."""
     _, lower, digits, _ = METRICS[metric]
     better = negated(over.above(0.0)) if lower else over.above(0.0)
     return Verdict(about, claim, f"difference {over.text(digits)}.", better, over)

@@ -1,7 +1,7 @@
-"""Where the trade-off exists: a map over speed, delay, memory of the field and cost of computing.
+"""Map of where the trade-off exists, over speed, delay, memory of the field and cost of computing.
 
-It is not in the thesis. The limit of every policy is no delay at all: where using all views is close to it,
-no scheduler can gain anything.
+It is not in the thesis. The limit of every policy is the result without delay: if using all views is close to
+it, no scheduler can gain anything.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from edge_server.report.style import figure
 # Cost of a step and of an update of 18 new views: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
 # and 4.0, 66 and 93).
 CHARGED = {"ms_per_step": 3.0, "ms_per_update": 70.0}
-# Time of treating a view of 64 x 64 there.
+# Time of treating a view of 64 x 64 on the same machine.
 COST_MS = {"mask": 0.5, "freshen": 4.0}
 PERIOD_MS = 30.0
 METRIC = "psnr_moving_db"
-# Thresholds and waits, in mean delays after one period.
+# Thresholds and waits: one period plus these multiples of the mean delay.
 SHARES = {"threshold": (0.5, 1.0, 2.0, 4.0), "wait": (0.5, 1.0, 2.0, 4.0)}
 QUICK_SHARES = {"threshold": (0.75, 1.5, 3.0), "wait": (1.0, 2.5)}
 OWN = ("mask", "freshen")

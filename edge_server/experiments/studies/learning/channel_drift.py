@@ -1,4 +1,4 @@
-"""The channel changes during use: rewards of a fixed policy, a trained one and one that keeps learning."""
+"""A channel that changes during use: rewards of a fixed policy, a trained one and one that keeps learning."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.online.online_policy import OnlinePolicy, OnlineSettings
 
 EPISODES = {True: 40, False: 600}
-# Episodes of one run before and after the change.
+# Number of episodes of one run before and after the change.
 BEFORE, AFTER = 10, 60
-# Episodes whose rewards arrive together: live, rewards arrive some seconds after the decisions.
+# Number of episodes whose rewards arrive together: live, rewards arrive some seconds after the decisions.
 _EPISODES_TOGETHER = 5
 AGE = -0.003
 PRICE = 0.003
@@ -49,10 +49,11 @@ Rewards = dict[str, list[float]]
 
 @dataclass(frozen=True)
 class Change:
-    """The channel before and after.
+    """A change of the channel.
 
+    before, after: channel sections.
     gone: camera that sends nothing afterwards.
-    price: cost of a view in the reward. Above 0 the policy selects single views instead of a threshold of
+    price: cost of a view in the reward. If above 0, the policy selects single views instead of a threshold of
         age, so its decision depends on which cameras there are.
     """
 
@@ -66,7 +67,7 @@ class Change:
         return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
 
     def config(self, trainer: StudyTrainer, training: int) -> TrainingConfig:
-        """What is trained, before and after the change."""
+        """The configuration of the trainings, before and after the change."""
         if self.price:
             reward = dataclasses.replace(trainer.reward("set"), views=-self.price)
             return trainer.config("select", reward, EPISODES, seed=training)
@@ -123,7 +124,7 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
     policies: dict[str, Policy] = {
         "fixed": fixed(rng),
         "learnt": BanditPolicy(home.actor, "learnt", rng),
-        # The shipped settings without a warm-up.
+        # The default settings without a warm-up.
         "still learning": OnlinePolicy(Learner.load(home.folder / "policy.npz"), fixed(rng), "still learning",
                                        rng, OnlineSettings(warmup=0)),
         "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
@@ -145,8 +146,8 @@ def _decide(
     trainer: StudyTrainer, setting: Setting, policy: Policy, moments: list[DecisionPoint], reward: Reward,
     first: int,
 ) -> list[float]:  # fmt: skip
-    """Rewards of decisions, which are numbered from ``first`` on, scored by the reporting cameras. An online
-    policy learns from the scores of the rewarding ones."""
+    """Rewards of decisions, numbered from ``first`` on, scored by the reporting cameras. An online policy
+    learns from the scores of the rewarding ones."""
     requests = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
 
     def totals(of: Setting) -> list[float | None]:
@@ -161,7 +162,7 @@ def _decide(
 
 
 def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
-    """Verdicts over the second half of the decisions after the change, when there was time to learn.
+    """Verdicts on the second half of the decisions after the change, when there was time to learn.
 
     runs: the runs of each training.
     """
@@ -187,7 +188,7 @@ def recovery(run: Rewards) -> int | str:
     """Number of decisions after the change until the online policy has recovered half of the loss.
 
     The loss is the difference between the policy trained on the old channel and the one trained on the new.
-    Or a text: that nothing was lost, or that the run is too short.
+    If nothing was lost or the run is too short, a text is returned: NOTHING_LOST or NOT_WITHIN.
     """
     mine, old, new = (smoothed(_after(run[p]), 40) for p in ("still learning", "learnt", "learnt afterwards"))
     lost = float(np.nanmean(new - old))

@@ -1,4 +1,4 @@
-"""Figure 5.9: single-step PPO that selects views (5.17-5.24), against policies without learning."""
+"""Figure 5.9: single-step PPO that selects views (5.17-5.24), compared with policies without learning."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from edge_server.experiments.training.scheduler.setting import Setting
 THESIS_PERCENT = 16.7
 # Training time in the thesis, on an RTX 4090 (5.6.2), and the limit for two cores.
 THESIS_MINUTES, WANTED_MINUTES = 30, 15
-# Cameras that reward: one, as in the thesis, or four all round, so that a policy cannot serve one viewpoint
-# alone.
+# Cameras that reward: one, as in the thesis, or four all round, so that a policy cannot optimize for a single
+# viewpoint.
 VIEWPOINTS = {"one viewpoint": ("cam00",), "four viewpoints": FOUR_VIEWPOINTS}
-# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view): the first has the
-# thesis's reward and start. Without a cost hardly any view ever harms, so using all is hard to beat.
+# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view). The first has the
+# thesis's reward and start. Without a cost views hardly ever harm, so using all is hard to beat.
 CASES = (
     ("whole", "one viewpoint", True, 0.0), ("whole", "one viewpoint", False, 0.0),
     ("moving", "one viewpoint", False, 0.0), ("whole", "four viewpoints", False, 0.0),
@@ -50,7 +50,7 @@ CASES = (
 )  # fmt: skip
 # Name of the field's start, by whether updates start from scratch.
 FIELDS = {True: "from nothing", False: "warm"}
-# Numbers of cameras nearest to the held-out ones: does a policy learn more than the viewpoint?
+# Numbers of cameras nearest to the held-out ones, to test whether a policy learns more than the viewpoint.
 NEAREST = (6, 9, 12)
 # Episodes of one training, by whether it is a quick pass.
 EPISODES = {True: 120, False: 600}
@@ -99,7 +99,7 @@ def _nearest(setting: Setting, k: int) -> Maker:
 
 
 def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
-    """The verdicts on the thesis's claims and on ours."""
+    """Verdicts on the thesis's claims and on ours."""
     mine, random = evaluation.runs("learnt"), evaluation.rewards("random")
     best, best_name = evaluation.best_fixed("threshold")
     best_values = evaluation.best_values("threshold")
@@ -124,7 +124,7 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
 
 
 def others(evaluation: Evaluation) -> list[str]:
-    """Names of the policies without learning, thresholds and random aside."""
+    """Names of the policies without learning, except thresholds, nearest and random."""
     known = ("learnt", "threshold:", "nearest:")
     return [n for n in evaluation.outcomes if not n.startswith(known) and n != "random"]
 
@@ -138,7 +138,7 @@ def _viewpoint(about: str, evaluation: Evaluation, mine: Runs) -> Verdict:
 
 
 def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
-    """Verdicts on the trained policies, judged by the cameras that rewarded them."""
+    """Verdicts on the trained policies, judged by the same cameras that rewarded them."""
     mine, (best, name) = evaluation.runs("learnt"), evaluation.best_fixed("threshold")
     random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
@@ -164,8 +164,8 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
         f"{share.text(2)} of the way to hindsight ({top:.4f}, the best of all that was tried at each "
         "decision, chosen by one fit and measured by another); the best fixed threshold has "
         f"{theirs.text(2)}{alone}.",
-        # Where the limit is no better than random there is no share; half of the way is still defined, and so
-        # is an interval over trainings.
+        # If the limit is not better than random, there is no share; but half of the way is still defined,
+        # with an interval over trainings.
         above.above(0.0),
         above,
     )  # fmt: skip
@@ -177,7 +177,7 @@ def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
     if one.jobs != 2:
         text = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
         return Verdict(about, "training is quick on 2 cores.", text, None)
-    if carried_out < fits / 2:  # most fits are known from another training: their time is not measured
+    if carried_out < fits / 2:  # most fits are known from another training, so their time was not measured
         return Verdict(about, "training is quick.", "most of its fits were known already.", None)
     a_fit, a_decision = one.seconds / carried_out, fits / sum(row["decisions"] for row in one.rows)
     minutes = a_fit * a_decision * 2400 / 60.0

@@ -24,8 +24,8 @@ from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.scheduler.learned.learner_spec import Action
 
 KINDS: tuple[Action, ...] = ("wait", "threshold")
-# The thesis's weight of a millisecond of age, and a fifth of it: with the thesis's (6.5) one young view beats
-# any number of views that are 30 ms older, so there is little to decide.
+# The thesis's weight of a millisecond of age, and a fifth of it. With the thesis's weight (6.5) a single
+# young view is better than any number of views that are 30 ms older, so there is little to decide.
 THESIS_AGE, LESS_AGE = -0.015, -0.003
 # (channel, weight of age, pixels of the PSNR). A traffic state of ch6 lasts 30 ms, less than a decision; one
 # of ch6-slow and swing lasts 3 s, and the best omega differs between the states of swing.
@@ -111,7 +111,7 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
 
 
 def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
-    """Whether there is anything to learn. gain: of ``by_ages``."""
+    """The verdict whether there is anything to learn. gain: result of ``by_ages``."""
     return Verdict(
         f"room, {case}, {kind}", "the ages tell which omega is best: there is something to learn.",
         f"a rule fitted to the rewards of every omega at every decision of the other seeds wins "

@@ -1,8 +1,8 @@
-"""Whether the ages at a decision predict its best omega.
+"""Tests whether the ages at a decision predict its best omega.
 
-The best omega differs between decisions in hindsight, which knows what arrives later. A rule fitted to the
-rewards of all values at every decision shows what the ages alone can gain. Where it gains nothing, a learner
-cannot do better than the best fixed value.
+In hindsight, which knows what arrives later, the best omega differs between decisions. A rule fitted to the
+rewards of all values at every decision shows the gain that is possible with the ages alone. If there is none,
+a learner cannot do better than the best fixed value.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _RIDGE = 30.0
 
 def by_ages(evaluation: Evaluation, kind: str, moments: Sequence[DecisionPoint]) -> Interval:
     """Reward of a rule that chooses the value of ``kind`` (wait, threshold) by the ages, minus that of the
-    best fixed value, paired over seeds. Both are fitted to all seeds but the one that they are measured on,
-    with the rewards of all values at every decision."""
+    best fixed value, paired over seeds. Both are fitted to all seeds except the one that they are measured
+    on, with the rewards of all values at every decision."""
     names = [name for name in evaluation.outcomes if name.startswith(f"{kind}:")]
     values = {name: evaluation.decisions(name) for name in names}
     known = [
@@ -47,7 +47,7 @@ def by_ages(evaluation: Evaluation, kind: str, moments: Sequence[DecisionPoint])
 
 
 def _features(moments: Sequence[DecisionPoint]) -> NDArray[np.float64]:
-    """(n, features): quantiles of the logarithms of a decision's ages, standardised, and their squares."""
+    """(n, features): standardized quantiles of the logarithms of a decision's ages, their squares, and 1."""
     ages = [np.maximum(m.state.ages_ms[m.state.reported], 0.0) for m in moments]
     x = np.array([np.percentile(np.log1p(a / _SCALE_MS), _QUANTILES) for a in ages])
     x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-6)

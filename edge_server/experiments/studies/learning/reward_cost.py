@@ -1,5 +1,5 @@
-"""Reward against training time: many cheap, noisy rewards or few expensive, exact ones; and reward against
-the size of the embedding where images can help."""
+"""Reward against training time, with many cheap, noisy rewards or few expensive, exact ones; and reward
+against the size of the embedding, in a scene where images can help."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 from edge_server.scheduler.learned.actor import Actor
 
 EPISODES = {True: 60, False: 600}
-# Optimiser steps of a fit that rewards in training; fits of JUDGED_STEPS judge the trained policies.
+# Optimizer steps of the fits that reward in training; fits of JUDGED_STEPS judge the trained policies.
 BUDGETS = (10, 25, 50, 100)
 QUICK_BUDGETS = (10, 50)
 JUDGED_STEPS = 100
 # Shares of a training after which its policy is judged.
 STAGES = (0.05, 0.1, 0.25, 0.5, 1.0)
 DIMS = (0, 4, 32)  # the first: without semantics
-# It takes longer to learn to use an embedding than to learn to use an age.
+# Learning to use an embedding takes longer than learning to use an age.
 EPISODES_BY_DIM = {True: 300, False: 1200}
 
 
@@ -66,7 +66,7 @@ def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdi
     for steps, stage in itertools.product(budgets, config.stages):
         actors = [Actor.load(stage_file(one.folder, stage)) for one in trained[steps]]
         candidates |= named_runs(_stage_name(steps, stage), actors)
-    # Every stage of every training is judged, by expensive fits: on fewer seeds than elsewhere.
+    # Every stage of every training is judged by expensive fits, so on fewer seeds than in other studies.
     judged = room("ch5", steps=JUDGED_STEPS)
     evaluation = trainer.evaluate(judged, candidates, reward, len(request.repeats(8, 40)))
     spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in config.stages]
@@ -83,12 +83,12 @@ def stages(batches: int) -> tuple[int, ...]:
 def spent_s(logs: Sequence[Sequence[Row]], batches: int) -> float:
     """Processor time of the first ``batches`` batches, mean over trainings: episodes, warm fields, fits and
     scores. Each counts with the time that it took when it was carried out, so a training whose fits were
-    known already is no cheaper."""
+    already known is not cheaper."""
     return sum(row["processor_seconds"] for rows in logs for row in rows[:batches]) / len(logs)
 
 
 def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]) -> list[Verdict]:
-    """Whether training with a cheap reward is better than with an expensive one for the same time.
+    """Verdicts whether training with a cheap reward is better than with an expensive one.
 
     stages: numbers of batches.
     spent: steps of a fit -> seconds of processor time at each of the stages.
@@ -119,8 +119,8 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
 
 
 def _in_the_same_time(limit_s: float, dear: Sequence[float]) -> int:
-    """Index of the last stage of the expensive training that took no longer than the cheap one, else 0. (Not
-    of the next stage: what is learned may be lost again, and a later loss must not count.)"""
+    """Index of the last stage of the expensive training that took no longer than the cheap one, else 0. (The
+    next stage is not used, because a policy may become worse again, and a later loss must not count.)"""
     return max((k for k, seconds in enumerate(dear) if seconds <= limit_s), default=0)
 
 
@@ -129,7 +129,7 @@ def _stage_name(steps: int, stage: int) -> str:
 
 
 def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict], list[Row]]:
-    """Reward against the width of the embedding; nothing where no embedder is available."""
+    """Reward against the width of the embedding; empty if no embedder is available."""
     if missing := embeddings_missing():
         print(f"  embedding sizes are left out: {missing}")
         return [], []
@@ -153,7 +153,7 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
 
 
 def judge_dims(evaluations: dict[str, Evaluation]) -> list[Verdict]:
-    """The verdicts whether each embedding is better than none, ``d = 0``."""
+    """Verdicts whether each embedding is better than none (``d = 0``)."""
     runs = {name: evaluation.runs(name) for name, evaluation in evaluations.items()}
     return [better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
             for name, values in runs.items() if name != "d = 0"]  # fmt: skip
@@ -172,7 +172,7 @@ def _draw(
 
 
 def _draw_dims(request: StudyRequest, evaluations: dict[str, Evaluation]) -> None:
-    """Draw the gain over no embedding against the width of the embedding: paired differences and their
+    """Draw the gain over no embedding against the width of the embedding: paired differences with
     intervals."""
     runs = [evaluation.runs(name) for name, evaluation in evaluations.items()]
     found = [paired_difference(mine, runs[0]) for mine in runs[1:]]

@@ -1,4 +1,4 @@
-"""How much the weights of a reward matter (6.36-6.38): policies trained with each are judged by all."""
+"""Sensitivity to the weights of the reward (6.36-6.38): policies trained with each are judged by all."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdi
 
 
 def variants(trainer: StudyTrainer) -> dict[str, Reward]:
-    """Rewards by name: the thesis's, ours with the corrected sign, and ages that count less."""
+    """Rewards by name: the thesis's, ours with the corrected sign, and variants with a lower weight of
+    age."""
     corrected = trainer.reward("corrected")
     return {
         "thesis": trainer.reward("thesis"),

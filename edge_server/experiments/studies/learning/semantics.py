@@ -1,5 +1,5 @@
-"""Do embeddings of the images help where something important moves in one part of the scene, and do they cost
-nothing where nothing moves?"""
+"""Tests whether embeddings of the images help if something important moves in one part of the scene, and
+whether they do not harm if nothing moves."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from edge_server.experiments.training.scheduler.trainer import Row
 from edge_server.report.style import CYCLE, figure, label_lines
 
 EPISODES = {True: 300, False: 1200}
-# scene -> (speed, pixels of the PSNR). A person walks on one of four sides of the workshop, or stands there.
+# scene -> (speed, pixels of the PSNR). A person walks or stands on one of four sides of the workshop.
 SCENES = {"somebody moves": (1.0, "moving"), "nothing moves": (0.0, "whole")}
-# Numbers of cameras that the oracle uses, which knows which of them see what moves.
+# Numbers of cameras used by the oracle, which knows the cameras that see the person.
 KNOWING = (1, 2, 3, 4)
 
 # In the figure: label of a family of policies -> prefix of their names.
@@ -77,8 +77,8 @@ class Semantics(TrainingStudy):
 
 
 def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
-    """Verdicts: policies with semantics are better than those without or, where nothing moves, no worse; and
-    both are better than the best policy without learning."""
+    """Verdicts whether policies with semantics are better than those without or, if nothing moves, not worse;
+    and whether both are better than the best policy without learning."""
     about, seeing, blind = f"tower, ch5, {scene}", evaluation.runs("with"), evaluation.runs("without")
     text = ""
     for name, runs in (("with", seeing), ("without", blind)):
@@ -100,9 +100,9 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
 
 
 def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[Verdict]:
-    """Verdicts: the embedding shows which cameras see what moves, and knowing it would help.
+    """Verdicts whether the embedding shows which cameras see motion, and whether knowing this would help.
 
-    areas: of ``embedding_areas``.
+    areas: result of ``embedding_areas``.
     """
     about, (embedding, camera) = f"tower, ch5, {scene}", areas
     knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
@@ -118,10 +118,11 @@ def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the mean reward against the used views, a panel a scene: families of policies as lines, trained
-    policies as diamonds. Without intervals, because the verdicts have those of the paired differences.
+    """Draw the mean reward against the used views, one panel per scene: families of policies as lines,
+    trained policies as diamonds. Without intervals, because the verdicts have those of the paired
+    differences.
 
-    rows: of the table.
+    rows: rows of the table.
     """
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     with figure(path, 1, len(scenes), height_inch=3.4) as (_, axes):

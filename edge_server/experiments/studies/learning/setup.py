@@ -1,7 +1,7 @@
-"""Shared by the studies of learned schedulers: settings, resumable trainings, evaluations and verdicts.
+"""Code shared by the studies of learned schedulers: settings, resumable trainings, evaluations and verdicts.
 
-The batches of a training depend on each other, so it does not go through the engine. Its checkpoints are kept
-below OUT/training and evaluations by content in OUT/training/evaluations.jsonl; the same command resumes.
+The batches of a training depend on each other, so the engine cannot run it. Its checkpoints are stored below
+OUT/training, and evaluations in OUT/training/evaluations.jsonl; the same command resumes.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # Cameras that judge trained policies: they give no reward and no update uses them.
 REPORT = ("cam05", "cam08")
-# Repeated trainings, by whether it is a quick pass; their spread is part of the interval.
+# Number of repeated trainings, by whether it is a quick pass; their spread is part of the interval.
 RUNS = {True: 1, False: 3}
 
 AGE_AND_POSE = StateLayout(("age", "pose"))
 
 Runs = Sequence[PerSeed]
-"""Rewards by seed of each of several trainings that differ in their random seed only."""
+"""Rewards by seed, of each of several trainings that differ only in their random seed."""
 Part = tuple[list[Verdict], list[Row]]
-"""Verdicts and rows of the table, of one case of a study."""
+"""Verdicts and rows of the table of one case of a study."""
 Parts = Iterator[Part]
 
 
 class TrainingStudy(Study):
-    """Base of the studies that train policies; they have no independent trials."""
+    """Base class of the studies that train policies; they have no independent trials."""
 
     def report(self, request: StudyRequest, table: Table | None) -> list[Verdict]:
         """Train, evaluate, write OUT/NAME.csv and return the verdicts. table: not used."""
@@ -81,11 +81,11 @@ class TrainingStudy(Study):
 class TrainedPolicy:
     """A finished training.
 
-    name: of its folder and in its tables.
+    name: its name in tables and the start of its folder's name.
     actor: the trained policy.
-    rows: of its log.
-    seconds: wall-clock time of the training, by ``jobs`` processes, when it was carried out.
-    folder: holds policy.npz.
+    rows: rows of its log.
+    seconds: wall-clock time of the training with ``jobs`` processes.
+    folder: folder with policy.npz.
     """
 
     name: str
@@ -102,10 +102,10 @@ def room(
 ) -> Setting:  # fmt: skip
     """The usual setting: a world at 64 x 64, nineteen cameras and a warm splat field.
 
-    channel: a preset, or a section of a scenario.
+    channel: a preset, or the section of a scenario.
     held_out: cameras that reward.
     report: cameras that judge.
-    more: fields of ``Setting``; ``scratch`` is the thesis's.
+    more: fields of ``Setting``; ``scratch=True`` as in the thesis.
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     trial = Trial(
@@ -123,7 +123,7 @@ def simple_policies(kind: str, others: Sequence[str] = ("random", "all")) -> dic
 
 
 class Nearest(Policy):
-    """Select the k cameras nearest to the reward cameras, whatever their age. This baseline knows the
+    """Selects the k cameras nearest to the reward cameras, independent of ages. This baseline knows the
     reward cameras but ignores the state."""
 
     name = "nearest"
@@ -148,7 +148,7 @@ class Nearest(Policy):
 
 @dataclass
 class StudyTrainer:
-    """Trains and evaluates policies for one study; a context manager that owns the worker pool."""
+    """Trains and evaluates policies of one study; a context manager that owns the worker pool."""
 
     request: StudyRequest
     pool: WorkerPool = field(init=False)
@@ -166,7 +166,7 @@ class StudyTrainer:
         self.pool.__exit__(*error)
 
     def reward(self, name: str, on: str = "whole") -> Reward:
-        """A preset reward; prints once if its LPIPS term has to be left out."""
+        """A preset reward; prints a line once if its LPIPS term must be left out."""
         reward, missing = reward_of(name, on, self.request.folders.lpips)
         if missing and not self._printed_missing:
             print(f"  {missing}")
@@ -174,8 +174,8 @@ class StudyTrainer:
         return reward
 
     def train_one(self, name: str, setting: Setting, config: TrainingConfig) -> TrainedPolicy:
-        """Carry out a training, or read it if it is finished; its curve is drawn to OUT/NAME.png."""
-        # Trainings with other settings or of other code get folders of their own.
+        """Carry out a training, or read it if it is finished; draws its curve to OUT/NAME.png."""
+        # Trainings with other settings or code have separate folders.
         about = source_digest() + setting.key + repr(dataclasses.asdict(config))
         folder = self.folder / f"{name}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
         jobs_file = folder / "jobs.json"
@@ -201,8 +201,11 @@ class StudyTrainer:
         self, action: Action, reward: Reward, episodes: Mapping[bool, int],
         layout: StateLayout = AGE_AND_POSE, **more: Any,
     ) -> TrainingConfig:  # fmt: skip
-        """The usual training of a learner that decides ``action``. episodes: by whether it is a quick pass.
-        more: of ``TrainingConfig``."""
+        """The usual training of a learner that decides ``action``.
+
+        episodes: number of episodes, by whether it is a quick pass.
+        more: further arguments of ``TrainingConfig``.
+        """
         spec = Spec(action, layout, OMEGAS_MS.get(action, ()))
         return TrainingConfig(spec, reward, self.request.episodes or episodes[self.request.quick], **more)
 
@@ -213,14 +216,14 @@ class StudyTrainer:
     def evaluate(
         self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
-        """Evaluate candidates on ``count`` seeds that were never trained on, scored by the cameras that
-        report, which never reward."""
+        """Evaluate candidates on ``count`` seeds that are not used in training, scored by the reporting
+        cameras, which never reward."""
         return self.evaluate_as_rewarded(setting.judged, candidates, reward, count, seed)
 
     def evaluate_as_rewarded(
         self, setting: Setting, candidates: Mapping[str, Candidate], reward: Reward, count: int, seed: int = 0
     ) -> Evaluation:
-        """As ``evaluate``, scored by the cameras that reward; it supplements the other evaluation."""
+        """As ``evaluate``, but scored by the rewarding cameras; it supplements the other evaluation."""
         return evaluate_policies(
             setting, self.pool, seeds(seed, "test", count), candidates, reward,
             lambda line: print(f"  evaluation: {line}", flush=True),
@@ -228,7 +231,7 @@ class StudyTrainer:
 
 
 def embeddings_missing() -> str | None:
-    """One-line reason why no policy can use images here; None if it can."""
+    """One-line reason why policies cannot use images here; None if they can."""
     from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 
     try:
@@ -245,8 +248,8 @@ def fixed_of(evaluation: Evaluation, kind: str) -> str:
 
 
 def mean_of(runs: Runs) -> PerSeed:
-    """Mean reward of repeated trainings, by test seed. For texts only: an interval of it would ignore how
-    much the trainings differ."""
+    """Mean reward of repeated trainings, by test seed. Only for texts: its interval would ignore the
+    differences between trainings."""
     found: PerSeed = {}
     for s in runs[0]:
         values = [v for run in runs if (v := run[s]) is not None]
@@ -263,8 +266,8 @@ def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str,
 
 
 def paired_difference(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
-    """Paired difference over seeds and, for repeated trainings, over those: run r of one is paired with run r
-    of the other, which saw the same episodes."""
+    """Paired difference over seeds and over repeated trainings: run r of one is paired with run r of the
+    other, which was trained on the same episodes."""
     ours, theirs = _runs(mine), _runs(other)
     if len(theirs) == 1:
         theirs = list(theirs) * len(ours)
@@ -282,7 +285,7 @@ def _runs(values: PerSeed | Runs) -> Runs:
 
 
 def _describe_difference(found: Interval, runs: int) -> str:
-    """The difference as text, with what its interval is over."""
+    """The difference as text, with the numbers of trainings and seeds of its interval."""
     trainings = f"{runs} trainings and " if runs > 1 else ""
     alone = "" if runs > 1 else " of a single training"
     return f"difference {found.text(4)} over {trainings}{found.count} seeds{alone}"
@@ -301,9 +304,9 @@ def no_worse(
     about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, evaluation: Evaluation,
     share: float = 0.01,
 ) -> Verdict:  # fmt: skip
-    """The verdict whether ``mine`` loses at most ``share`` of the size of ``other``'s mean reward. The text
-    also gives the loss relative to the way from random to hindsight, because the zero of a reward is
-    arbitrary. Undecided where the reward is too near its zero for a percentage."""
+    """The verdict whether ``mine`` loses at most ``share`` of the absolute value of ``other``'s mean reward.
+    The text also gives the loss relative to the difference between random and hindsight, because the zero of
+    a reward is arbitrary. Undecided if the reward is too near its zero for a percentage."""
     difference, base = paired_difference(mine, other), crossed(_runs(other))
     text = f"{_describe_difference(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
     if base.low <= 0.0 <= base.high:

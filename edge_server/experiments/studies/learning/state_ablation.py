@@ -1,4 +1,4 @@
-"""What each part of the state [Z, age, pose] is worth (6.33) for choosing views, and for choosing omega."""
+"""The value of each part of the state [Z, age, pose] (6.33) for choosing views, and for choosing omega."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ VARIANTS = {
     "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
     "all": ("semantics", "age", "pose"),
 }  # fmt: skip
-# The chapter's schedulers, ``wait`` in both of its readings.
+# The schedulers of chapter 6, with both interpretations of ``wait``.
 KINDS: tuple[Action, ...] = ("threshold", "wait", "wait-arrived")
 WHOLE = "Z, age, pose"
-# name -> parts of the state, each left out in turn
+# name -> parts of the state: all, and without each of them
 LEFT_OUT = {
     WHOLE: ("semantics", "age", "pose"), "age, pose": ("age", "pose"), "Z, pose": ("semantics", "pose"),
     "Z, age": ("semantics", "age"),
@@ -51,7 +51,7 @@ class Ablation(TrainingStudy):
 
     def _which_views(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
         variants = usable(VARIANTS)
-        # All variants see the same decisions, drawn with all parts that any of them uses.
+        # All variants have the same decisions, drawn with all parts that any of them uses.
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
         reward, candidates = trainer.reward("set", "moving"), simple_policies("threshold")
@@ -69,7 +69,8 @@ class Ablation(TrainingStudy):
     def _flushed(self, trainer: StudyTrainer, request: StudyRequest) -> Part:
         variants = usable(LEFT_OUT)
         fullest = {name: variants[name] for name in list(variants)[:1]}
-        # Nothing is on its way at a decision: what arrives was generated later, and both readings agree.
+        # After a flush no frame is in transit at a decision, so frames that arrive were generated later, and
+        # both interpretations of wait are the same.
         flushed = self._omegas(trainer, request, ("wait",), variants, flush=True)
         kept = self._omegas(trainer, request, ("wait",), fullest)
         found = judge_flushed(flushed, kept, list(variants))
@@ -79,7 +80,8 @@ class Ablation(TrainingStudy):
         self, trainer: StudyTrainer, request: StudyRequest, kinds: Sequence[Action],
         variants: dict[str, tuple[str, ...]], flush: bool = False,
     ) -> Evaluation:  # fmt: skip
-        """Omega by every variant of the state, and all fixed ones."""
+        """Train policies that choose omega by every variant of the state; evaluate them and all fixed
+        omegas."""
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch6", held_out=FOUR_VIEWPOINTS, parts=parts, flush=flush)
         reward = dataclasses.replace(trainer.reward("corrected"), age=THESIS_AGE)
@@ -94,7 +96,7 @@ class Ablation(TrainingStudy):
 
 
 def usable(variants: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The variants without those that need embeddings, where nothing computes them."""
+    """The variants; without those that need embeddings if no embedder is available."""
     if missing := embeddings_missing():
         print(f"  semantics are left out: {missing}")
         return {name: parts for name, parts in variants.items() if "semantics" not in parts}
@@ -107,7 +109,7 @@ def learnt(kind: str, variant: str) -> str:
 
 
 def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
-    """Verdicts on omega as each variant of the state chooses it, and on the two readings of wait."""
+    """Verdicts on omega chosen by each variant of the state, and on the two interpretations of wait."""
     found = [v for kind in KINDS for v in _left_out(evaluation, variants, kind, f"room, ch6, {kind}")]
     fullest = variants[0]
     arrived, generated = (evaluation.runs(learnt(k, fullest)) for k in ("wait-arrived", "wait"))
@@ -121,7 +123,8 @@ def judge_chapter_6(evaluation: Evaluation, variants: Sequence[str]) -> list[Ver
 
 
 def _left_out(evaluation: Evaluation, variants: Sequence[str], kind: str, about: str) -> list[Verdict]:
-    """Verdicts on one kind: against its best fixed omega, and by the whole state against by its parts."""
+    """Verdicts on one kind: compared with its best fixed omega, and with the whole state compared with its
+    parts."""
     best, text = evaluation.best_fixed(kind)[0], fixed_of(evaluation, kind)
     trained = {name: evaluation.runs(learnt(kind, name)) for name in variants}
     found = [
@@ -135,7 +138,8 @@ def _left_out(evaluation: Evaluation, variants: Sequence[str], kind: str, about:
 
 
 def judge_flushed(flushed: Evaluation, kept: Evaluation, variants: Sequence[str]) -> list[Verdict]:
-    """Verdicts on wait where what is on its way at a decision is broken off, and against where it is not."""
+    """Verdicts on wait if frames in transit are discarded at a decision, and compared with wait if they are
+    not."""
     fullest, claim = variants[0], "a flush before the wait serves better than none (6.5)."
     return [
         *_left_out(flushed, variants, "wait", "room, ch6, flushed, wait"),

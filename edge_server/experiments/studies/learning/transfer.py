@@ -1,4 +1,4 @@
-"""Trained on one scene and channel, used on another."""
+"""Policies that are trained on one scene and channel and used on another."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AGE = -0.003
 
 
 def settings(quick: bool) -> dict[str, Setting]:
-    """Settings by name: a policy is trained in each, and that of ``HOME`` is used in all."""
+    """Settings by name: a policy is trained in each, and the one of ``HOME`` is used in all."""
     found = {HOME: room("swing"), "tower, swing": room("swing", scene="tower")}
     more = {"room at 3 m/s, swing": room("swing", speed_m_per_s=3.0), "room, ch6-slow": room("ch6-slow")}
     return found if quick else found | more
@@ -54,7 +54,8 @@ class Transfer(TrainingStudy):
 
 
 def judge(place: str, evaluation: Evaluation) -> list[Verdict]:
-    """Verdicts on the policies trained at ``HOME``, used at a place, against those trained there."""
+    """Verdicts on the policies trained in ``HOME`` and used in ``place``, compared with those trained
+    there."""
     home, here = evaluation.runs("learnt at home"), evaluation.runs("learnt here")
     best, text = evaluation.best_fixed("wait")[0], fixed_of(evaluation, "wait")
     found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,

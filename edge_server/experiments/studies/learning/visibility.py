@@ -1,7 +1,8 @@
-"""What each camera sees of the moving things: for an oracle policy, and to test whether embeddings show it.
+"""Measures how much of the moving bodies each camera sees, for an oracle policy and for testing embeddings.
 
-It is computed from the scene itself, which no policy has. A study uses it to find out why embeddings help or
-do not: they do not show it, it would not help, or it was not learned.
+It is computed from the scene itself, which no policy knows. A study uses it to find out why embeddings do or
+do
+not help: whether they show motion, whether knowing it would help, and whether it was learned.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from edge_server.experiments.training.scheduler.episode import Choice, DecisionP
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.virtual.from_scenario import exact_scene
 
-# A pixel shows a moving thing if it differs by more than this, of 255, from the scene without moving things.
+# A pixel shows a moving body if it differs by more than this, of 255, from the scene without moving bodies.
 _DIFFERS = 12
-# A camera sees motion if this share of its pixels shows a moving thing.
+# A camera sees motion if more than this share of its pixels shows a moving body.
 SEES = 0.01
 # Time constant with which the oracle discounts the age of a view.
 _FRESH_MS = 100.0
 
 
 class VisibleMotion:
-    """Renders each image with and without the moving things. setting: of a world."""
+    """Renders each image with and without the moving bodies. setting: must be of a synthetic world."""
 
     def __init__(self, setting: Setting) -> None:
         self._setting = setting
         self._known: dict[tuple[int, int], dict[str, float]] = {}
 
     def shares(self, moment: DecisionPoint) -> dict[str, float]:
-        """Camera -> share of the pixels of its newest frame at a decision that show a moving thing; without
-        cameras that have no frame."""
+        """Camera -> share of the pixels of its newest frame at a decision that show a moving body; cameras
+        without a frame are left out."""
         at = moment.seed, moment.number
         if at not in self._known:
             self._known[at] = self._look(moment)
@@ -54,7 +55,7 @@ class VisibleMotion:
 
 
 class SeesMotion:
-    """An oracle policy: the ``k`` cameras that show most of the moving things, discounted by age."""
+    """An oracle policy: selects the ``k`` cameras that show most of the moving bodies, discounted by age."""
 
     def __init__(self, visible: VisibleMotion, k: int) -> None:
         self._sight, self._k = visible, k
@@ -69,9 +70,10 @@ class SeesMotion:
 
 
 def embedding_areas(visible: VisibleMotion, moments: Sequence[DecisionPoint]) -> tuple[float, float]:
-    """How well a linear rule tells whether a camera sees motion, from the embedding of its frame and from the
+    """How well a linear rule predicts whether a camera sees motion, from the embedding of its frame and from
+    the
     identity of the camera: areas under the ROC curve. The rules are fitted to every other episode and
-    measured on the rest; NaN where all cameras see motion, or none."""
+    measured on the others; NaN if all cameras see motion, or none."""
     rows, names, seen, episodes = [], [], [], []
     for moment in moments:
         embeddings = moment.state.embeddings
@@ -91,7 +93,9 @@ def embedding_areas(visible: VisibleMotion, moments: Sequence[DecisionPoint]) ->
 def _area_of_rule(x: NDArray[np.float64], labels: NDArray[np.bool_], fitted: NDArray[np.bool_]) -> float:
     """Area under the ROC curve of a linear rule by ridge regression.
 
-    x: (rows, features). labels: (rows,). fitted: (rows,), rows that it is fitted to; the others measure it.
+    x: (rows, features).
+    labels: (rows,).
+    fitted: (rows,), whether the rule is fitted to the row; it is measured on the others.
     """
     spread = np.maximum(x[fitted].std(axis=0), 1e-6)
     scaled = np.hstack([(x - x[fitted].mean(axis=0)) / spread, np.ones((len(x), 1))])
@@ -102,7 +106,7 @@ def _area_of_rule(x: NDArray[np.float64], labels: NDArray[np.bool_], fitted: NDA
 
 def area(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
     """Area under the ROC curve: how often a true row has a higher score than a false one; ties count half.
-    scores, labels: (rows,). NaN where all labels are the same."""
+    NaN if all labels are the same. scores, labels: (rows,)."""
     true, false = scores[labels], scores[~labels]
     if not (len(true) and len(false)):
         return float("nan")

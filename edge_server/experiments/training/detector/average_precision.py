@@ -1,4 +1,4 @@
-"""Average precision of a detector as COCO defines it, for any model with YOLO's output."""
+"""Average precision of a detector as defined by COCO, for any model with YOLO's output."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 def measure(run: Run, dataset: LabeledImages, kinds: Sequence[str] = KINDS) -> dict[str, Any]:
-    """{map50, map50_95, by_kind: {kind: {ap50, ap50_95, true}}, images} over ``dataset``."""
+    """Measure average precisions over ``dataset``: {map50, map50_95, by_kind: {kind: {ap50, ap50_95, true}},
+    images}."""
     found: list[Array] = []
     for part in network_inputs(dataset.images, _BATCH):
         found += [detections(out[: 4 + len(kinds)]) for out in run(part)]
@@ -60,10 +61,11 @@ def detections(output: NDArray[np.float32]) -> Array:
 
 
 def average_precision(found: Sequence[Array], true: Sequence[Array], ious: Array = IOUS) -> Array:
-    """Average precision (len(ious),) of one kind, interpolated at 101 recalls; NaN without a true box.
+    """Average precision (len(ious),) of one kind, interpolated at 101 recalls; NaN without a true box. Of two
+    detections of one object, the one with the lower score is false.
 
-    found: (n, 5) of each image, boxes with scores. true: (m, 4) of each image, boxes. Of two detections of
-    one object, the one with the lower score is false.
+    found: for each image, boxes with scores (n, 5).
+    true: for each image, boxes (m, 4).
     """
     total = sum(map(len, true))
     if not total:
@@ -86,8 +88,8 @@ def average_precision(found: Sequence[Array], true: Sequence[Array], ious: Array
 
 
 def _matches(found: Array, true: Array, ious: Array) -> NDArray[np.bool_]:
-    """(n, len(ious)) true positives: detections that are the best-scored with at least this IoU with a true
-    box."""
+    """Whether each detection is a true positive at each IoU, (n, len(ious)): the detection with the highest
+    score that has at least this IoU with a true box."""
     hits = np.zeros((len(found), len(ious)), dtype=np.bool_)
     if not len(found) or not len(true):
         return hits

@@ -1,4 +1,4 @@
-"""``edge-server train-detector``: renders, trains, exports and measures; every step is resumable."""
+"""``edge-server train-detector``: renders images, trains, exports and measures; every step is resumable."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal. CheckpointError: it cannot be read."""
+    """SHA-256 of a file, in hexadecimal. Raises CheckpointError if it cannot be read."""
     from edge_server.experiments.training.detector.training import CheckpointError
 
     try:
@@ -118,13 +118,13 @@ def file_digest(path: Path) -> str:
 
 
 def folder(args: argparse.Namespace) -> Path:
-    """Where everything is written."""
+    """The output folder."""
     default = Path("runs/detector" if args.of == "scenes" else f"runs/detector-{args.of}")
     return default if args.out is None else Path(args.out)
 
 
 def _masks(fp32: Path, int8: Path, sets: dict[str, Any]) -> dict[str, Any]:
-    """Masks of both files against the truth, and of GrabCut in the boxes of the smaller one."""
+    """Quality of the masks of both files, and of GrabCut in the boxes of the int8 file."""
     from edge_server.experiments.training.detector.mask_quality import measure_masks
 
     ways = ((fp32.stem, fp32, None), (int8.stem, int8, None), (f"{int8.stem}, grabcut", int8, "grabcut"))
@@ -135,7 +135,7 @@ def _masks(fp32: Path, int8: Path, sets: dict[str, Any]) -> dict[str, Any]:
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
-    """Cosines between both files' pooled features, after subtracting the float mean."""
+    """Cosine similarities of both files' pooled features, after subtracting the float mean."""
     import numpy as np
 
     from edge_server.experiments.training.detector.export import pooled_features

@@ -1,4 +1,4 @@
-"""Renders the detector's images once and keeps them in files, so that an interrupted run resumes."""
+"""Renders the detector's images once and keeps them in files, so that an interrupted run can resume."""
 
 from __future__ import annotations
 
@@ -27,14 +27,18 @@ RIG_CAMERAS = tuple(f"cam{k:02d}" for k in range(0, 19, 3))
 RIG_INSTANTS_S = (0.0, 0.7, 1.6, 2.5)
 
 
-# What a detector can be trained on -> the kinds of things that it finds.
+# Subject of a training -> the kinds of objects that its detector finds.
 SUBJECTS = {"scenes": KINDS, "tile": object_scenes.KINDS}
 
 
 @dataclass(frozen=True)
 class LabeledImages:
-    """images (n, side, side, 3) uint8; boxes: of each image (m, 5), see scenes.Boxes; masks: bool (n, side,
-    side), of the one object that a detector with masks finds, else None."""
+    """A labeled data set.
+
+    images: uint8 (n, side, side, 3).
+    boxes: for each image (m, 5), see scenes.Boxes.
+    masks: bool (n, side, side), of the single object that a detector with masks finds; else None.
+    """
 
     images: NDArray[np.uint8]
     boxes: list[Boxes]
@@ -45,7 +49,7 @@ class LabeledImages:
 
 
 def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np.float32]]:
-    """Images (n, H, W, 3) in batches (batch, 3, H, W), in [0, 1]."""
+    """Yield images (n, H, W, 3) as batches (batch, 3, H, W) in [0, 1]."""
     for first in range(0, len(images), batch):
         part = images[first : first + batch].transpose(0, 3, 1, 2).astype(np.float32)
         yield np.ascontiguousarray(part) / np.float32(255.0)
@@ -54,8 +58,8 @@ def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np
 def render(
     purpose: str, shots: int, side: int, seed: int, folder: Path, subject: str = "scenes"
 ) -> LabeledImages:
-    """``INSTANTS`` images of each of ``shots`` variations of a subject (``SUBJECTS``); those already in
-    ``folder`` are read from there."""
+    """Render ``INSTANTS`` images of each of ``shots`` variations of a subject (``SUBJECTS``); those already
+    in ``folder`` are read from there."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
     for first in range(0, shots, SHARD_SHOTS):
@@ -80,7 +84,7 @@ def scenes_of(purpose: str, shots: int, seed: int) -> list[str]:
 
 
 def of_own_rigs(side: int, subject: str = "scenes") -> dict[str, LabeledImages]:
-    """Images of the shipped scenes by some of their own cameras; of one object: as its scenarios show it."""
+    """Images of the shipped scenes by some of their own cameras; for a single object, as in its scenarios."""
     if subject != "scenes":
         shots = object_scenes.own_shots(side)
         return {name: LabeledImages(*shot.take()) for name, shot in shots.items()}

@@ -1,4 +1,4 @@
-"""The trained detector as ONNX, in float32 and in static 8 bits, with its projection for embeddings."""
+"""Exports the trained detector to ONNX, in float32 and static 8 bits, with its projection for embeddings."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ OPSET = 17
 INPUT = "images"
 CALIBRATION_IMAGES = 128
 _BATCH = 32
-# Axes of the learned projection: the largest dimension of an embedding.
+# Number of axes of the learned projection: the largest dimension of an embedding.
 AXES = 64
-# Smallest spread of an axis, relative to the first, so that scaling does not amplify one without information.
+# Least spread of an axis, relative to the first, so that scaling does not amplify one without information.
 _LEAST_SPREAD = 1e-3
 
 
 def export_fp32(
     model: Detector, side: int, path: Path, about: dict[str, Any], kinds: Sequence[str] = KINDS
 ) -> None:
-    """Write the detector with any number of images of any size whose sides are multiples of 16."""
+    """Export the detector for any number of images of any size whose sides are multiples of 16."""
     model = model.eval()
     axes = {INPUT: {0: "n", 2: "height", 3: "width"}, "output0": {0: "n", 2: "cells"}}
     if model.prototypes:
         axes["output1"] = {0: "n", 2: "mask_height", 3: "mask_width"}
     with warnings.catch_warnings():
-        # The newer exporter needs another package and gives the same operators.
+        # The newer exporter needs an additional package and gives the same operators.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             model,
@@ -76,8 +76,8 @@ def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
     """
     model = onnx.load(str(fp32))
     heads = ("/model.10/", "/model.11/")
-    # From the last convolutions of the heads and of the prototypes on: logits and distances need their full
-    # range.
+    # Not quantized: the last convolutions of the heads and of the prototypes, and what follows them, because
+    # logits and distances need their full range.
     inner = [n.name for n in model.graph.node if not n.name.startswith("/model.")]
     last = [
         n.name
@@ -95,8 +95,8 @@ def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             per_channel=True,
-            # Seven bits of weights: with eight, processors without VNNI saturate their sums, and one frame
-            # would have another embedding on another machine.
+            # Seven bits of weights: with eight, processors without VNNI saturate their sums, and a frame
+            # would have different embeddings on different machines.
             reduce_range=True,
             calibrate_method=CalibrationMethod.MinMax,
             op_types_to_quantize=["Conv", "Concat", "MaxPool", "Add", "Split", "Resize"],
@@ -125,7 +125,7 @@ def add_projection(path: Path, features: NDArray[np.float32]) -> dict[str, float
     scaled to unit variance. Returns the share of variance that the first 8, 16, 32 and 64 axes explain."""
     mean = features.mean(axis=0)
     _, spread, axes = np.linalg.svd((features - mean).astype(np.float64), full_matrices=False)
-    # The sign of an axis is arbitrary: its largest entry is positive.
+    # The sign of an axis is arbitrary: make its largest entry positive.
     axes *= np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
     scale = np.maximum(spread, _LEAST_SPREAD * spread[0]) / np.sqrt(len(features))
     kept = min(AXES, len(axes))
@@ -138,7 +138,7 @@ def add_projection(path: Path, features: NDArray[np.float32]) -> dict[str, float
 
 
 def runner(path: Path) -> Run:
-    """The whole detector through ONNX Runtime."""
+    """Function that runs the whole detector in ONNX Runtime."""
     session = _session(str(path))
     return lambda images: np.asarray(session.run(None, {INPUT: images})[0])
 

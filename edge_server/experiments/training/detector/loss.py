@@ -14,15 +14,15 @@ from torch import Tensor
 TOP_CELLS = 10
 SCORE_POWER, OVERLAP_POWER = 0.5, 6.0
 BOX_WEIGHT, MASK_WEIGHT = 5.0, 5.0
-# A mask is learned within the box and this share of its sides around it: what is farther off is cut anyway.
+# A mask is learned within the box and this share of its sides around it: pixels outside are cut anyway.
 MASK_MARGIN = 0.15
 
 Assigned = tuple[Tensor, Tensor, Tensor]
-"""What ``assign`` returns of one image."""
+"""The result of ``assign`` for one image."""
 
 
 def overlaps(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(IoU, generalised IoU) of boxes (..., 4) given as left, top, right, bottom; shapes broadcast."""
+    """(IoU, generalized IoU) of boxes (..., 4) given as left, top, right, bottom; shapes broadcast."""
     low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
     both = (high - low).clamp(min=0).prod(-1)
     area_a = (a[..., 2:] - a[..., :2]).clamp(min=0).prod(-1)
@@ -46,7 +46,7 @@ def assign(boxes: Tensor, scores: Tensor, cells: Tensor, truth: Tensor) -> tuple
         return none, none, torch.zeros(0)
     true = truth[:, None, :4]
     centre = cells[None, :, :2]
-    # Half a stride around a box counts as inside, because small boxes contain few cell centres.
+    # Half a stride around a box counts as inside, because small boxes contain few cell centers.
     reach = cells[None, :, 2] * 0.5
     inside = ((centre - true[..., :2]).amin(-1) > -reach) & ((true[..., 2:] - centre).amin(-1) > -reach)
     iou = overlaps(boxes[None], true)[0]
@@ -71,7 +71,7 @@ def assign(boxes: Tensor, scores: Tensor, cells: Tensor, truth: Tensor) -> tuple
 
 
 def assign_batch(predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor]) -> list[Assigned]:
-    """``assign`` for each image of a batch: predictions as ``Detector.raw`` gives them, truths (G, 5)."""
+    """``assign`` for each image of a batch. predicted: as from ``Detector.raw``. truths: (G, 5) each."""
     boxes, logits, cells = predicted
     with torch.no_grad():
         return [assign(boxes[k], logits[k].sigmoid(), cells, truth) for k, truth in enumerate(truths)]
@@ -80,8 +80,12 @@ def assign_batch(predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor])
 def detection_loss(
     predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor], assigned: list[Assigned] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(score loss, box loss) of a batch: predictions as ``Detector.raw`` gives them, truths (G, 5) each.
-    assigned: of ``assign_batch``, where it is known already."""
+    """(score loss, box loss) of a batch.
+
+    predicted: as from ``Detector.raw``.
+    truths: (G, 5) each.
+    assigned: result of ``assign_batch``; None computes it.
+    """
     boxes, logits, _ = predicted
     target = torch.zeros_like(logits)
     box_loss = logits.sum() * 0.0
@@ -102,9 +106,12 @@ def detection_loss(
 def mask_loss(
     weights: Tensor, prototypes: Tensor, truths: list[Tensor], masks: Tensor, assigned: list[Assigned]
 ) -> Tensor:
-    """Mean cross-entropy of a pixel in and near the box. weights (B, cells, M) and prototypes (B, M, h, w) as
-    ``Detector.raw_with_masks`` gives them; truths: one box (1, 5), or none, an image; masks: (B, H, W), 1
-    where that object is seen."""
+    """Mean cross-entropy of the pixels in and near the box.
+
+    weights, prototypes: (B, cells, M) and (B, M, h, w), as from ``Detector.raw_with_masks``.
+    truths: one box (1, 5), or none, per image.
+    masks: (B, H, W), 1 at the object's pixels.
+    """
     height, width = prototypes.shape[2:]
     soft = F.adaptive_avg_pool2d(masks[:, None], (height, width))[:, 0]
     scale = masks.shape[-1] / width

@@ -1,4 +1,4 @@
-"""How well masks fit the truth, through the code that a deployment runs (``edge_server.foreground``)."""
+"""Measures the quality of masks, with the code that a deployment runs (``edge_server.foreground``)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ Mask = NDArray[np.bool_]
 
 
 def measure_masks(model: Path, dataset: LabeledImages, segment: str | None = None) -> dict[str, Any]:
-    """Of a model with masks, or of ``segment`` (see ForegroundConfig) in its boxes: over the images that show
-    the object ``found``, the share in which it is, and of these mean, tenth percentile and least IoU with the
-    true mask; over the others ``false_alarms``, the share in which something is found. None without any."""
+    """Measure the masks of a model, or of ``segment`` (see ForegroundConfig) in its boxes.
+
+    found: share of the images with the object in which it is found; None without such images.
+    iou, iou_p10, iou_least: mean, tenth percentile and least IoU with the true mask, over these.
+    false_alarms: share of the images without the object in which something is found; None without such
+        images.
+    """
     assert dataset.masks is not None
     cut = make_foreground(ForegroundConfig(detector=str(model), segment=segment))
     ious, shown, alarms = [], 0, 0
@@ -45,7 +49,7 @@ def measure_masks(model: Path, dataset: LabeledImages, segment: str | None = Non
 
 def found_mask(image: NDArray[np.uint8], full: bool) -> Mask | None:
     """The pixels (H, W) that a cut image still shows; None if it was passed on whole because nothing was
-    found. full: whether all of it was found to be the object."""
+    found. full: whether the whole image was found to be the object."""
     if image.shape[2] == 4:
         return np.asarray(image[..., 3] > 0)
     return np.ones(image.shape[:2], np.bool_) if full else None

@@ -1,7 +1,8 @@
 """A small detector of the YOLOv8 family: cross-stage backbone, one step of neck, anchor-free heads.
 
-Modules carry the family's names (``model.N``), so the exported graph reads like any other of the family.
-Rectifiers instead of SiLU: ONNX Runtime fuses them into the convolutions, and 8 bits hold them better.
+Modules have the family's names (``model.N``), so the exported graph looks like others of the family.
+Rectifiers replace SiLU, because ONNX Runtime fuses them into the convolutions, and 8 bits represent them
+better.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ LAYERS = tuple(range(8))
 
 
 class Conv(nn.Module):
-    """Convolution, batch normalisation (folded into it at export), rectifier."""
+    """Convolution, batch normalization (folded into it at export), rectifier."""
 
     def __init__(self, c_in: int, c_out: int, kernel: int = 1, stride: int = 1) -> None:
         super().__init__()
@@ -66,8 +67,8 @@ class SPPF(nn.Module):
 
 
 class Head(nn.Module):
-    """Head of one map: scores of the kinds as logits, distances to the four sides of the box in strides, and
-    of a detector with masks the weights of their prototypes."""
+    """Head of one map: distances to the four sides of the box in strides, scores of the kinds as logits, and,
+    of a detector with masks, the weights of the prototypes."""
 
     def __init__(self, channels: int, kinds: int, prototypes: int = 0) -> None:
         super().__init__()
@@ -81,8 +82,8 @@ class Head(nn.Module):
 
 
 class Prototypes(nn.Module):
-    """Maps at half the image's side whose weighted sums are masks, as logits: the neck's fine map, enlarged
-    twice, each time beside the backbone's map of that size."""
+    """Maps at half the image's side whose weighted sums are masks, as logits. The neck's fine map is enlarged
+    twice, each time concatenated with the backbone's map of that size."""
 
     def __init__(self, fine: int, quarter: int, half: int, prototypes: int) -> None:
         super().__init__()
@@ -98,11 +99,12 @@ class Prototypes(nn.Module):
 
 
 class Detector(nn.Module):
-    """Images (B, 3, H, W) in [0, 1], sides multiples of 16, -> output0 (B, 4 + kinds, cells): centre, width
-    and height in pixels and a score for each kind, as every detector of the family gives them.
+    """Images (B, 3, H, W) in [0, 1], sides multiples of 16, -> output0 (B, 4 + kinds, cells): center, width
+    and height in pixels and a score for each kind, as in every detector of the family.
 
-    With ``prototypes``, as every segmentation model of the family: output0 (B, 4 + kinds + prototypes, cells)
-    has the weights of the mask's prototypes below, and output1 (B, prototypes, H / 2, W / 2) is these."""
+    With ``prototypes``, as in every segmentation model of the family, output0 (B, 4 + kinds + prototypes,
+    cells) also has the weights of the mask's prototypes, and output1 (B, prototypes, H / 2, W / 2) contains
+    these."""
 
     def __init__(self, kinds: int, prototypes: int = 0) -> None:
         super().__init__()
@@ -121,12 +123,12 @@ class Detector(nn.Module):
 
     def raw(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Boxes (B, cells, 4) as left, top, right, bottom in pixels, logits (B, cells, kinds), and the cells'
-        centres and strides (cells, 3)."""
+        centers and strides (cells, 3)."""
         return self.raw_with_masks(x)[:3]
 
     def raw_with_masks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """``raw``, and of a detector with masks each cell's weights (B, cells, prototypes) and the prototypes
-        (B, prototypes, H / 2, W / 2), else None."""
+        """``raw``, and the weights of each cell (B, cells, prototypes) and the prototypes (B, prototypes, H /
+        2, W / 2); None for a detector without masks."""
         m = self.model
         half = m[0](x)
         quarter = m[2](m[1](half))
@@ -158,7 +160,7 @@ class Detector(nn.Module):
 
 
 def _cells(feature: Tensor, stride: int) -> Tensor:
-    """Centres x, y in pixels and the stride (cells, 3) of a map's cells, row by row."""
+    """Centers x, y in pixels and the stride (cells, 3) of a map's cells, row by row."""
     height, width = feature.shape[2:]
     y = (torch.arange(height, device=feature.device, dtype=torch.float32) + 0.5) * stride
     x = (torch.arange(width, device=feature.device, dtype=torch.float32) + 0.5) * stride

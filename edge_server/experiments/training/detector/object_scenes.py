@@ -1,8 +1,8 @@
 """Training scenes of the detector of one object: the tile of scene ``tile`` among other things, with masks.
 
-A seed gives one world: the tile without some of its parts, or (one world in seven) no tile at all, on a bench
-or before nothing, with boxes, cylinders, balls and plates around it, in another light, seen from several
-viewpoints near and far, some of which cut it off at the image's edge or do not show it.
+A seed gives one world: the tile without some of its parts, or (in one world of seven) no tile, with or
+without a bench below, with boxes, cylinders, balls and plates around it, in varied light. It is seen from
+several near and far viewpoints, some of which show the tile cut off by the image's edge, or not at all.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from freshfield.geometry import Array, Pinhole, so3_exp
 
 KINDS = ("tile",)
 VIEWS = 8
-# Shares of the worlds: without the tile, with a bench below it.
+# Shares of the worlds without the tile, and with a bench below it.
 _ABSENT, _BENCH = 0.15, 0.8
-# Shares of the tile's parts: left out, in a texture of their own.
+# Shares of the tile's parts that are left out, and that get a random texture.
 _LEFT_OUT, _REPAINTED = 0.15, 0.1
-_HALF_M = (0.24, 0.18)  # of the tile: nothing else stands there
+_HALF_M = (0.24, 0.18)  # half sizes of the tile's area, in which no other object is placed
 _NEAR_M, _FAR_M = 0.28, 2.2
-_AIM = 0.8  # the tile's middle lies within this share of the image, from its middle to its edge
-_OFF = 0.2  # share of the views that look further aside
-# Viewpoints of scenario ``cell``: of a hand that carries a camera round the tile.
+_AIM = 0.8  # the tile's center is within this share of the distance from the image's center to its edge
+_OFF = 0.2  # share of the views that may look further aside
+# Viewpoints of scenario ``cell``: of a hand that moves a camera round the tile.
 _HAND_M, _HAND_FOV_DEG = 0.34, 75.0
 _HAND_ANGLES_DEG = tuple((a, e) for e in (30, 52, 75) for a in range(-180, 180, 30))
 
@@ -48,15 +48,15 @@ class ObjectShot:
     views: Sequence[tuple[Pinhole, Array]]
 
     def take(self) -> tuple[NDArray[np.uint8], list[Boxes], NDArray[np.bool_]]:
-        """Images (n, H, W, 3), the box in each that shows the object, and the object's masks (n, H, W)."""
+        """Render the images (n, H, W, 3), the object's box in each that shows it, and its masks (n, H, W)."""
         images = np.stack([self.scene.view(lens, pose).image(0.0) for lens, pose in self.views])
         masks = np.stack([self.scene.object_mask(lens, pose) for lens, pose in self.views])
         return images, [boxes_of(np.where(mask, 0, -1), [0]) for mask in masks], masks
 
 
 def own_shots(side: int) -> dict[str, ObjectShot]:
-    """The tile as shipped: through its own rig, and as a hand sees it in ``cell`` and on the bench of
-    ``scan``. The detector trains on none of these."""
+    """The shipped tile: from its own rig, and from a hand in ``cell`` and on the bench of ``scan``. The
+    detector is not trained on these."""
     size = {"width": side, "height": side}
     rig = make_scene("tile", {"count": 19, **size})
     lens = Pinhole.from_fov(side, side, _HAND_FOV_DEG)
@@ -87,7 +87,7 @@ def variation(seed: int, purpose: str, side: int) -> ObjectShot:
 
 
 def _tile(rng: np.random.Generator) -> list[Part]:
-    """The carrier, and most of what is on it."""
+    """The carrier, and most of the parts on it."""
     first, *rest = object_parts()
     kept = [first, *(part for part in rest if rng.random() >= _LEFT_OUT)]
     return [
@@ -97,7 +97,7 @@ def _tile(rng: np.random.Generator) -> list[Part]:
 
 
 def _others(rng: np.random.Generator, around_tile: bool) -> list[Part]:
-    """Bench, walls and what stands about. around_tile: leave its place free."""
+    """Bench, walls and other objects. around_tile: keep the tile's area free."""
     found = []
     if rng.random() < _BENCH:
         half = rng.uniform(0.3, 1.4, 2)
@@ -121,7 +121,7 @@ def _others(rng: np.random.Generator, around_tile: bool) -> list[Part]:
 
 
 def _shape(rng: np.random.Generator) -> tuple[Shape, float]:
-    """Something on the bench, and how high its middle is above it: a box, a plate, a cylinder or a ball."""
+    """A box, plate, cylinder or ball on the bench, and the height of its center above the bench."""
     which = int(rng.integers(4))
     if which == 0:
         a, b, c = rng.uniform(0.02, 0.13, 3)
@@ -137,7 +137,7 @@ def _shape(rng: np.random.Generator) -> tuple[Shape, float]:
 
 
 def _light(rng: np.random.Generator, light: Light) -> Light:
-    """Three of the light's points elsewhere, another strength and tint."""
+    """The light with three of its points, displaced, and a random strength and tint."""
     points = light.points[rng.choice(len(light.points), 3, replace=False)]
     dim = rng.uniform(0.6, 1.1)
 
@@ -156,7 +156,7 @@ def _light(rng: np.random.Generator, light: Light) -> Light:
 
 
 def _color(rng: np.random.Generator) -> tx.Color:
-    """Any color, or a gray."""
+    """A random color, or nearly grey."""
     r, g, b = (
         rng.uniform(0.05, 0.98, 3)
         if rng.random() < 0.5
@@ -166,7 +166,7 @@ def _color(rng: np.random.Generator) -> tx.Color:
 
 
 def _texture(rng: np.random.Generator) -> tx.Texture:
-    """Plain, brushed, striped, checkered, of boards or of bricks."""
+    """A random texture: plain, brushed, striped, checkered, boards or bricks."""
     one, other, size = _color(rng), _color(rng), float(rng.uniform(0.02, 0.12))
     made: list[tx.Texture] = [
         tx.Plain(one),
@@ -180,14 +180,14 @@ def _texture(rng: np.random.Generator) -> tx.Texture:
 
 
 def _viewpoint(rng: np.random.Generator, scene: Scene, side: int) -> tuple[Pinhole, Array]:
-    """A camera above the bench and outside of everything on it."""
+    """A random camera above the bench, outside of all objects."""
     placed = place_static([p for p in scene.world.static_parts if not isinstance(p.shape, Quad)])
     while True:
         lens = Pinhole.from_fov(side, side, float(rng.uniform(36, 80)))
         distance = float(np.exp(rng.uniform(math.log(_NEAR_M), math.log(_FAR_M))))
         pose = on_sphere(scene.target, distance, rng.uniform(-180, 180), rng.uniform(6, 88))
         apart = np.linalg.norm(placed.centers - pose[:3, 3], axis=1) if len(placed.parts) else np.ones(1)
-        # The bench and the tile below are wide: a camera is not within them, but within their spheres.
+        # Wide parts (bench, tile) are not tested: a camera is never inside them, but inside their spheres.
         if not ((apart < placed.radii + 0.02) & (placed.radii < 0.2)).any():
             break
     half = math.atan(_AIM * 0.5 * side / lens.fx)

@@ -36,9 +36,9 @@ the weights of LPIPS; whoever uses the distance does not. In OUT: perceptual.npz
 """
 # Range of the power, and the start of its search.
 POWERS, _START = (0.3, 2.0), 0.7
-# Added to distances before their logarithm is taken in the fit: a thousandth of the smallest that matter.
+# Added to distances before taking their logarithm in the fit: a thousandth of the smallest relevant ones.
 _NEAR = 1e-6
-TRIES = 5  # distortions of each image
+TRIES = 5  # number of distortions of each image
 UNSEEN = "unseen variations"
 _BATCH = 32
 _REPORT_EVERY = 20  # batches
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class FitFailed(ValueError):
-    """Nothing to fit to; the message says what is missing."""
+    """There is nothing to fit to; the message says what is missing."""
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[str]]:
     """Pairs (n, 2, H, W, 3) of a distorted and a true image, and the name of each distortion. Neighbors in
-    ``images`` are other instants of the same view."""
+    ``images`` must be different instants of the same view."""
     from edge_server.experiments.training.detector.distortions import distorted
 
     pairs, names = [], []
@@ -148,8 +148,8 @@ def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArr
 
 
 def fit(x: Array, y: Array) -> tuple[Array, float]:
-    """Non-negative weights (D,) and the power for which (x @ weights)^power is nearest to y (n,), by least
-    squares of the roots, so that small distances count as much as large ones."""
+    """Fit non-negative weights (D,) and a power so that (x @ weights)^power approximates y (n,), by least
+    squares of the square roots, which gives small distances more weight."""
     from scipy.optimize import minimize
 
     scale = x.mean(axis=0) + 1e-9
@@ -160,7 +160,7 @@ def fit(x: Array, y: Array) -> tuple[Array, float]:
         distance = x @ (z[:-1] / scale) + _NEAR
         found = distance ** (0.5 * z[-1])
         off = found - root
-        slope = off * found / len(y)  # of half the error, times the distance over half the power
+        slope = off * found / len(y)  # derivative of half the error, times the distance over half the power
         by_weight = x.T @ (slope * z[-1] / distance) / scale
         return float((off * off).mean()), np.append(by_weight, (slope * np.log(distance)).sum())
 
@@ -172,7 +172,7 @@ def fit(x: Array, y: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Differences (n, D), LPIPS (n,), and the scene of each image, which has ``TRIES`` pairs."""
+    """Differences (n, D) and LPIPS (n,) of pairs, and the scene of each image, which has ``TRIES`` pairs."""
 
     x: Array
     y: Array
@@ -185,8 +185,8 @@ class Compared:
 
 
 def left_out(known: Sequence[Compared]) -> dict[str, Any]:
-    """``correlation`` for each scene, with weights and power fitted to the others: what to expect of a new
-    scene. (The backbone was trained on variations of all of them.)"""
+    """``correlation`` for each scene, with weights and power fitted to the other scenes, to estimate the
+    quality for a new scene. (The backbone was trained on variations of all of them.)"""
     found = {}
     for scene in sorted(set(known[0].scenes)):
         x, y = known[0].of(scene, others=True)

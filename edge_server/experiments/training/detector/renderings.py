@@ -12,7 +12,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 
 FIELD = "voxel"
-# Optimiser steps between renderings.
+# Optimizer steps between renderings.
 STEPS = (15, 25, 60, 150, 250)
 INSTANT_S = 0.4
 

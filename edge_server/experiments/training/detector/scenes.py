@@ -25,9 +25,9 @@ from camera_node.synthetic.shapes import Cylinder, Quad, Shape, Sphere
 from freshfield.geometry import Array, Pinhole, look_at, world_rays
 
 KINDS = ("person", "cart", "ball", "drum")
-# Smallest side and area, in visible pixels, of a box.
+# Least side and area, in visible pixels, of a box.
 MIN_SIDE_PX, MIN_PIXELS = 5, 20
-# Height over width of a cylinder that is a drum, not a pole or a coin.
+# Range of height over width of a cylinder that is a drum, not a pole or a coin.
 _DRUM_PROPORTIONS = (0.4, 3.0)
 _PRESENT = 0.75  # share of the furniture that a variation keeps
 _SHARES = {"room": 0.45, "tower": 0.35, "tile": 0.20}
@@ -38,7 +38,7 @@ Boxes = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Shot:
-    """One camera in one world. kinds: of each mover, a number of KINDS."""
+    """One camera in one world. kinds: for each moving body its index in KINDS."""
 
     world: World
     camera: Pinhole
@@ -47,7 +47,7 @@ class Shot:
     supersample: int = 2
 
     def take(self, instants_s: Sequence[float]) -> tuple[NDArray[np.uint8], list[Boxes]]:
-        """Images (n, H, W, 3) and the boxes in each."""
+        """Render images (n, H, W, 3) and the boxes in each."""
         renderer = CameraRenderer(self.world, self.camera, self.camera_to_world, self.supersample)
         origin, rays = world_rays(self.camera, self.camera_to_world)
         rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
@@ -67,7 +67,7 @@ class Shot:
 
 
 def kind_of(shape: Shape, matrix: Array) -> int | None:
-    """Number of the kind of a single part, by its shape; None for furniture."""
+    """Index of the kind of a single part, by its shape; None for furniture."""
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
     if isinstance(shape, Sphere) and np.ptp(stretch) < 0.05 * stretch.max():
         return KINDS.index("ball")
@@ -80,7 +80,7 @@ def kind_of(shape: Shape, matrix: Array) -> int | None:
 
 
 def boxes_of(owner: NDArray[np.int64], kinds: Sequence[int | None]) -> Boxes:
-    """Boxes of the visible things. owner: (H, W), the index into ``kinds`` of the thing that each pixel
+    """Boxes of the visible objects. owner: (H, W), the index into ``kinds`` of the object that each pixel
     shows, -1 for none."""
     found = []
     for thing in np.unique(owner):
@@ -95,14 +95,14 @@ def boxes_of(owner: NDArray[np.int64], kinds: Sequence[int | None]) -> Boxes:
 
 
 def own_rig(name: str, camera: str, side: int) -> Shot:
-    """A camera of the scene as it is shipped; the detector trains on none of these."""
+    """A camera of the shipped scene; the detector is not trained on these."""
     scene = make_scene(name, {"count": 19, "width": side, "height": side})
     kinds = {"room": ("person",), "tower": ("person", "cart"), "tile": ()}[name]
     return Shot(scene.world, *scene.cameras[camera], tuple(KINDS.index(k) for k in kinds))
 
 
 def scene_of(seed: int, purpose: str) -> str:
-    """Name of the shipped scene that ``variation`` begins with."""
+    """Name of the shipped scene that ``variation`` varies."""
     return _base_scene(seed, purpose)[0]
 
 
@@ -160,7 +160,7 @@ def _things(rng: np.random.Generator, name: str) -> list[tuple[str, MovingBody]]
 
 
 def _small_things(rng: np.random.Generator) -> list[tuple[str, MovingBody]]:
-    """Balls and drums the size of a bolt or a probe, over the tile."""
+    """Balls and drums of the size of a bolt or a probe, above the tile."""
     return [
         _thing(rng, (*rng.uniform((-0.2, -0.15), (0.2, 0.15)), 0.06), rng.uniform(0.018, 0.06), 0.05)
         for _ in range(rng.integers(0, 4))
@@ -170,7 +170,7 @@ def _small_things(rng: np.random.Generator) -> list[tuple[str, MovingBody]]:
 def _thing(
     rng: np.random.Generator, place_m: tuple[float, float, float], size_m: float, path_m: float
 ) -> tuple[str, MovingBody]:
-    """A ball or a drum in random colors that circles ``place_m`` and turns."""
+    """A ball or a drum in random colors that circles ``place_m`` and rotates."""
     kind = str(rng.choice(["ball", "drum"]))
     tall = rng.uniform(0.7, 1.8)
     shape: Shape = Sphere(size_m) if kind == "ball" else Cylinder(size_m * 0.8, size_m * 0.8 * tall)
@@ -208,7 +208,7 @@ def _moved(mover: MovingBody, matrix: Array) -> MovingBody:
 
 
 def _viewpoint(rng: np.random.Generator, name: str, scene: Scene, movers: Sequence[MovingBody]) -> Array:
-    """A random camera pose of the scene; half of them look towards something that moves."""
+    """A random camera pose of the scene; half of the poses look towards a moving body."""
     target = np.asarray(scene.target, dtype=np.float64)
     if name == "tile":
         aim = target + rng.uniform((-0.12, -0.1, -0.02), (0.12, 0.1, 0.02))
@@ -221,7 +221,7 @@ def _viewpoint(rng: np.random.Generator, name: str, scene: Scene, movers: Sequen
         target = target + 3.0 * np.array([math.cos(a), math.sin(a), rng.uniform(-0.5, 0.3)])
     else:
         target = target + rng.uniform(-0.5, 0.5, 3)
-    if name == "room":  # its walls are seen through from outside
+    if name == "room":  # its walls are transparent from outside
         return on_sphere(target, rng.uniform(2.2, 3.6), rng.uniform(-75, 75), rng.uniform(3, 42))
     eye = np.asarray(scene.target) + rng.uniform((-0.7, -0.7, -0.5), (0.7, 0.7, 0.5))
     return look_at(eye, target)

@@ -1,4 +1,4 @@
-"""Trains the detector. Every epoch writes a checkpoint, from which a stopped run resumes."""
+"""Trains the detector. A checkpoint is written after every epoch, from which a stopped run resumes."""
 
 from __future__ import annotations
 
@@ -34,8 +34,12 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that decide the weights bit for bit; threads too, because they split sums. subject: of
-    ``dataset.SUBJECTS``. start: SHA-256 of the checkpoint whose weights it begins from; empty: none."""
+    """Settings that determine the weights bit for bit; also threads, because they split sums.
+
+    side: width and height of the images.
+    subject: a key of ``dataset.SUBJECTS``.
+    start: SHA-256 of the checkpoint with the initial weights; empty: none.
+    """
 
     seed: int = 0
     side: int = 128
@@ -50,14 +54,17 @@ class Settings:
 def train(
     dataset: LabeledImages, settings: Settings, checkpoint: Path, start: Path | None = None
 ) -> tuple[Detector, list[dict[str, Any]]]:
-    """Train, or resume from ``checkpoint``; with masks, if ``dataset`` has some. Returns the averaged
-    detector in eval mode, and a row of losses per epoch. start: a checkpoint of an earlier training, of the
-    same subject, whose averaged weights this one begins from. CheckpointError: made with other settings.
-    FloatingPointError: the loss diverged."""
+    """Train, or resume from ``checkpoint``; with masks, if ``dataset`` has them.
+
+    start: a checkpoint of an earlier training with the same subject, whose averaged weights are the initial
+        ones.
+    Returns the averaged detector in eval mode, and a row of losses per epoch. Raises CheckpointError if the
+    checkpoint has other settings, FloatingPointError if the loss diverges.
+    """
     torch.set_num_threads(settings.threads)
     torch.use_deterministic_algorithms(True)
     torch.manual_seed(settings.seed)
-    # Channels last: a quarter less time per step.
+    # The memory format channels_last saves a quarter of the time per step.
     kinds, prototypes = len(SUBJECTS[settings.subject]), 0 if dataset.masks is None else PROTOTYPES
     model = Detector(kinds, prototypes)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
@@ -109,7 +116,7 @@ def train(
 
 
 def _schedule(step: int, steps: int) -> float:
-    """Share of the rate: a short warm-up, then half a cosine down to a hundredth."""
+    """Factor of the learning rate: a short warm-up, then half a cosine down to a hundredth."""
     warm = min(1.0, (step + 1) / WARMUP_STEPS)
     return warm * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / max(1, steps))))
 
@@ -143,11 +150,11 @@ def _resume(checkpoint: Path, settings: Settings, parts: dict[str, Any]) -> list
 
 
 def _read(checkpoint: Path) -> dict[str, Any]:
-    """What ``_save`` wrote. CheckpointError: it cannot be read."""
+    """Read a checkpoint. Raises CheckpointError."""
     try:
         kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)
         kept["settings"], kept["averaged"]
-    except Exception as error:  # torch's reader raises whatever its archive's layers raise
+    except Exception as error:  # torch's reader raises any kind of exception
         raise CheckpointError(f"{checkpoint}: cannot be read ({error})") from None
     return kept
 
@@ -162,8 +169,8 @@ def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list
 def _batches(
     dataset: LabeledImages, settings: Settings, epoch: int
 ) -> Iterator[tuple[Tensor, list[Tensor], Tensor | None]]:
-    """Augmented batches of one epoch, a function of seed and epoch alone: images, boxes, and masks where the
-    dataset has some."""
+    """Augmented batches of one epoch, which depend only on seed and epoch: images, boxes, and masks if the
+    data set has them."""
     order = np.random.default_rng([settings.seed, epoch]).permutation(len(dataset))
     for first in range(0, len(dataset) - BATCH + 1, BATCH):
         images, truths = [], []
@@ -182,9 +189,10 @@ def _batches(
 def augmented(
     image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], Boxes]:
-    """A randomly augmented image (side, side, 3) in [0, 1] and its boxes: mirrored, scaled, shifted, with
-    another exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the mask of its
-    one object, from 0 to 255: it moves along, and the box is that of what it still shows."""
+    """Randomly augment an image (side, side, 3), returned in [0, 1], and its boxes: mirrored, scaled,
+    shifted, with a random exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the
+    mask of its
+    single object, from 0 to 255: it is transformed as well, and the box is computed from it."""
     side = image.shape[0]
     boxes = boxes.copy()
     if rng.random() < 0.5:

@@ -17,8 +17,10 @@ Maker = Callable[[np.random.Generator], Policy]
 
 def choose(policy: Policy, moment: DecisionPoint, number: int | None = None) -> Choice:
     """Plan, wait and select with ``policy`` at a decision, as in the live loop. A policy that would wait past
-    the channel's record uses all newest frames at its end. number: of the decision, for policies with state
-    across decisions; None takes the moment's own."""
+    the channel's record uses all newest frames at its end.
+
+    number: number of the decision, for policies with state across decisions; None: the moment's own.
+    """
     number = moment.number if number is None else number
     plan = policy.plan(_epoch(moment, moment.now_ns, number))
     at_ns = min(max(moment.now_ns, plan.wait_until_ns), moment.until_ns)
@@ -63,6 +65,6 @@ def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:
     newest = moment.newest(at_ns)
     generated = {c: arrival.generated_ns for c, arrival in newest.items()}
     received = {c: arrival.received_ns for c, arrival in newest.items()}
-    # Apart from ages, the state is known only at the instant of the decision, when policies read it.
+    # Except for ages, the state is known only at the instant of the decision, when policies read it.
     state = (lambda parts=(): moment.state) if at_ns == moment.now_ns else None
     return Epoch(at_ns, number, generated, state, received)

@@ -1,4 +1,4 @@
-"""``edge-server train-scheduler``: a scheduler learns in virtual time, with real field fits as reward."""
+"""``edge-server train-scheduler``: trains a scheduler in virtual time, with real field fits as reward."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
     def work() -> None:
-        args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
         with WorkerPool(folders, args.jobs, args.out / "evaluations.jsonl") as pool:
             _train_and_evaluate(args, setting, config, pool)
 
@@ -114,7 +114,7 @@ def _train_and_evaluate(
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
     learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
-    # Reports of an earlier call; a call that was refused keeps them.
+    # Delete the reports of an earlier call, but only after the training was accepted.
     for name in REPORTS:
         (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
@@ -144,7 +144,8 @@ def _train_and_evaluate(
 
 
 def _score(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
-    """Fixed policies and the learnt one in the scenario as it is: its own size, all its training cameras."""
+    """Score fixed policies and the learnt one in the unchanged scenario: its own image size, all its training
+    cameras."""
     scenario = load(args.scenario)
     report = () if set(setting.report) == set(scenario.held_out) else setting.report
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
@@ -165,7 +166,7 @@ def _report(
     found = summary(evaluation, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
     levels = {label: found["rewards"][name][0] for label, name in names.items()}
-    # The zero of a reward depends on the cameras: levels of other cameras cannot be drawn beside the curve.
+    # The zero of a reward depends on the cameras, so levels of other cameras cannot be drawn with the curve.
     shown = {} if about["rewarded_from"] != about["judged_from"] else levels
     draw_curve(out / "training.png", rows, {k: v for k, v in shown.items() if v is not None})
     write_json(out / "summary.json", {**found, **about}, indent=1)
@@ -175,7 +176,8 @@ def _report(
 
 
 def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
-    """Where decisions come from: the scenario with small pictures and a quick field."""
+    """The setting that decisions are drawn from: the scenario with small images and a quick field. Raises
+    ScenarioError or ValueError."""
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
@@ -190,7 +192,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     edge["policy"] = {"name": "all"}
     report = _reporting(args, scenario)
     held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
-    if args.hold and not set(report) <= set(scenario.held_out):  # the spared camera rewards
+    if args.hold and not set(report) <= set(scenario.held_out):  # the additional held-out camera rewards
         report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
@@ -203,8 +205,8 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
 
 
 def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
-    """Cameras that report. By themselves: the last of several that are held out, else one in the middle of
-    those that are trained on, which then is not."""
+    """Cameras that only report. Default: the last of several held-out cameras, else the middle one of the
+    training cameras, which then is held out, too."""
     if args.report == "none" or not scenario.held_out:
         return ()
     if args.report:

@@ -1,8 +1,8 @@
-"""Episodes in which the scheduler itself decides: a whole deployment in virtual time, computing charged.
+"""Episodes in which the scheduler decides in a running deployment in virtual time, with computing charged.
 
-A decision holds for ``Spec.hold_ms``; its outcome is what was shown until the next one, of the field that all
-decisions before it left behind. Several tries of an episode share channel, motion and instants, so that the
-outcomes of one instant are comparable.
+A decision holds for ``Spec.hold_ms``. Its outcome is the fidelity of the images shown until the next
+decision; it also depends on all earlier decisions, because the field is not reset. Several tries of an
+episode share channel, motion and instants, so that the outcomes of one instant are comparable.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision import Decision
 from freshfield.scenario import Scenario
 
-# Instants at which what is shown is scored.
+# Period of the instants at which the shown image is scored.
 SHOWN_EVERY_MS = 125.0
 
 
 @dataclass(frozen=True)
 class Hindsight:
-    """What no policy can do: every ``hold_ms`` it takes that of some thresholds which will show most until
-    the next decision (PSNR). Greedy: what an action is worth later does not count."""
+    """An oracle that knows the future: every ``hold_ms`` it takes the threshold with the highest PSNR shown
+    until the next decision. It is greedy: later effects of an action do not count."""
 
     hold_ms: float
     omegas_ms: tuple[float, ...]
@@ -67,8 +67,8 @@ def play(factory: EpisodeFactory, seed: int, actor: Actor, turn: int) -> list[De
 
 
 def judge(factory: EpisodeFactory, seed: int, who: Judged) -> dict[str, Any]:
-    """What a policy shows in an episode after its lead, as plain values. An actor's omegas are given by the
-    channel's state, too."""
+    """Means over an episode after its lead, under one policy, as plain values; of an actor with omegas also
+    its mean omega by the channel's state."""
     rng = np.random.default_rng([seed, 0])
     policy: Policy
     if isinstance(who, Actor):
@@ -88,7 +88,8 @@ def judge(factory: EpisodeFactory, seed: int, who: Judged) -> dict[str, Any]:
 
 
 def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDeployment, list[Decided]]:
-    """Run an episode under ``policy``, and all decisions that a learned one took after the lead."""
+    """Run an episode under ``policy``. Returns the deployment, and the decisions after the lead of a learned
+    policy."""
     setting, scenario = factory.setting, factory.scenario(seed)
     edge, stage, field = read_config(scenario), factory.stage(seed), factory.field(seed)
     field.reset()
@@ -128,13 +129,13 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
 
 
 class _Forking(Threshold):
-    """Tries the actions of each decision in forks of this process, which all go on from the same state."""
+    """Tries the actions of each decision in forks of this process, which all continue from the same state."""
 
     def __init__(self, who: Hindsight) -> None:
         super().__init__(None, np.random.default_rng(0))
         self._who, self._began_ns, self._until_ns = who, 0, 0
         cv2.setNumThreads(1)  # a fork has no other threads
-        self._answer: int | None = None  # a fork writes there what its action showed, and ends
+        self._answer: int | None = None  # in a fork: file descriptor to which it writes its result
         self.shown_db: Callable[[int, int], float | None] = lambda begin_ns, end_ns: None
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
@@ -147,12 +148,12 @@ class _Forking(Threshold):
                 if (found := self._fork()) is None:  # in the fork
                     return super().plan(epoch)
                 shown[omega_ms] = found
-            # Of equal ones, the largest: leaving frames out has to win something.
+            # Of equal ones the largest, because leaving frames out must be an advantage.
             self.value = max(shown, key=lambda omega_ms: (shown[omega_ms], omega_ms))
         return super().plan(epoch)
 
     def _fork(self) -> float | None:
-        """What the fork showed, -inf without a score; None in the fork itself."""
+        """Fork. Returns the PSNR that the fork showed, -inf without a score; None in the fork itself."""
         read, write = os.pipe()
         pid = os.fork()
         if pid == 0:
@@ -168,21 +169,21 @@ class _Forking(Threshold):
         return float(struct.unpack("d", answer)[0])
 
     def report(self, now_ns: int) -> None:
-        """End a fork with what was shown since its decision; nothing elsewhere."""
+        """In a fork: write the PSNR shown since its decision, and end it. Otherwise do nothing."""
         if self._answer is not None:
             shown = self.shown_db(self._began_ns, now_ns)
             os.write(self._answer, struct.pack("d", -np.inf if shown is None else shown))
             os._exit(0)
 
     def fail(self) -> None:
-        """End a fork that has failed, without a result; nothing elsewhere."""
+        """In a fork: end it without a result. Otherwise do nothing."""
         if self._answer is not None:
             traceback.print_exc()
             os._exit(1)
 
 
 def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outcome:
-    """Means of what was shown, and of the updates that were published, in [begin, end)."""
+    """Means of the images shown and of the updates published in [begin, end)."""
     shown = [s for s in deployment.shown if begin_ns <= s.published_ns < end_ns]
     updates = [p for p in deployment.publications if begin_ns <= p.published_ns < end_ns]
     return Outcome(
@@ -194,7 +195,8 @@ def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outco
 
 
 def channel_states(scenario: Scenario, at_ns: list[int]) -> list[str]:
-    """Names of the states of the chain that all cameras share, at instants; "" without one."""
+    """Names of the states of the Markov chain that all cameras share, at given instants; "" without a
+    chain."""
     config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
     chain = Channel(config, scenario.seed).chain
     return ["" if chain is None else config.state_names[chain.state(t)] for t in at_ns]
@@ -203,8 +205,8 @@ def channel_states(scenario: Scenario, at_ns: list[int]) -> list[str]:
 def sibling_advantages(
     tries: Sequence[Sequence[Decided]], hold_ms: float, rewards: Sequence[Sequence[float]]
 ) -> list[NDArray[np.float64]]:
-    """Rewards of several tries of one episode minus the mean of the other tries at the same instant, NaN
-    where no other try decided then; with a single try the rewards as they are."""
+    """For each try of one episode its rewards minus the mean of the other tries at the same instant; NaN if
+    no other try has a reward there. With a single try the unchanged rewards."""
     if len(tries) == 1:
         return [np.array(rewards[0])]
     slots = [[d.decision.now_ns // round(hold_ms * 1e6) for d in one] for one in tries]

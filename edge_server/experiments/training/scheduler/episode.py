@@ -1,8 +1,8 @@
 """Episodes: run a virtual deployment, draw decisions from it, and evaluate choices with field fits.
 
 The channel does not depend on the edge's decisions, so one recorded run serves every action at every
-decision, and the record gives the buffer at any instant. (Where a decision flushes the links, it has a record
-of its own, whose one flush every action shares.) Each choice gets its own field fit, from nothing or
+decision, and the record gives the buffer at any instant. (If decisions flush the links, each has its own
+record with one flush, which all actions share.) Each choice gets its own field fit, from an empty field or
 from a copy of the same warm field, so actions of one decision are comparable (thesis 5.4, algorithm 1; 6.3,
 algorithm 2).
 """
@@ -53,13 +53,13 @@ Image = Callable[[str, float], NDArray[np.uint8]]
 _EPISODES_KEPT = 32
 _TRUTHS_KEPT = 8192
 SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
-# The first decision of the deployment's own edge: never within an episode.
+# Instant of the first decision of the deployment's own edge: never within an episode.
 _NEVER_MS = 1e11
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A frame that reached the buffer. generated_ns: on the edge's clock."""
+    """A frame that reached the buffer. generated_ns: instant of its capture on the edge's clock."""
 
     camera: str
     sequence: int
@@ -69,7 +69,7 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Choice:
-    """A policy's choice: the newest frames of ``cameras`` at ``at_ns``. treatment: name, "" for none."""
+    """A policy's choice: the newest frames of ``cameras`` at ``at_ns``. treatment: its name, "" for none."""
 
     cameras: tuple[str, ...]
     at_ns: int
@@ -167,8 +167,8 @@ class Stage:
 
 
 class EpisodeFactory:
-    """Objects that the episodes of a setting share in one process: scorer, field, embedder, and the images
-    where all episodes have the same motion."""
+    """Objects that the episodes of a setting share in one process: scorer, field, embedder, and the images if
+    all episodes have the same motion."""
 
     def __init__(self, setting: Setting, folders: Folders) -> None:
         scenario = setting.scenario
@@ -199,7 +199,8 @@ class EpisodeFactory:
         return self.setting.seeded(seed, self._moving)
 
     def stage(self, seed: int) -> Stage:
-        """Truth and training cameras of an episode; the last one's keep what they have rendered."""
+        """Truth and training cameras of an episode; those of the last episode are cached with their
+        images."""
         if self._shared is not None:
             return self._shared
         if self._last is None or self._last[0] != seed:
@@ -269,7 +270,8 @@ class Episode:
         self._owed_s = time.process_time() - began_s
 
     def _recorded(self, flush_ns: int | None = None) -> tuple[VirtualDeployment, list[Arrival]]:
-        """The deployment run to the record's end, and what arrived. flush_ns: when its links are flushed."""
+        """Run the deployment to the end of the record; returns it and all arrivals. flush_ns: when its links
+        are flushed; None: never."""
         factory, setting = self._factory, self._factory.setting
         scenario, stage = factory.scenario(self.seed), factory.stage(self.seed)
         heard = tuple(c for c in scenario.cameras if c not in setting.silent)
@@ -289,7 +291,7 @@ class Episode:
             deployment.flush()
         deployment.run((self._until_ns - deployment.clock.now_ns()) / 1e9)
         record = recorder.record
-        # For their images alone: when a frame was received depends on the record.
+        # Kept for the images only: the instant of reception depends on the record.
         self._frames |= {(b.frame.camera, b.frame.sequence): b for b in record}
         return deployment, [
             Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record

@@ -38,9 +38,9 @@ _REQUESTS_AT_ONCE = 400
 class Evaluation:
     """Outcomes by policy and decision.
 
-    reward: judges the outcomes; it may be replaced at no cost.
-    repeated: outcomes of the same choices with fields of other seeds. The choice that looks best in one
-        outcome is measured in the other, because the maximum of noisy fits is biased upwards.
+    reward: rates the outcomes; it may be replaced without new evaluations.
+    repeated: outcomes of the same choices with fields of other seeds. The choice that is best in one outcome
+        is measured in the other, because the maximum of noisy fits is biased upwards.
     """
 
     reward: Reward
@@ -48,18 +48,18 @@ class Evaluation:
     repeated: dict[str, dict[At, Outcome]] = field(default_factory=dict)
 
     def value(self, outcome: Outcome) -> float | None:
-        """Reward of an outcome; None where a term is missing."""
+        """Reward of an outcome; None if a term is missing."""
         found = self.reward.of(outcome)
         return found.total if found.complete else None
 
     def rewards(self, name: str) -> PerSeed:
-        """seed -> mean reward of its decisions. ``hindsight``: of the best choice of all policies at each
+        """seed -> mean reward of its decisions. For ``hindsight``: of the best choice of all policies at each
         decision, chosen by one fit and measured by another."""
         values = self._hindsight(list(self.outcomes))[0] if name == HINDSIGHT else self.decisions(name)
         return _by_seed(values, self._unscored())
 
     def decisions(self, name: str) -> dict[At, float | None]:
-        """Reward of every decision, mean of its fits; None where a term is missing."""
+        """Reward of every decision, mean of its fits; None if a term is missing."""
         return {at: _mean([self.value(o) for o in self._fits(name, at)]) for at in self.outcomes[name]}
 
     def runs(self, name: str) -> list[PerSeed]:
@@ -94,8 +94,8 @@ class Evaluation:
 
     def best_values(self, kind: str) -> dict[str, Any]:
         """How much the best value of ``kind`` varies between decisions: its ``quartiles``, and the ``gain``
-        of knowing it: hindsight among these values minus the best fixed one, paired over seeds. Both are
-        unknown where every choice was carried out only once."""
+        from knowing it: hindsight among these values minus the best fixed one, paired over seeds. Both are
+        unknown if every choice was carried out only once."""
         names = [name for name in self.outcomes if name.startswith(f"{kind}:")]
         rewards, best = self._hindsight(names)
         gain = paired(_by_seed(rewards, self._unscored()), self.best_fixed(kind)[0])
@@ -116,8 +116,8 @@ class Evaluation:
     def _hindsight(self, names: Sequence[str]) -> tuple[dict[At, float | None], list[int]]:
         """Decision -> reward of the best of ``names`` there, and the indices of all best ones.
 
-        Chosen by each of two fits and measured by the other, among the policies that have both; None where
-        none has.
+        The best is chosen by each of two fits and measured by the other, among the policies that have both;
+        None if none has.
         """
         found: dict[At, float | None] = {}
         best: list[int] = []
@@ -136,7 +136,7 @@ class Evaluation:
 
 
 class OracleCandidate(Protocol):
-    """A candidate that may look at more of a decision than a policy sees."""
+    """A candidate that may use more of a decision than a policy sees."""
 
     def choice(self, moment: DecisionPoint) -> Choice: ...
 
@@ -152,15 +152,16 @@ def evaluate_policies(
     reward: Reward,
     say: Callable[[str], None] | None = None,
 ) -> Evaluation:
-    """Carry out the choice of every candidate at every decision of every seed, twice, with fields of other
+    """Carry out the choice of every candidate at every decision of every seed twice, with fields of different
     seeds.
 
-    setting: ``Setting.judged``, because the cameras that reward must not judge.
+    setting: a ``Setting.judged``, because the cameras that reward must not judge.
+    candidates: by name.
     say: called with lines of progress.
     """
     evaluation = Evaluation(reward, {name: {} for name in candidates}, {name: {} for name in candidates})
     requests: list[tuple[str, Request]] = []
-    # All requests of one episode stand together, so that its images and its field are made once.
+    # All requests of one episode are adjacent, so that its images and its field are made once.
     for moments in pool.draw(setting, seeds):
         for place, (name, candidate) in enumerate(candidates.items()):
             if isinstance(candidate, Actor):
@@ -214,8 +215,8 @@ def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
 
 
 def _by_seed(values: Mapping[At, float | None], left_out: Container[At] = ()) -> PerSeed:
-    """Mean over each seed's decisions, those ``left_out`` aside. None where one of them has no value, because
-    seeds that lack different decisions cannot be compared, and where all are left out."""
+    """Mean over each seed's decisions, except those ``left_out``. None if one of them has no value, because
+    seeds that lack different decisions cannot be compared, or if all are left out."""
     found: dict[int, list[float | None]] = {}
     for (seed, number), value in values.items():
         mine = found.setdefault(seed, [])
@@ -228,6 +229,6 @@ def _by_seed(values: Mapping[At, float | None], left_out: Container[At] = ()) ->
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """None where a value is missing."""
+    """The mean; None if a value is missing or there are none."""
     known = [v for v in values if v is not None]
     return sum(known) / len(known) if known and len(known) == len(values) else None

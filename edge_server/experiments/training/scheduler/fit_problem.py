@@ -25,9 +25,12 @@ KEPT = 16  # number of last drawn episodes whose frames stay in memory
 
 @dataclass(frozen=True)
 class FitProblem:
-    """``scheduler.learned.gym_environment.Problem``: seed s is decision s mod D of training episode s div D,
-    with D decisions per episode. No seed gives a test episode. spec: the meaning of an action. run: number of
-    the run whose training episodes are drawn."""
+    """A ``scheduler.learned.gym_environment.Problem``: seed s is decision s mod D of training episode s div
+    D, with D decisions per episode. No seed gives a test episode.
+
+    spec: the meaning of an action.
+    run: number of the run whose training episodes are drawn.
+    """
 
     setting: Setting
     spec: Spec
@@ -50,7 +53,7 @@ class FitProblem:
 
 @dataclass(frozen=True)
 class FitDecision:
-    """``scheduler.learned.gym_environment.Round``."""
+    """A ``scheduler.learned.gym_environment.Round``."""
 
     problem: FitProblem
     moment: DecisionPoint

@@ -1,13 +1,13 @@
-"""What fixed policies and a learnt one show in a scenario as it is, in virtual time with computing charged.
+"""Compares fixed policies and a learnt one in an unchanged scenario, in virtual time with computing charged.
 
-All policies with the scenario's own seed, for the page; the learnt one and its reference with other seeds,
-too: one channel, one motion and the same instants for both. Policies without learning, with other seeds, and
-what hindsight of each second would win with these thresholds:
+All policies run with the scenario's own seed, for the page; the learnt one and its reference also with other
+seeds, each with the same channel, motion and instants for both. To compare policies without learning over
+seeds, and hindsight of each second with these thresholds:
 
     python -m edge_server.experiments.training.scheduler.policy_comparison card all whittle:1
         hindsight:100,250,1000 --json FILE
 
-Also on a machine of other costs: --costs, --slower.
+--costs and --slower set the costs of another machine.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ POLICIES = (
     REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:1", "aoii:1",
     "covariance:1", "age-driven",
 )  # fmt: skip
-# Until the layers of a field have begun (``layered_field.PLATE_S``), decisions tell nothing.
+# Decisions have no effect until the layers of a field have begun (``layered_field.PLATE_S``).
 LEAD_MS = 5000.0
-# What is shown is scored for so long, after the lead of an episode.
+# For how long shown images are scored, after the lead of an episode.
 SPAN_MS = 8000.0
 HINDSIGHT, HINDSIGHT_HOLD_MS = "hindsight:", 1000.0
 _SHOWN = ("psnr_db", "psnr_moving_db")
@@ -101,7 +101,8 @@ def _runs(
 def _means(
     runs: Mapping[str, list[dict[str, Any]]], seeds: range, names: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Of each policy the means of ``names``, and of what it shows minus what the first one does, paired."""
+    """For each policy the means of ``names``, and its shown fidelity minus that of the first policy,
+    paired."""
     first, found = next(iter(runs)), {}
     for who, of in runs.items():
         found[who] = {m: interval(run[m] for run in of).rounded(4) for m in names}
@@ -120,14 +121,14 @@ def _by_state(runs: list[Mapping[str, float]]) -> dict[str, list[float | None]]:
 def compare(
     setting: Setting, pool: WorkerPool, seeds: range, names: Sequence[str], known: Path
 ) -> dict[str, dict[str, Any]]:
-    """What each policy shows, mean and interval over seeds, and minus the first of them, paired; hindsight
-    also minus the fixed policy that is best on other seeds.
+    """The fidelity that each policy shows, mean and interval over seeds, and minus that of the first one,
+    paired; hindsight also minus the fixed policy that is best on other seeds.
 
-    names: policies without learning, and their values; ``hindsight:`` and its thresholds. known: as in
-    ``score_policies``.
+    names: policies without learning, with their values; or ``hindsight:`` with its thresholds.
+    known: as in ``score_policies``.
     """
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for seed in seeds:  # of one motion after the other: its pictures are rendered once
+    for seed in seeds:  # one motion after the other, so that its images are rendered once
         for name in names:
             runs[name] += _runs(setting, pool, range(seed, seed + 1), _named(name), "", known)
     found = _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
@@ -196,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _slower(costs: ComputeConfig, times: float) -> ComputeConfig:
-    """``costs`` of a slower machine. ValueError: it would make no difference."""
+    """``costs`` multiplied by ``times``. Raises ValueError if this is invalid or has no effect."""
     charged = dataclasses.asdict(costs)
     if not times > 0.0 or (times != 1.0 and not any(charged.values())):
         raise ValueError(

@@ -12,15 +12,15 @@ from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation, PerSeed
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
-# Batches that a point of the smoothed curve is the mean of.
+# Number of batches averaged in a point of the smoothed curve.
 _SMOOTH = 9
 
 
 def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, float] | None = None) -> None:
     """Draw the learning curve (figures 5.9, 6.8) and the terms of the reward.
 
-    path: of the PNG.
-    rows: of the log, one a batch.
+    path: the PNG file.
+    rows: rows of the log, one per batch.
     levels: label -> reward of a policy without learning, on the test seeds.
     """
     terms = [name for name in rows[0] if name.startswith("term_")]
@@ -41,7 +41,7 @@ def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, flo
 
 
 def smoothed(values: np.ndarray, count: int = _SMOOTH) -> np.ndarray:
-    """Moving average over the last ``count`` values, fewer at the beginning, NaN left out."""
+    """Moving average over the last ``count`` values, fewer at the beginning, without NaN."""
     parts = [values[max(0, i + 1 - count) : i + 1] for i in range(len(values))]
     return np.array([np.nan if np.isnan(p).all() else np.nanmean(p) for p in parts])
 
@@ -97,8 +97,8 @@ def quartiles(best_values: dict[str, Any]) -> str:
 
 
 def percent(values: PerSeed, base: PerSeed) -> str:
-    """Gain in mean reward over ``base`` in percent of its size, as in the thesis. The text says that there is
-    none where the arbitrary zero of the reward lies near ``base`` or between the two."""
+    """Gain in mean reward over ``base`` in percent of its absolute value, as in the thesis. The text says
+    that there is no percentage if the arbitrary zero of the reward is near ``base`` or between the two."""
     a, b = interval(values.values()), interval(base.values())
     if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
         return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"

@@ -36,21 +36,27 @@ OMEGAS_MS = {
 
 @dataclass(frozen=True)
 class Setting:
-    """scenario: the deployment; each episode replaces its seed and policy. decisions: number per episode, at
-    random instants between ``lead_ms`` and ``lead_ms + span_ms`` of virtual time. horizon_ms: longest wait.
+    """The setting of decisions and evaluations.
 
+    scenario: the deployment; each episode replaces its seed and policy.
     report: held-out cameras that only report; the other held-out cameras reward. Neither is trained on.
     judging: score outcomes from the reporting cameras instead of the rewarding ones (``judged``).
-    motions: draw each episode's motion from its seed, where a world moves. If False, and with recordings,
-    all episodes share one motion and seeds differ only in channel and instants.
-
-    steps: optimizer steps per update. scratch: start every update from nothing, as in the thesis (5.4, 6.3);
-    else from a copy of the episode's warm field, trained for ``warm_steps`` before the first decision and,
-    on the newest frames, for ``steps`` more before each later one, ``refresh_ms`` before the decision.
-    repeat: number of the fields' random stream, to measure the variance of repeated fits. compute: virtual
-    time charged per update. parts: of the state (6.33); only "semantics" embeds frames, as the scenario's
-    ``edge.embedding`` configures. silent: cameras that never send.
-    flush: what is on its way at each decision is broken off (6.5), whatever is chosen.
+    motions: draw each episode's motion from its seed, if the world moves. If False, and with recordings, all
+        episodes share one motion and seeds differ only in channel and instants.
+    steps: optimizer steps per update.
+    scratch: start every update with an empty field, as in the thesis (5.4, 6.3); else with a copy of the
+        episode's warm field, trained for ``warm_steps`` before the first decision and, on the newest frames,
+        for ``steps`` more before each later one, ``refresh_ms`` before the decision.
+    repeat: number of the fields' random stream, to measure the variance of repeated fits.
+    decisions: number per episode, at random instants between ``lead_ms`` and ``lead_ms + span_ms`` of virtual
+        time.
+    horizon_ms: longest wait.
+    compute: virtual time charged per update.
+    parts: parts of the state (6.33); only "semantics" embeds frames, as the scenario's ``edge.embedding``
+        configures.
+    silent: cameras that never send.
+    flush: discard the frames in transit at each decision (6.5), whatever is chosen.
+    Raises ScenarioError or ValueError.
     """
 
     scenario: Scenario
@@ -134,7 +140,7 @@ class Setting:
 
 
 def seeds(run: int, purpose: str, count: int, first: int = 0) -> range:
-    """Seeds of ``count`` episodes from number ``first`` on, for one of ``PURPOSES`` of run ``run``.
+    """Seeds of ``count`` episodes from number ``first`` on, for one of ``PURPOSES`` of run ``run``. Raises
     ValueError if the range would overlap the next."""
     if not (0 <= run < 10**9 and first >= 0 and first + count <= SEEDS_A_PURPOSE):
         raise ValueError(f"seed: expected 0 to 999999999, and at most {SEEDS_A_PURPOSE} episodes")
@@ -147,9 +153,9 @@ def reward_of(
 ) -> tuple[Reward, str | None]:
     """A preset reward, and why it has no LPIPS term (None if it has what was requested).
 
-    name: of the preset.
+    name: name of the preset.
     on: whole or moving, the pixels of the PSNR.
-    lpips_folder: weights of LPIPS.
+    lpips_folder: folder of the LPIPS weights.
     network: the scenario's edge.lpips.
     distance: lpips, perceptual (its stand-in) or none.
     """
@@ -167,7 +173,7 @@ def reward_of(
 
 def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
     """The layout of a network's input: ``parts`` of the state, with the embedding of the setting's scenario.
-    ValueError where no embedder is available."""
+    Raises ValueError if no embedder is available."""
     if "semantics" not in parts:
         return StateLayout(parts)
     from edge_server.embed import EmbeddingConfig

@@ -3,9 +3,9 @@
 Several actions are tried at every decision. The baseline of a try is the mean reward of the other tries of
 its decision (``subtract_sibling_baseline``), which reduces the variance of the policy gradient.
 
-The seed decides everything: episodes by their numbers, actions by the learner's own stream, rewards by the
-field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from its
-last checkpoint, on the same kind of processor.
+The seed determines everything: episodes by their numbers, actions by the learner's random stream, rewards by
+the field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from
+its last checkpoint, on the same kind of processor.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 _PROGRESS_EVERY_S = 5.0
-# What train-scheduler writes of a finished training beside it.
+# Files that train-scheduler writes after a training.
 REPORTS = ("summary.json", "evaluation.csv")
 
 
@@ -49,16 +49,17 @@ class TrainingError(ValueError):
 class TrainingConfig:
     """How a learner is trained.
 
-    spec: the learner.
-    reward: of an outcome.
-    episodes: number of episodes in all.
-    batch: episodes of one update of the weights.
+    spec: specification of the learner.
+    reward: the reward of an outcome.
+    episodes: total number of episodes.
+    batch: number of episodes of one update of the weights.
     tries: actions that are evaluated at every decision. With more than one, the baseline of each is the mean
         reward of the others: an estimate of V(s) (5.24) for this scene and channel, which a function of the
         state cannot know.
-    seed: of the episodes and of the learner.
+    seed: seed of the episodes and of the learner.
     checkpoint_every: number of batches between checkpoints.
-    stages: numbers of batches after which the policy is kept, too (``stage_file``).
+    stages: numbers of batches after which the policy is also saved (``stage_file``).
+    Raises TrainingError for values out of range.
     """
 
     spec: Spec
@@ -91,15 +92,15 @@ def train(
 ) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
-    Writes OUT/training.jsonl (a line a batch), OUT/training.json, the ``stage_file`` of each stage and, at
-    the end, OUT/policy.npz. KeyboardInterrupt leaves the last checkpoint there.
+    Writes OUT/training.jsonl (a line per batch), OUT/training.json, the ``stage_file`` of each stage and, at
+    the end, OUT/policy.npz. After KeyboardInterrupt the last checkpoint is there.
 
-    setting: where decisions come from.
+    setting: the setting that decisions are drawn from.
     pool: draws and evaluates them.
     say: called with lines of progress.
 
-    Returns the trained learner. Raises TrainingError where ``out`` holds a training with other settings, or
-    where the first batch has no reward.
+    Returns the trained learner. Raises TrainingError if ``out`` holds a training with other settings, or if
+    the first batch has no reward.
     """
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = _Checkpoint(out, _settings_key(setting, config))
@@ -129,12 +130,12 @@ def train(
 
 
 def stage_file(out: Path, batches: int) -> Path:
-    """File in which a training in ``out`` keeps its policy after so many batches."""
+    """File of the policy after that many batches of a training in ``out``."""
     return out / f"after-{batches:05d}.npz"
 
 
 def read_log(out: Path) -> list[Row]:
-    """The log of a training so far, one row a batch."""
+    """The log of a training so far, one row per batch."""
     return [json.loads(line) for line in (out / "training.jsonl").read_text().splitlines()]
 
 
@@ -146,14 +147,14 @@ def _train_batch(
     number: int,
     say: Callable[[str], None],
 ) -> Row:
-    """One update of the weights; returns its row of the log. TrainingError where the first batch has no
-    reward."""
+    """Do one update of the weights; returns its row of the log. Raises TrainingError if the first batch has
+    no reward."""
     episode_seeds = config.seeds(number)
     if config.spec.hold_ms:
         return _train_deployed_batch(setting, config, pool, learner, number)
     moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
     pool.forget(setting, episode_seeds)
-    # The tries of one decision stand together.
+    # The tries of one decision are adjacent.
     each = [m for m in moments for _ in range(config.tries)]
     states = [m.state for m in each]
     actions, logps = learner.act(states)
@@ -181,7 +182,7 @@ def _row(
     outcomes: Sequence[Outcome],
     actions: Iterable[Any],
 ) -> Row:
-    """What a batch's row of the log says of its decisions."""
+    """The part of a batch's row of the log that describes its decisions."""
     first = config.seeds(0)[0]
     row: Row = {
         "batch": (episode_seeds[0] - first) // config.batch, "episodes": episode_seeds[-1] + 1 - first,
@@ -198,8 +199,8 @@ def _row(
 def _train_deployed_batch(
     setting: Setting, config: TrainingConfig, pool: WorkerPool, learner: Learner, number: int
 ) -> Row:
-    """``_train_batch`` where the learner decides in the running deployment (``deployed``). A later batch
-    without a decision or a reward changes no weights."""
+    """``_train_batch`` for a learner that decides in the running deployment (``deployed``). After the first,
+    a batch without a decision or a reward changes no weights."""
     episode_seeds = config.seeds(number)
     each: list[Decided] = []
     advantages: list[NDArray[np.float64]] = []
@@ -256,12 +257,12 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
 
 def subtract_sibling_baseline(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
     """Subtract from each reward the mean reward of its siblings, the other tries of the same decision
-    (leave-one-out baseline): it reduces the variance of the gradient without a bias.
+    (leave-one-out baseline), which reduces the variance of the gradient without a bias.
 
-    rewards: (B,), the tries of one decision next to each other; NaN where there is none.
+    rewards: (B,), the tries of one decision next to each other; NaN for a missing reward.
     tries: number of tries of a decision; with one there are no siblings and the rewards are returned.
 
-    Returns (B,); NaN where the reward or those of all siblings are NaN.
+    Returns (B,); NaN if the reward or those of all siblings are NaN.
     """
     if tries == 1:
         return rewards
@@ -291,14 +292,15 @@ def _new_learner(setting: Setting, config: TrainingConfig, pool: WorkerPool) -> 
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    """Checkpoint of a training: first the weights under a new name, then the file that names them, so it is
-    complete whenever the process is stopped."""
+    """Checkpoint of a training. The weights are written first, under a new name, then the file that names
+    them, so the checkpoint is complete whenever the process is stopped."""
 
     out: Path
     key: str
 
     def load(self) -> tuple[Learner | None, list[Row]]:
-        """The learner and the rows of its log; (None, []) if there is no training here."""
+        """The learner and the rows of its log; (None, []) if there is no training here. Raises
+        TrainingError."""
         from edge_server.scheduler.learned.ppo import Learner
 
         path = self.out / "training.json"
@@ -334,7 +336,7 @@ class _Checkpoint:
 
 def _settings_key(setting: Setting, config: TrainingConfig) -> str:
     settings = dataclasses.asdict(config)
-    settings.pop("checkpoint_every")  # decides when the disk is written, not what is learned
+    settings.pop("checkpoint_every")  # does not affect what is learned
     return content_key(json.dumps([setting.key, settings], sort_keys=True, default=str), 24)
 
 

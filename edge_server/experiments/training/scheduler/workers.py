@@ -2,7 +2,7 @@
 of processes or on their order.
 
 An episode belongs to one process, which keeps its images and its warm field, so all actions of its decisions
-are evaluated there. A known evaluation is not repeated; with a file, not even by the next run.
+are evaluated there. A known evaluation is not repeated; with a file, not even in a later run.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Request = tuple[int, int, Choice]
 Progress = Callable[[int, int], None]
 _Task = tuple[list[str], list[Request]]
 
-# Evaluations of one task: few, so that Ctrl-C loses little and progress is reported.
+# Number of evaluations of one task: few, so that Ctrl-C loses little and progress is reported.
 _REQUESTS_A_TASK = 8
-# Settings whose images a process keeps.
+# Number of settings whose images a process keeps.
 _FACTORIES_KEPT = 3
 _FACTORIES: dict[tuple[str, Folders], EpisodeFactory] = {}
 
@@ -62,7 +62,7 @@ def _evaluate(setting: Setting, folders: Folders, requests: Sequence[Request]) -
 
 
 def _each(work: Callable[..., Any], setting: Setting, folders: Folders, asked: Sequence[Any]) -> list[Any]:
-    """``work`` of the setting's factory and the further arguments of each that is asked for."""
+    """Call ``work`` with the setting's factory and each tuple of further arguments."""
     return [work(_factory(setting, folders), *one) for one in asked]
 
 
@@ -96,7 +96,7 @@ class WorkerPool:
                 cost_ms = float(found["cost_ms"])
                 outcome = Outcome(**{name: v for name, v in found.items() if name != "cost_ms"})
             except (ValueError, KeyError, TypeError):
-                continue  # of another version
+                continue  # written by another version
             self._known[key] = outcome, cost_ms
 
     def __enter__(self) -> WorkerPool:
@@ -157,8 +157,9 @@ class WorkerPool:
         return [self._known[key][0] for key in keys]
 
     def cost_s(self, setting: Setting, requests: Sequence[Request]) -> float:
-        """Processor time of evaluated requests: episodes, warm fields, fits and scores. Each counts once,
-        with the time that it took when it was carried out. KeyError for an unknown one."""
+        """Seconds of processor time of evaluated requests: episodes, warm fields, fits and scores. Each
+        counts once, with the time that it took when it was carried out. Raises KeyError for an unknown
+        one."""
         return math.fsum(self._known[key][1] for key in {self._key(setting, r) for r in requests}) / 1e3
 
     def play(
@@ -174,7 +175,7 @@ class WorkerPool:
         sent: Iterable[Future[list[Any]]] = (
             self._send(s, partial(_each, judge), setting, [(s, who)]) for s in seeds
         )
-        # In this process one is done when it is sent: each is given as soon as it is.
+        # With one job, sending computes the result, so send one only when it is asked for.
         for one in sent if self.jobs == 1 else list(sent):
             yield one.result()[0]
 
@@ -197,7 +198,7 @@ class WorkerPool:
             done.set_result(work(setting, self.folders, what))
             return done
         if not self._pools:
-            # Fresh processes: forking one that has threads of kernels in it would hang.
+            # Spawned processes: a fork of a process that has kernel threads would hang.
             self._pools = [ProcessPoolExecutor(1, WorkerContext(), _init_process) for _ in range(self.jobs)]
         return self._pools[seed % self.jobs].submit(work, setting, self.folders, what)
 
