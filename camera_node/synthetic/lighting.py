@@ -17,7 +17,7 @@ from camera_node.synthetic.placement import MovingBody, PlacedParts
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array
 
-# Contact shadows end at this distance (metres) from the body's middle, and take away at most this share.
+# Contact shadows end at this distance (meters) from the body's middle, and take away at most this share.
 _REACH_M, _MOST_DARKENING = 0.8, 0.75
 
 

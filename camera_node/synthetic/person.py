@@ -33,7 +33,7 @@ COURSES = ("loop", "stops", "reverses", "jumps")
 class Walk:
     """An elliptic walk.
 
-    center: on the floor, metres. radii: of the ellipse, metres, multiplied by ``scale``.
+    center: on the floor, meters. radii: of the ellipse, meters, multiplied by ``scale``.
     period_s: time for one loop.
     still: the person stands still.
     direction: 1.0 is counterclockwise from above, -1.0 clockwise.
@@ -253,7 +253,7 @@ def make_walk(
     """The walk on which the person's parts move at ``speed_m_per_s`` on average; 0 stands still. The period
     is rounded to a multiple of PERIOD_UNIT_S, and the ellipse scaled to keep the speed.
 
-    center, radii: of the ellipse, metres.
+    center, radii: of the ellipse, meters.
     seed: draws a variation of the path, its direction, its start and the speed; None: no variation.
     """
     if speed_m_per_s == 0.0:

@@ -47,7 +47,7 @@ class MovingBody:
     """Parts that move together.
 
     matrices: returns their world-from-local matrices (M, 4, 4), which may scale, at an instant t_s.
-    contact: (index, radius in metres) of the parts that darken the floor beneath them.
+    contact: (index, radius in meters) of the parts that darken the floor beneath them.
     """
 
     parts: tuple[Part, ...]

@@ -75,7 +75,7 @@ class Scene:
 
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out.
     target: (3,), the point that cameras look at, or away from.
-    bounds: (2, 3), lower and upper corner in metres of everything that can be seen, except an occluder.
+    bounds: (2, 3), lower and upper corner in meters of everything that can be seen, except an occluder.
     period_s: time after which frames repeat, a multiple of 0.6 s.
     moving: False if all instants look the same.
     object_parts: number of static parts, from the first, that form the object of interest; None: all.

@@ -17,7 +17,7 @@ import numpy as np
 
 from freshfield.geometry import Array
 
-# Least distance (metres) of a hit, so that a ray does not hit the surface on which it starts.
+# Least distance (meters) of a hit, so that a ray does not hit the surface on which it starts.
 T_MIN = 1e-6
 # Replaces zero in a denominator; its reciprocal is finite, so 0 * inf cannot make a NaN.
 _TINY = 1e-30
@@ -181,7 +181,7 @@ class Cylinder:
 @dataclass(frozen=True)
 class RoundCone:
     """The convex hull of a ball of radius r0 at the origin and one of radius r1 at (0, 0, length); a capsule
-    if the radii are equal. Surface coordinates: turns about z and metres along it. Raises ValueError unless
+    if the radii are equal. Surface coordinates: turns about z and meters along it. Raises ValueError unless
     length > |r0 - r1|, because otherwise one ball contains the other.
 
     The cone between the two tangent circles is quadratic in t; ``_d2`` and ``_along`` place a point

@@ -1,7 +1,7 @@
 """Procedural textures: colors (3, N) in [0, 1] as functions of surface coordinates (2, N).
 
 All have soft edges or are sums of a few sinusoids, so that images of a hundred pixels a side alias little;
-``supersample`` reduces it further. Widths are in the surface's units (metres, or turns around a round shape).
+``supersample`` reduces it further. Widths are in the surface's units (meters, or turns around a round shape).
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ hour, which must not make a frame from the future the newest one until that time
 # --- poses and lenses -------------------------------------------------------------------------
 
 MAX_TRANSLATION_M = 1e6
-"""Distance from the origin along each axis: more is a wrong unit (a kilometre in millimetres) or garbage."""
+"""Distance from the origin along each axis: more is a wrong unit (a kilometer in millimeters) or garbage."""
 
 MAX_QUATERNION_ERROR = 1e-3
 """Error of a quaternion's length, or of a rotation's orthonormality. Real calibrations are better."""

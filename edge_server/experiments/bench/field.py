@@ -231,7 +231,7 @@ def _render_ms(field: Field, pose: Any, lens: Pinhole) -> float:
 def draw(figures: dict[str, Any], path: Path) -> None:
     """Draw PSNR against seconds from scratch to ``path`` (PNG), a panel per scene, a line per
     representation."""
-    from edge_server.report.style import CYCLE, GREY, figure, label_lines
+    from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
     scenes = [name for name, part in figures.items() if isinstance(part, dict) and "scene" in part]
     if not scenes:

@@ -265,7 +265,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
     """Draw the lines of all runs and the markers of the fresh fits. of_scene: as ``_runs``, without the
     scene."""
-    from edge_server.report.style import CYCLE, GREY
+    from edge_server.report.style import CYCLE, GRAY
 
     names = list(dict.fromkeys(name for name, *_ in of_scene))
     runs = list(dict.fromkeys(run for _, run, *_ in of_scene))

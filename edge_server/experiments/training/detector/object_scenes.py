@@ -156,7 +156,7 @@ def _light(rng: np.random.Generator, light: Light) -> Light:
 
 
 def _color(rng: np.random.Generator) -> tx.Color:
-    """A random color, or nearly grey."""
+    """A random color, or nearly gray."""
     r, g, b = (
         rng.uniform(0.05, 0.98, 3)
         if rng.random() < 0.5
