@@ -12,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import QueueServer
@@ -84,6 +84,9 @@ class Event:
 class Fault:
     """Base class of the faults; as it stands, it changes nothing."""
 
+    by_size: ClassVar[bool] = False
+    """Whether the fault depends on the size of a frame."""
+
     def extra_ns(self, transit: Transit) -> int:
         """Nanoseconds to add to the frame's delay; asked when transmission starts."""
         return 0
@@ -154,6 +157,11 @@ class Link:
         self.own_event_ns = self._next_reset_ns
         """Like ``next_event_ns``, without events that already happened."""
         self.server.add(self)
+
+    @property
+    def by_size(self) -> bool:
+        """Whether a fault depends on the size of a frame."""
+        return any(fault.by_size for fault in self._faults)
 
     @property
     def in_flight(self) -> int:

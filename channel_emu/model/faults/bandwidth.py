@@ -18,6 +18,8 @@ class Params:
 
 
 class Effect(Fault):
+    by_size = True
+
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.ns_per_byte = 8e3 / params.megabits_per_s
 

@@ -25,6 +25,8 @@ class Effect(Fault):
     """A frame is delivered with the last packet that it needs. Unused bytes of an opportunity are lost, and a
     preempted frame does not give its opportunities back."""
 
+    by_size = True
+
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.times_ns = [at * 10**6 for at in params.opportunities_ms]
         self._next = 0

@@ -182,8 +182,6 @@ class VirtualDeployment:
             raise ValueError("the cameras and the buffer's are not the same, or in another order")
         self._channel = Channel(channel, seed)
         self._links: dict[str, Link] = {name: self._channel.link(name) for name in self._cameras}
-        # Only a fault that limits bandwidth asks how large a frame is.
-        self._weigh = "bandwidth" in channel.faults
         self._admission = FrameAdmission(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
@@ -325,8 +323,9 @@ class VirtualDeployment:
 
     def _send(self, frame: Frame, now_ns: int) -> None:
         """Offer a frame to its link."""
-        size = len(self._with_image(frame).payload) if self._weigh else 0
-        self._take(self._links[frame.camera].offer(now_ns - self._channel_origin_ns, frame, size)[1])
+        link = self._links[frame.camera]
+        size = len(self._with_image(frame).payload) if link.by_size else 0
+        self._take(link.offer(now_ns - self._channel_origin_ns, frame, size)[1])
 
     def _advance_links(self, now_ns: int) -> None:
         for link in self._links.values():
