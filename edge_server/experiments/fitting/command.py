@@ -26,7 +26,7 @@ from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
-from edge_server.fields.registry import field_names, option_help
+from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
@@ -87,10 +87,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if args.list_options:
         try:
-            known = option_help(args.field)
+            known, defaults = option_help(args.field), settings_of(args.field)
         except ValueError as error:
             parser.error(str(error))
-        print("\n".join(f"{name:18} {text}" for name, text in known.items()))
+        print(f"{'effort':18} preset of the options below: {', '.join(efforts_of(args.field))} [medium]")
+        print("\n".join(f"{name:18} {text} [{getattr(defaults, name)}]" for name, text in known.items()))
         return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
