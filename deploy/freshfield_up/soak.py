@@ -280,11 +280,15 @@ def soak(
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--minutes", type=float, help="how long, with kills in the first minutes only")
+    what.add_argument("--minutes", type=float, help="duration; kills in the first minutes only")
     what.add_argument("--kills", type=int, metavar="N", help="kill each process N times instead")
-    parser.add_argument("--every", type=float, default=60.0, metavar="S", help="between faults [%(default)s]")
-    parser.add_argument("--scenario", default="ideal", help="a file or a shipped one [%(default)s]")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
+    parser.add_argument(
+        "--every", type=float, default=60.0, metavar="S", help="seconds between faults [%(default)s]"
+    )
+    parser.add_argument(
+        "--scenario", default="ideal", help="scenario file, or the name of a shipped one [%(default)s]"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result to FILE")
     args = parser.parse_args()
     if args.kills:
         planned = KILLS * args.kills
