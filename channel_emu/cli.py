@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu.model import ages, spelling
+from channel_emu.model import ages, faults, spelling
 from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
@@ -201,8 +201,9 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--service-by-state", metavar="SPEC,SPEC", help="--service for each state: exp:30ms,exp:60ms"
     )
-    sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help="loss:0.1, loss:[0.01, 0.5] by "
-                     "state, reset:{at_ms: [50]}; may be repeated")  # fmt: skip
+    sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help=f"{', '.join(faults.NAMES)}; "
+                     "e.g. loss:0.1, loss:[0.01, 0.5] by state, reset:{at_ms: [50]}; "
+                     "may be repeated")  # fmt: skip
     sub.add_argument("--chain", metavar="SPEC", help="Markov chain of states: mu1=1/30,mu2=1/30 (rates per "
                      "ms), states=low/high, scope=per-camera, initial=low, slots=1ms, or "
                      "{generator_per_ms: [[..]]}")  # fmt: skip
