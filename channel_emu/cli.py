@@ -217,7 +217,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
         choices=DISCIPLINES,
         help="what a busy link does with a new frame [the preset's, else drop-new]",
     )
-    sub.add_argument("--shared-server", action="store_true", help="one queue for all cameras [one for each]")
+    sub.add_argument("--shared-server", action="store_true", help="one server for all cameras [one for each]")
 
 
 def _simulate(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Real processes under faults, for minutes: does each fault end within two seconds, does memory stay flat?
+"""Runs real processes under faults: each must recover within two seconds, and memory must stay flat.
 
     python -m freshfield_up.soak --minutes 30 --json docs/results/soak.json
     python -m freshfield_up.soak --kills 34 --every 8 --json docs/results/kills.json

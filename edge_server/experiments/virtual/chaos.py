@@ -51,9 +51,9 @@ checkpoints.
 
 After each run: every frame is accounted for as it really ended (ledgers against what happened), queues and
 memory are within their bounds, no number is NaN, every camera and the field are up to date again within 2 s
-of the last fault, and a second run has the same digest. The queue discipline of a
-shared line may starve cameras: of these one must be up to date. For a seed that fails, a minimal set of its
-faults is found, and the command that repeats the failure is printed.
+of the last fault, and a second run has the same digest. The queue discipline of a shared line may starve
+cameras: of these one must be up to date. For a seed that fails, a minimal set of its faults is found, and the
+command that repeats the failure is printed.
 """
 _SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0,
                         epoch_ms=100.0, score_every_ms=None)  # fmt: skip
