@@ -22,16 +22,18 @@ if TYPE_CHECKING:
 
 EXAMPLES = """examples:
   camera-node run room --all --to 127.0.0.1:7001             every camera of the shipped scenario "room"
-  camera-node run room.yaml --camera cam03 --to emu:7001     one camera, as on a machine of its own
-  camera-node run fox --all --to :7001 --data ~/data         recorded data: where the data sets lie
-  camera-node prepare room --all                             render ahead, for a quick start later
-  camera-node calibrate hand-eye --help                      where a camera sits on an arm, and its lens
-  camera-node sources                                        what a scenario's source section can say
-  camera-node effects                                        what it can list under effects
-  camera-node simulate-arm cell                              an arm for the scenario "cell" on this machine
-  camera-node drive-arm cell                                 take its camera round the target
-  camera-node teleop cell --stylus keyboard                  or gamepad, network:PORT: an operator moves it
-  camera-node doctor cell                                    what is missing here, and what to do about it
+  camera-node run room.yaml --camera cam03 --to emu:7001     one camera, e.g. on its own machine
+  camera-node run fox --all --to :7001 --data ~/data         recorded data, from the folder --data
+  camera-node prepare room --all                             render ahead, so that run starts quickly
+  camera-node calibrate hand-eye --help                      pose of a camera on an arm
+  camera-node sources                                        keys of a scenario's source section
+  camera-node effects                                        effects that a source section can list
+  camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
+  camera-node drive-arm cell                                 move its camera around the target
+  camera-node teleop cell --stylus keyboard                  an operator moves it; or gamepad, network:PORT
+  camera-node doctor cell                                    what is missing on this machine
+
+In the help of a command, [x] after an option is its default.
 
 exit codes: 0 stopped as asked, 1 failed while running, 2 wrong scenario, option or data
 """
@@ -53,22 +55,20 @@ def main(arguments: list[str] | None = None) -> int:
     _add_run(commands.add_parser("run", help="stream cameras of a scenario", epilog=EXAMPLES,
                                  formatter_class=argparse.RawDescriptionHelpFormatter))  # fmt: skip
     prepare = commands.add_parser(
-        "prepare", help="render a scenario's frames ahead and keep them, as run does when it starts"
+        "prepare", help="render and cache a scenario's frames, which run otherwise does when it starts"
     )
     _add_cameras(prepare)
-    prepare.add_argument("-q", "--quiet", action="store_true", help="only warnings")
+    prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     prepare.set_defaults(run=_prepare)
-    calibrate.add_arguments(
-        commands.add_parser("calibrate", help="hand-eye, intrinsics, and what they are worth")
-    )
-    sources = commands.add_parser("sources", help="list kinds of sources and the keys they take")
+    calibrate.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
+    sources = commands.add_parser("sources", help="list the kinds of sources and their keys")
     effects = commands.add_parser("effects", help="list effects and their parameters")
     for each in (sources, effects):
         each.set_defaults(run=_print_list)
     arm_cli.add_commands(commands)
     _add_doctor(commands.add_parser(
-        "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
-        description="Tests, one after the other, the packages, cameras, arm, clock, network, disk and files "
+        "doctor", help="check this machine's part of a setup: what is wrong, and how to fix it",
+        description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
         "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
     ))  # fmt: skip
     args = parser.parse_args(arguments)
@@ -82,40 +82,59 @@ def main(arguments: list[str] | None = None) -> int:
 def _add_cameras(command: argparse.ArgumentParser) -> None:
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     who = command.add_mutually_exclusive_group(required=True)
-    who.add_argument("--camera", metavar="ID[,ID]", help="the scenario's cameras this process hosts")
-    who.add_argument("--all", action="store_true", help="host all of them")
-    command.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
-    command.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's")
+    who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
+    who.add_argument("--all", action="store_true", help="all cameras of the scenario")
+    command.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]"
+    )
+    command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
 
 
 def _add_run(run: argparse.ArgumentParser) -> None:
     run.set_defaults(run=_run)
     _add_cameras(run)
-    run.add_argument("--to", required=True, metavar="HOST:PORT", help="channel emulator or edge server")
-    run.add_argument("--out", type=out_folder, metavar="DIR", help="for the ledger and the status file")
-    run.add_argument("--seconds", type=float, metavar="S", help="stop after S seconds of capture")
+    run.add_argument(
+        "--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server"
+    )
+    run.add_argument(
+        "--out",
+        type=out_folder,
+        metavar="DIR",
+        help="folder to write the ledger and status file to [not written]",
+    )
+    run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
     run.add_argument(
         "--cache-mb", type=float, default=DEFAULT_CACHE_MB, metavar="MB",
-        help="bound on compressed frames kept for the next round (default %(default)s, 0 keeps none)",
+        help="memory for compressed frames kept for the next loop; 0: none [%(default)g]",
     )  # fmt: skip
     run.add_argument(
         "--response-timeout", type=float, default=5.0, metavar="S",
-        help="reconnect when a frame is not answered for so long, or for much longer than those before "
-        "(default %(default)s)",
+        help="reconnect if a frame is not answered within S seconds, or much later than earlier ones "
+        "[%(default)g]",
     )  # fmt: skip
-    run.add_argument("-q", "--quiet", action="store_true", help="only warnings")
+    run.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     transport.add_arguments(run, listens=False)
 
 
 def _add_doctor(doctor: argparse.ArgumentParser) -> None:
     doctor.set_defaults(run=_doctor)
-    doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
-    doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
-    doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
     doctor.add_argument(
-        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
+        "scenario",
+        nargs="?",
+        help="scenario file, or the name of a shipped one [check what every scenario needs]",
     )
-    doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
+    doctor.add_argument("--to", metavar="HOST:PORT", help="address of the channel emulator or edge server")
+    doctor.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]"
+    )
+    doctor.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs"),
+        metavar="DIR",
+        help="folder that runs will be written to [%(default)s]",
+    )
+    doctor.add_argument("--json", action="store_true", help="print the result as one JSON object")
     transport.add_arguments(doctor, listens=False)
 
 

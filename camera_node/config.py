@@ -37,9 +37,9 @@ MAX_LATENCY_MS = 6e4
 class SourceConfig(Bounded):
     """Keys of every kind.
 
-    fps: captures a second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
-    or zstd. quality: of jpeg, 1 to 100; color is not subsampled from 90 up. effects: name -> parameters,
-    or null; what is not listed is not imported.
+    fps: captures per second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
+    or zstd. quality: JPEG quality, 1 to 100; from 90 up, color is not subsampled. effects: name ->
+    parameters, or null (see ``camera-node effects``).
     """
 
     kind: str
@@ -53,11 +53,11 @@ class SourceConfig(Bounded):
 class PathConfig(Bounded):
     """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
 
-    target_m: in the world. radius_m: camera to target. elevations_deg: of the rings. azimuths_deg:
-    first and last of each ring (0 is on the target's -y side, 90 on its +x side). step_deg: between
-    viewpoints of a ring. rolls_deg: turns about its line of sight that the camera may take at a viewpoint,
-    whichever the arm can get to. speed_rad_s, acceleration_rad_s2: of the fastest joint. floor_m: the middle
-    of no joint beyond the shoulder comes lower, in the world's z.
+    target_m: target in the world. radius_m: distance from camera to target. elevations_deg: elevations of
+    the rings. azimuths_deg: first and last azimuth of each ring (0 is on the target's -y side, 90 on its +x
+    side). step_deg: between viewpoints of a ring. rolls_deg: allowed rotations of the camera about its
+    optical axis; at each viewpoint, one that the arm reaches is used. speed_rad_s, acceleration_rad_s2:
+    limits of the fastest joint. floor_m: minimum height (world z) of the joint centers beyond the shoulder.
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -75,12 +75,12 @@ class PathConfig(Bounded):
 class ArmConfig(Bounded):
     """An arm whose joint states give cameras their poses (extra ``ur``).
 
-    host: the controller's address. robot: ur3e. cameras: camera -> its hand-eye calibration, a file of
-    ``camera-node calibrate hand-eye``, relative to the scenario, or null as long as there is none (its poses
-    are then the hand's own, as that command needs them). calibration: the robot's own
-    ``calibration.conf``, likewise. base_m, base_yaw_deg: where its base stands in the world. frequency_hz:
-    joint states a second, 10 to 500. pairing: nearest or interpolated. max_gap_ms: a frame farther than this
-    from a joint state is not sent. path: the tour of ``camera-node drive-arm``. simulated: deploy/up.py
+    host: the controller's address. robot: ur3e. cameras: camera -> its hand-eye calibration, a file written
+    by ``camera-node calibrate hand-eye``, relative to the scenario, or null before calibration (its poses are
+    then those of the hand, as that command needs them). calibration: the robot's own ``calibration.conf``,
+    relative to the scenario. base_m, base_yaw_deg: pose of the arm's base in the world. frequency_hz:
+    joint states per second, 10 to 500. pairing: nearest or interpolated. max_gap_ms: a frame farther than
+    this from a joint state is not sent. path: the tour of ``camera-node drive-arm``. simulated: deploy/up.py
     starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and up) and drives
     it. teleop: keys of ``camera_node.robot.teleop.settings.TeleopConfig``, for ``camera-node teleop``.
     """
@@ -111,10 +111,10 @@ class ArmConfig(Bounded):
 
 @dataclass(frozen=True)
 class WorldConfig(SourceConfig):
-    """A synthetic world. scene: ``room``, ``tile`` or ``tower``; size and lens of its cameras; how fast it
-    moves. motion_seed: another motion of the same scene, drawn from it (path, sense, start, speed); not
-    given, the scene's own. params: further parameters of the scene by name. arm: carries those of the cameras
-    that it lists; what they see is rendered from where a simulated arm really is."""
+    """A synthetic world. scene: ``room``, ``tile`` or ``tower``; width, height, horizontal_fov_deg: of its
+    cameras; speed_m_per_s: of its motion. motion_seed: draws another motion of the same scene (path, sense,
+    start, speed); not given: the scene's own. params: further parameters of the scene by name. arm: an arm
+    that carries the cameras that it lists; their images are rendered from the simulated arm's true pose."""
 
     scene: str = "room"
     width: int | None = None
@@ -169,7 +169,7 @@ class RecordedConfig(SourceConfig):
 
 @dataclass(frozen=True)
 class TransformsConfig(RecordedConfig):
-    """nerfstudio, instant-ngp, NeRF-synthetic. background: what goes under RGBA images;
+    """nerfstudio, instant-ngp, NeRF-synthetic. background: color behind RGBA images;
     ``keep`` sends alpha and needs the codec png."""
 
     background: str = one_of("white", BACKGROUNDS)
@@ -186,12 +186,11 @@ class VideoConfig(RecordedConfig):
 
 @dataclass(frozen=True)
 class LiveConfig(SourceConfig):
-    """Keys of every kind with a camera behind it. devices: camera -> which one it is (its serial number; a
-    number, path or address for kind ``camera``); needed where there is more than one. width, height: pixels
-    asked for. exposure_us: fixed; not given, the camera chooses. calibration: JSON of intrinsics and poses by
-    camera (as ``camera-node sources`` says for videos), relative to the scenario; without it intrinsics are
-    the device's own, where it has any, and poses come from ``arm``. first_frame_s: how long a camera may take
-    until its first frame."""
+    """Keys of all kinds with real cameras. devices: camera -> its device (serial number; a number, path or
+    address for kind ``camera``); needed if there is more than one. width, height: requested pixels.
+    exposure_us: fixed exposure; not given: automatic. calibration: JSON of intrinsics and poses by camera, as
+    for videos, relative to the scenario; without it intrinsics are the device's own, if it has any, and poses
+    come from ``arm``. first_frame_s: seconds that a camera may take until its first frame."""
 
     devices: dict[str, str] = field(default_factory=dict)
     width: int = bounded(640, 8, MAX_IMAGE_SIDE_PX)
@@ -206,7 +205,7 @@ class LiveConfig(SourceConfig):
 class CameraConfig(LiveConfig):
     """Any camera or stream that OpenCV opens: a USB camera by number or path (/dev/v4l/by-id/...), a network
     camera by address (rtsp://...). It knows no intrinsics: ``calibration`` gives them. latency_ms: from
-    exposure to the host, for drivers that stamp nothing themselves; subtracted from the time of arrival."""
+    exposure to arrival at the host, for drivers without time stamps; subtracted from the time of arrival."""
 
     latency_ms: float = bounded(0.0, 0, MAX_LATENCY_MS)
 

@@ -11,7 +11,7 @@ from camera_node.config import MODELS, ArmConfig, PathConfig, SourceConfig
 
 def sources() -> str:
     """Every kind of source with its keys and their defaults."""
-    lines = ["keys of every kind", "", _doc(SourceConfig), "", *_keys(SourceConfig)]
+    lines = [_doc(SourceConfig), "", *_keys(SourceConfig)]
     common = [f.name for f in dataclasses.fields(SourceConfig)]
     for kind, model in MODELS.items():
         lines += ["", f"source: {{kind: {kind}, ...}}", ""]
@@ -28,7 +28,9 @@ def effects() -> str:
     """Every effect with its parameters and their defaults."""
     from camera_node.synthetic.effects import NAMES, effect_class
 
-    lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are spared unless in_truth: true"]
+    lines = [
+        "source: {effects: {NAME: {parameters}}}; held-out cameras are not affected unless in_truth: true"
+    ]
     for name in NAMES:
         effect = effect_class(name)
         lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", *_keys(effect)]

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from edge_server.live.state import EdgeState
 
 DESCRIPTION = """\
-The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
+The edge server of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
+In the help of a command, [x] after an option is its default.
 
   edge-server run room --listen 127.0.0.1:7000 --page-port 8080 --out runs/room
   edge-server run room --out runs/room --record runs/room/session.mcap
@@ -75,40 +76,40 @@ _COMMANDS = {
     ),
     "frontier": (
         "experiments.frontier.command",
-        "what accuracy costs in time: sweep effort, plot fidelity against seconds",
+        "sweep the effort of fits and updates, plot fidelity against seconds",
     ),
     "train-scheduler": (
         "experiments.training.scheduler.command",
-        "learn when and of which views to update, with real field fits as reward",
+        "learn when to update the field and from which views, rewarded by real field fits",
     ),
     "simulate": (
         "experiments.virtual.simulate",
-        "a scenario's whole deployment in virtual time, repeatable bit for bit",
+        "run a scenario's whole deployment in virtual time, reproducible bit for bit",
     ),
     "costs": (
         "experiments.virtual.costs",
-        "what an update of a scenario takes on this machine, for virtual time to charge",
+        "measure the time that a scenario's updates take on this machine, for virtual time",
     ),
     "chaos": (
         "experiments.virtual.chaos",
-        "small deployments in virtual time with faults from seeds, and what must hold after each",
+        "run small deployments in virtual time with random faults, and check invariants",
     ),
     "viewpoints": (
         "experiments.viewpoints.command",
         "choose where a camera goes next around an object, within a budget of views or meters",
     ),
-    "study": ("experiments.studies.command", "the thesis's figures as commands, each with a verdict"),
+    "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
     "bench": (
         "experiments.bench.command",
-        "measure this machine: field, track, limits, ingest and more (bench --help)",
+        "measure speed and quality on this machine: field, track, ingest and more",
     ),
     "explain": (
         "report.explain_command",
-        "what moved a decision of a run: part of the state, camera, region of an image",
+        "explain a policy's decision: shares of state parts, cameras, image regions",
     ),
     "export": (
         "export.command",
-        "a run's mesh, splats, points, cameras and poses as files for other programs",
+        "write a run's mesh, splats, points, cameras and poses as files for other programs",
     ),
     "train-detector": (
         "experiments.training.detector.command",
@@ -116,12 +117,12 @@ _COMMANDS = {
     ),
     "train-perceptual": (
         "experiments.training.detector.perceptual",
-        "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
+        "fit the substitute for LPIPS to real LPIPS on distorted renderings",
     ),
-    "keys": ("live.keys", "make a development authority, certificates and tokens for a scenario's processes"),
+    "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": (
         "fidelity.fetch_lpips",
-        "fetch LPIPS weights with the public package and convert them to our weights folder",
+        "fetch LPIPS weights with the public package and convert them for --lpips",
     ),
 }
 
@@ -134,39 +135,71 @@ def _compare_with_scene(*args: Any) -> Any:
 def _add_run(commands: argparse._SubParsersAction) -> None:
     run = commands.add_parser(
         "run",
-        help="serve a scenario",
-        description="Take frames on --listen, keep the field up to date, show it on the page.",
+        help="serve a scenario: receive its frames, update the field, show it",
+        description="Receive frames on --listen, keep the field up to date, show it on a web page.",
     )
     run.add_argument("scenario", help="scenario file, or the name of a shipped one")
     run.add_argument(
-        "--listen", default="127.0.0.1:7000", metavar="HOST:PORT", help="for frames [%(default)s]"
+        "--listen",
+        default="127.0.0.1:7000",
+        metavar="HOST:PORT",
+        help="address to receive frames on [%(default)s]",
     )
-    run.add_argument("--page-port", type=int, metavar="PORT", help="serve the live page on this port")
-    run.add_argument("--page-host", default="127.0.0.1", metavar="HOST", help="page's address [%(default)s]")
-    run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port")
-    run.add_argument("--out", type=out_folder, default="runs/edge", metavar="DIR", help="[%(default)s]")
-    run.add_argument("--emulator-out", type=Path, metavar="DIR",
-        help="the emulator's --out, whose channel state the page shows [that of this server]")  # fmt: skip
-    run.add_argument("--seed", type=int, help="instead of the scenario's")
     run.add_argument(
-        "--policy", metavar="NAME[:VALUE]", help="not the scenario's: threshold:120, bandit:FILE"
+        "--page-port", type=int, metavar="PORT", help="serve the live page on this port [no page]"
+    )
+    run.add_argument(
+        "--page-host",
+        default="127.0.0.1",
+        metavar="HOST",
+        help="address of the page and the metrics [%(default)s]",
+    )
+    run.add_argument(
+        "--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port [none]"
+    )
+    run.add_argument(
+        "--out", type=out_folder, default="runs/edge", metavar="DIR", help="folder to write [%(default)s]"
+    )
+    run.add_argument("--emulator-out", type=Path, metavar="DIR",
+        help="--out of channel-emu run: the page shows its channel state [this --out]")  # fmt: skip
+    run.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    run.add_argument(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
     run.add_argument(
         "--learn", nargs="?", const="", metavar="REWARD[:moving]",
-        help="bandit:FILE goes on learning, by this reward [edge.learn, else the one it was trained with]",
+        help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
+        "[edge.learn, else as trained]",
     )  # fmt: skip
     run.add_argument(
         "--fallback",
         metavar="NAME[:VALUE]",
-        help="beside what learns [edge.learn, else the best of its training]",
+        help="policy that takes over if the learning one does worse [edge.learn, else the best fixed one]",
     )
-    run.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
+    run.add_argument(
+        "--lpips",
+        type=Path,
+        metavar="DIR",
+        help="folder of LPIPS weights [$FRESHFIELD_LPIPS, else lpips/ in the data folder]",
+    )
+    run.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="folder of data sets; only its lpips/ is read [$FRESHFIELD_DATA]",
+    )
     run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
-    run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz this often")
-    run.add_argument("--record", type=out_file, metavar="FILE", help="write the session as MCAP, to look at "
-                     "or replay (source kind mcap)")  # fmt: skip
-    run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
+    run.add_argument(
+        "--checkpoint-every",
+        type=float,
+        metavar="S",
+        help="write OUT/field.npz every S seconds [only at the end]",
+    )
+    run.add_argument("--record", type=out_file, metavar="FILE", help="write the session as MCAP, to view or "
+                     "replay (source kind mcap)")  # fmt: skip
+    run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     transport.add_arguments(run)
     run.set_defaults(run=_run)
 
@@ -253,7 +286,7 @@ def _add_report(commands: argparse._SubParsersAction) -> None:
         help="join the ledgers of all processes and write report.json, report.html and figures",
         description="Write DIR/report.json, DIR/report.html and figures from what a run left in DIR.",
     )
-    report.add_argument("directory", type=Path, metavar="DIR")
+    report.add_argument("directory", type=Path, metavar="DIR", help="folder of a run or fit (its --out)")
     report.set_defaults(run=_report)
 
 

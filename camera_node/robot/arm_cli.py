@@ -25,18 +25,35 @@ def add_commands(commands: Any) -> None:
     )  # fmt: skip
     simulate.set_defaults(run=partial(_run, "simulated_controller.command"))
     add = simulate.add_argument
-    add("scenario", nargs="?", help="take address, robot and calibration from this scenario's source.arm")
+    add("scenario", nargs="?", help="scenario whose source.arm gives address, robot and calibration")
     add(
         "--host", metavar="ADDRESS",
-        help="address to serve at (default 127.0.0.2); the ports are fixed, so a second arm needs a second "
-        "address, such as 127.0.0.3",
+        help="address to serve at; the ports are fixed, so a second arm needs a second address, such as "
+        "127.0.0.3 [127.0.0.2]",
     )  # fmt: skip
-    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="which arm (default %(default)s)")
-    add("--calibration", type=Path, metavar="FILE", help="a robot's own calibration.conf")
-    add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees")
-    add("--drift-ppm", type=float, default=0.0, metavar="PPM", help="how much too fast its clock runs")
-    add("--noise-rad", type=float, default=0.0, metavar="RAD", help="noise of its encoders, one sigma")
-    add("--seed", type=int, default=0, metavar="N", help="of that noise")
+    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm [%(default)s]")
+    add(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="calibration.conf of a real robot [nominal kinematics]",
+    )
+    add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees [a home pose]")
+    add(
+        "--drift-ppm",
+        type=float,
+        default=0.0,
+        metavar="PPM",
+        help="frequency error of its clock, positive: fast [%(default)g]",
+    )
+    add(
+        "--noise-rad",
+        type=float,
+        default=0.0,
+        metavar="RAD",
+        help="standard deviation of encoder noise [%(default)g]",
+    )
+    add("--seed", type=int, default=0, metavar="N", help="random seed of the noise [%(default)s]")
 
     drive = commands.add_parser(
         "drive-arm", help="move the camera on an arm around its target",
@@ -46,10 +63,14 @@ def add_commands(commands: Any) -> None:
     drive.set_defaults(run=partial(_run, "arm.drive"))
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
-    add("--rounds", type=int, default=0, metavar="N", help="number of tours (default 0: without end)")
-    add("--show", action="store_true", help="print the tour from the arm's joint angles, and do not move")
-    add("--joints", metavar="DEG,...", help="with --show: from these angles instead, six in degrees")
-    add("--yes", action="store_true", help="the arm's space is clear: do not ask")
+    add("--rounds", type=int, default=0, metavar="N", help="number of tours; 0: until Ctrl-C [%(default)s]")
+    add(
+        "--show",
+        action="store_true",
+        help="print the tour from the arm's joint angles and exit without moving",
+    )
+    add("--joints", metavar="DEG,...", help="with --show: start from these six joint angles, in degrees")
+    add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
 
     _add_teleop(commands)
 
@@ -57,14 +78,14 @@ def add_commands(commands: Any) -> None:
 TELEOP = """\
 Moves the arm of a scenario as an operator moves a stylus, while its clutch is pressed: scaled, filtered, and
 at every tick within limits of workspace, joints, speed, acceleration and distance between the arm's parts.
-Without a message for watchdog_ms the arm comes to rest. Limits and scale are keys of the scenario's
+If no message arrives for watchdog_ms, the arm stops. Limits and scale are keys of the scenario's
 source.arm.teleop.
 
   camera-node simulate-arm cell &                                   an arm on this machine
   camera-node teleop cell --stylus keyboard                         keys are listed when it starts
   camera-node teleop cell --stylus gamepad                          hold the south button (A, cross) to move
-  camera-node teleop cell --stylus network:7010                     a driver sends what the stylus does
-  camera-node teleop cell --stylus network:7010 --dry-run path.csv  no arm: joints a tick, to a file
+  camera-node teleop cell --stylus network:7010                     a driver sends the stylus's poses
+  camera-node teleop cell --stylus network:7010 --dry-run path.csv  no arm: write joint angles to a file
 
 A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 per second:
 
@@ -86,12 +107,17 @@ def _add_teleop(commands: Any) -> None:
     add("scenario", help="a scenario with a source.arm")
     add(
         "--stylus", required=True, metavar="WHICH",
-        help="keyboard, gamepad[:/dev/input/eventN], network:[HOST:]PORT (HOST: 127.0.0.1)",
+        help="keyboard, gamepad[:/dev/input/eventN], network:[HOST:]PORT [HOST: 127.0.0.1]",
     )  # fmt: skip
-    add("--dry-run", type=Path, metavar="FILE", help="write the trajectory there (CSV) and move nothing")
-    add("--seconds", type=float, metavar="S", help="end after so long")
-    add("--yes", action="store_true", help="the arm's space is clear: do not ask")
-    add("--json", action="store_true", help="counts at the end as one JSON object")
+    add(
+        "--dry-run",
+        type=Path,
+        metavar="FILE",
+        help="write the trajectory to FILE (CSV) instead of moving an arm",
+    )
+    add("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
+    add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
+    add("--json", action="store_true", help="print the counts at the end as one JSON object")
 
 
 def log_to_stderr(level: int = logging.INFO) -> None:

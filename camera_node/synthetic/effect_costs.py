@@ -163,16 +163,22 @@ def _size(word: str) -> Size:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description="cost of scenes and effects, ms a frame (medians)")
+    parser = argparse.ArgumentParser(
+        description="measure the cost of scenes and effects, in ms per frame (medians)"
+    )
     parser.add_argument(
         "--size", type=_size, nargs="+", default=[(128, 128), (640, 480)], metavar="WxH",
-        help="of the images [128x128 640x480]",
+        help="image sizes [128x128 640x480]",
     )  # fmt: skip
-    parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames each median is over")
+    parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames per median [%(default)s]")
     parser.add_argument(
-        "--within", type=float, default=1.0, metavar="S", help="seconds a figure, for fewer frames where slow"
+        "--within",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="seconds per figure, with fewer frames if slow [%(default)g]",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also save the figures here")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to FILE as JSON")
     args = parser.parse_args(arguments)
     saved = []
     for size in args.size:

@@ -178,17 +178,17 @@ def _weight(text: str) -> float:
 METRICS = {
     "age": Metric("time average of the age", (), mean_age_ms),
     "peak": Metric("age just before a delivery", (), peak_age_ms),
-    "query": Metric("age at regular queries, query:100ms", (span_ms,), query_age_ms),
+    "query": Metric("age at periodic queries, query:100ms", (span_ms,), query_age_ms),
     "shown": Metric(
-        "age of what a screen shows, by time of computing and interval of refreshes, shown:20ms:16.7ms",
+        "age of what a screen shows, by computing time and refresh interval, shown:20ms:16.7ms",
         (span_ms, span_ms), shown_age_ms,
     ),
     "incorrect": Metric(
-        "age of incorrect information on a source of two states, left at these rates, incorrect:1/2s:1/2s",
+        "age of incorrect information about a two-state source, by transition rates, incorrect:1/2s:1/2s",
         (rate_per_ms, rate_per_ms), _incorrect, drawn=True,
     ),
     "urgency": Metric(
-        "age times a weight while it is urgent, which begins and ends at these rates, urgency:5:1/3s:1/1s",
+        "age, weighted while urgent, by weight and rates of onset and end, urgency:5:1/3s:1/1s",
         (_weight, rate_per_ms, rate_per_ms), _urgency, drawn=True,
     ),
 }  # fmt: skip

@@ -25,7 +25,7 @@ def _two_states(sojourn_ms: int) -> str:
 _CH6 = {"arrivals": "mmpp:1/120ms,1/30ms", "service": "exp:30ms,exp:60ms", "discipline": "newest-waits"}
 
 PRESETS = {
-    "ideal": Preset("nothing happens: every frame arrives as it is offered", {}),
+    "ideal": Preset("no delay, no loss: every frame arrives when it is offered", {}),
     "ch5": Preset(
         "thesis 5.5: a frame every 30 ms, one is sent at a time, the others are dropped (D/G/1/0)",
         {"arrivals": "periodic:30ms", "service": "exp:60ms", "discipline": "drop-new"},
@@ -35,20 +35,20 @@ PRESETS = {
         {**_CH6, "chain": _two_states(30)},
     ),
     "ch6-high": Preset(
-        "thesis 6.5.1: high traffic for good", {**_CH6, "arrivals": "poisson:1/60ms", "service": "exp:60ms"}
+        "thesis 6.5.1: high traffic only", {**_CH6, "arrivals": "poisson:1/60ms", "service": "exp:60ms"}
     ),
     "ch6-low": Preset(
-        "thesis 6.5.1: low traffic for good", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}
+        "thesis 6.5.1: low traffic only", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}
     ),
     "ch6-slow": Preset(
-        "as ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn",
+        "as ch6, but a state lasts 3 s: longer than a decision, so a policy can exploit it",
         {**_CH6, "chain": _two_states(3000)},
     ),
     # In both states of ch6 a buffer fills about equally fast (few frames with short delays, or many with
     # long ones), so the best wait is the same. Here only the delays differ, tenfold, and a state lasts 3 s:
     # the best wait depends on the state, which can be inferred from the frames' ages.
     "swing": Preset(
-        "delays of 15 and 150 ms alternate, 3 s a state: what is best depends on the state",
+        "delays of 15 and 150 ms alternate, 3 s per state: the best decision depends on the state",
         {**_CH6, "arrivals": "periodic:30ms", "service": "exp:15ms,exp:150ms", "chain": _two_states(3000)},
     ),
     "gilbert-elliott": Preset(
@@ -60,7 +60,7 @@ PRESETS = {
 
 FROM_FILES = {
     "mahimahi:FILE": "a Mahimahi trace: a line for each instant, in ms, at which 1500 bytes may leave",
-    "errant:FILE:OPERATOR/COUNTRY/RAT/QUALITY": "of ERRANT's profiles.csv: half the latency, and the upload",
+    "errant:FILE:OPERATOR/COUNTRY/RAT/QUALITY": "of ERRANT's profiles.csv: half its latency, its upload rate",
 }  # fmt: skip
 """Presets that are read from files of other tools."""
 

@@ -86,25 +86,51 @@ def _refuse(message: str) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="freshfield-up", description=__doc__.split("\n")[0])
     add = parser.add_argument
-    add("scenario", help="a scenario file, or the name of a shipped one (room, tile, ideal, ...)")
-    add("--for", dest="duration_s", type=seconds, default=60.0, metavar="TIME", help="default 60s; 0: no end")
-    add("--out", type=Path, default=Path("runs/demo"), help="folder of the run; replaces an earlier run")
-    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 (default 8080)")
-    add("--data", type=Path, help="folder of recorded data, for scenarios that stream it")
-    add("--seed", type=int, help="seed in place of the scenario's")
-    add("--policy", metavar="NAME[:VALUE]", help="in place of the scenario's: threshold:120, bandit:FILE")
+    add("scenario", help="scenario file, or the name of a shipped one (room, tile, ideal, ...)")
+    add(
+        "--for",
+        dest="duration_s",
+        type=seconds,
+        default=60.0,
+        metavar="TIME",
+        help="end after this long: 90s, 5m, 2h; 0: on Ctrl-C [60s]",
+    )
+    add(
+        "--out",
+        type=Path,
+        default=Path("runs/demo"),
+        metavar="DIR",
+        help="folder to write; replaces an earlier run in it [%(default)s]",
+    )
+    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 [%(default)s]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+    )
     add(
         "--learn", nargs="?", const="", metavar="REWARD[:moving]",
-        help="bandit:FILE keeps learning from this reward (default: the one it was trained with)",
+        help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
+        "[edge.learn, else as trained]",
     )  # fmt: skip
     add(
         "--fallback",
         metavar="NAME[:VALUE]",
-        help="beside a learning policy (default: the best of its training)",
+        help="policy that takes over if the learning one does worse [edge.learn, else the best fixed one]",
     )
     add(
         "--restart", action="store_true", help="start a process again when it dies, instead of ending the run"
     )
-    add("--no-table", action="store_true", help="plain lines even on a terminal")
-    add("--process-per-camera", action="store_true", help="one camera-node process for each camera")
+    add(
+        "--no-table",
+        action="store_true",
+        help="print plain lines instead of a live table, even on a terminal",
+    )
+    add(
+        "--process-per-camera",
+        action="store_true",
+        help="one camera-node process for each camera [one for all]",
+    )
     return parser

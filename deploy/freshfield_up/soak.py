@@ -1,4 +1,4 @@
-"""Real processes under faults, for minutes: does each fault end within two seconds, does memory stay flat?
+"""Runs real processes under faults: each must recover within two seconds, and memory must stay flat.
 
     python -m freshfield_up.soak --minutes 30 --json docs/results/soak.json
     python -m freshfield_up.soak --kills 34 --every 8 --json docs/results/kills.json
@@ -294,11 +294,15 @@ def soak(
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--minutes", type=float, help="how long, with kills in the first minutes only")
+    what.add_argument("--minutes", type=float, help="duration; kills in the first minutes only")
     what.add_argument("--kills", type=int, metavar="N", help="kill each process N times instead")
-    parser.add_argument("--every", type=float, default=60.0, metavar="S", help="between faults [%(default)s]")
-    parser.add_argument("--scenario", default="ideal", help="a file or a shipped one [%(default)s]")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
+    parser.add_argument(
+        "--every", type=float, default=60.0, metavar="S", help="seconds between faults [%(default)s]"
+    )
+    parser.add_argument(
+        "--scenario", default="ideal", help="scenario file, or the name of a shipped one [%(default)s]"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result to FILE")
     args = parser.parse_args()
     if args.kills:
         planned = KILLS * args.kills

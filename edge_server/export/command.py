@@ -15,10 +15,10 @@ from edge_server.surface import SurfaceError
 from freshfield.files import out_file, out_folder, write_json
 
 DESCRIPTION = """\
-Write what a run or a fit has made as files for other programs. RUN is its folder, or a checkpoint in it.
+Write the results of a run or fit as files for other programs. RUN is its folder, or a checkpoint in it.
 
   edge-server export runs/demo --mesh tile.ply
-  edge-server export runs/cell --mesh tile.ply --measure cell      how far it is from the true surface
+  edge-server export runs/cell --mesh tile.ply --measure cell      and its distance to the true surface
   edge-server export runs/fit-tile --mesh tile.glb --voxel 1 --watertight
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf --trajectory out/path.tum
@@ -28,10 +28,10 @@ Write what a run or a fit has made as files for other programs. RUN is its folde
 --points       surface points with colors (.ply)
 --colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
---trajectory   poses as the TUM benchmark has them; a file for each camera that moved
+--trajectory   poses in the format of the TUM benchmark; a file for each camera that moved
 
-Several can be asked for at once. Lengths in the files are meters, our z points up (in GLB: y). A mesh comes
-from depth as the cameras see it, fused on a grid; what no camera saw stays open, or is closed: --watertight.
+Several can be given at once. Lengths in the files are meters, and z points up (in GLB: y). A mesh is fused on
+a grid from the depth that the cameras see; what no camera saw stays open, or is closed with --watertight.
 """
 
 
@@ -59,30 +59,51 @@ def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server export", description=DESCRIPTION, formatter_class=raw)
     add = parser.add_argument
-    add("run", type=Path, metavar="RUN", help="folder of a run or fit, or a checkpoint")
-    add("--mesh", type=out_file, metavar="FILE", help=".ply or .glb")
-    add("--splats", type=out_file, metavar="FILE", help=".ply")
-    add("--points", type=out_file, metavar="FILE", help=".ply")
-    add("--colmap", type=out_folder, metavar="DIR")
-    add("--binary", action="store_true", help="of --colmap: binary instead of text")
-    add("--transforms", type=out_folder, metavar="DIR")
-    add("--trajectory", type=out_file, metavar="FILE")
-    add("--count", type=int, default=20000, metavar="N", help="points of --points and others [%(default)s]")
-    mesh = parser.add_argument_group("of --mesh").add_argument
-    mesh("--voxel", type=float, metavar="MM", help="[what a pixel spans at the surface]")
+    add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
+    add("--mesh", type=out_file, metavar="FILE", help="mesh: .ply or .glb")
+    add("--splats", type=out_file, metavar="FILE", help="Gaussians: .ply")
+    add("--points", type=out_file, metavar="FILE", help="surface points: .ply")
+    add("--colmap", type=out_folder, metavar="DIR", help="COLMAP model with images")
+    add("--binary", action="store_true", help="write the --colmap model as binary, not text")
+    add("--transforms", type=out_folder, metavar="DIR", help="transforms.json with images and points")
+    add("--trajectory", type=out_file, metavar="FILE", help="camera poses, TUM format")
+    add(
+        "--count",
+        type=int,
+        default=20000,
+        metavar="N",
+        help="points in --points, --colmap, --transforms [%(default)s]",
+    )
+    mesh = parser.add_argument_group("for --mesh").add_argument
+    mesh(
+        "--voxel",
+        type=float,
+        metavar="MM",
+        help="voxel size in millimeters [the width of a pixel at the surface]",
+    )
     mesh(
         "--bounds", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="meters [what the cameras see]",
+        help="box to mesh: lower and upper corner, meters [what the cameras see]",
     )  # fmt: skip
-    mesh("--watertight", action="store_true", help="close it where nobody looked")
-    mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function with the eikonal term [tsdf]")
-    mesh("--no-sharpen", action="store_true", help="take the field's depth as it is, without moving it to "
-         "where the cameras' pictures agree: faster, for what moves, less exact")  # fmt: skip
-    mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
-    mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
-         "far the mesh is from the true surface")  # fmt: skip
+    mesh("--watertight", action="store_true", help="close the surface where no camera looked")
+    mesh(
+        "--method",
+        default="tsdf",
+        help="tsdf, or sdf: a distance function fitted with an eikonal term [tsdf]",
+    )
+    mesh("--no-sharpen", action="store_true", help="use the field's depth as it is, without refining it by "
+         "multi-view consistency: faster, works for moving scenes, less accurate")  # fmt: skip
+    mesh(
+        "--min-weight",
+        type=float,
+        default=0.2,
+        metavar="W",
+        help="minimum fused weight of a voxel; a view at normal incidence counts 1 [%(default)g]",
+    )
+    mesh("--measure", metavar="SCENARIO", help="scenario of the run; if its scene is synthetic and static, "
+         "print the mesh's distance to the true surface")  # fmt: skip
     mesh("--json", type=out_file, metavar="FILE",
-         help="size, seconds of each stage and, of --measure, distances")  # fmt: skip
+         help="write size, seconds of each stage and distances of --measure to FILE as JSON")  # fmt: skip
     return parser
 
 

@@ -14,7 +14,7 @@ from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, Network, 
 from freshfield.files import out_folder
 
 DESCRIPTION = f"""\
-Fetch the weights of LPIPS with its authors' package and convert them to a weights folder of ours.
+Fetch the weights of LPIPS with its authors' package and convert them to the folder that --lpips takes.
 
   pip install 'freshfield[edge,lpips]'
   edge-server fetch-lpips --out ~/lpips
@@ -36,7 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server fetch-lpips", description=DESCRIPTION, formatter_class=raw)
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--network", choices=get_args(Network), action="append", help="[both]")
+    parser.add_argument(
+        "--network", choices=get_args(Network), action="append", help="backbone; may be repeated [both]"
+    )
     args = parser.parse_args(argv)
     try:
         for network in args.network or get_args(Network):

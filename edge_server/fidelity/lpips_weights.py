@@ -40,19 +40,19 @@ def open_lpips(
 ) -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, reason) where the weights are missing or unusable.
 
-    folder: folder with the weights; None takes that of the environment variable FRESHFIELD_LPIPS.
+    folder: folder with the weights; None takes that of ``weights_folder``.
     The reason, one line for people, says what was looked for, where, and what to do; reports print it as
     ``lpips_missing``. Raises ValueError for an unknown network.
     """
     if network not in FILES:
         raise ValueError(f"no LPIPS network {network!r}: choose one of {', '.join(FILES)}")
-    place = str(folder) if folder else os.environ.get(FOLDER_VARIABLE, "")
-    if not place:
+    place = weights_folder(Path(folder) if folder else None)
+    if place is None:
         return None, (
             f"no weights folder given: pass --lpips DIR or set {FOLDER_VARIABLE} to a folder with "
             f"{' and '.join(FILES[network])}"
         )
-    paths = [Path(place) / name for name in FILES[network]]
+    paths = [place / name for name in FILES[network]]
     absent = [p.name for p in paths if not p.is_file()]
     if absent:
         return None, (

@@ -27,12 +27,14 @@ _HERE = ("localhost", "127.0.0.1", "::1")
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = argparse.ArgumentParser(
-        "edge-server keys", description="Make a development authority, and a folder of certificate, key and "
-        "authority for each process of a scenario: edge, emulator, every camera, operator and viewer. The "
-        "edge's holds tokens.txt as well, with which people log in to the page.",
+        "edge-server keys", description="Make a development certificate authority (CA), and a folder with "
+        "certificate, key and CA for each process of a scenario: edge, emulator, every camera, operator and "
+        "viewer. The edge's folder also holds tokens.txt, with which people log in to the page.",
     )  # fmt: skip
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="new folder to write")
+    parser.add_argument(
+        "--out", type=out_folder, required=True, metavar="DIR", help="folder to write; must not exist"
+    )
     for process in ("edge", "emulator"):
         parser.add_argument(
             f"--{process}", action="append", default=[], metavar="HOST",

@@ -17,16 +17,16 @@ from edge_server.scheduler.learned.explain import EmbedImages, Explanation, expl
 from freshfield.files import out_file, write_json
 
 DESCRIPTION = """\
-What moved a decision of a learned policy (bandit:FILE): part of the state, camera, region of an image.
+Explain a decision of a learned policy (bandit:FILE): shares of the state's parts, cameras and image regions.
 
   edge-server run room --policy bandit:runs/learned/policy.npz --out runs/room
   edge-server explain runs/room                          # the newest decision
   edge-server explain runs/room --decision 123 --camera cam04
 
 A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out. Shares are
-Shapley values of the action's logit, against average cameras of the training: they sum to the difference.
-Regions are found by painting them over and embedding the image again; that needs a policy that looks at
-images.
+Shapley values of the action's logit, relative to the average camera in training: they sum to the difference.
+Shares of regions are found by occluding them and embedding the image again; that needs a policy with
+embeddings in its state.
 """
 
 # Cameras with a bar of their own.
@@ -37,10 +37,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server explain", description=DESCRIPTION, formatter_class=raw)
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--decision", type=int, metavar="N", help="that of update N [the newest kept]")
-    parser.add_argument("--camera", metavar="NAME", help="whose picture [the one with the largest share]")
-    parser.add_argument("--json", type=out_file, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run or simulation (its --out)")
+    parser.add_argument("--decision", type=int, metavar="N", help="decision of update N [the newest kept]")
+    parser.add_argument(
+        "--camera", metavar="NAME", help="camera whose image regions to explain [that with the largest share]"
+    )
+    parser.add_argument(
+        "--json", type=out_file, metavar="FILE", help="also write the figures to FILE as JSON"
+    )
     args = parser.parse_args(argv)
     try:
         found = read_decision(args.run, args.decision)

@@ -20,7 +20,7 @@ from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
 # name -> (class, one line of help)
 POLICIES: dict[str, tuple[type[Policy], str]] = {
     "all": (fixed.UseAll, "every camera's newest frame, however old"),
-    "periodic": (fixed.Periodic, "use all, at fixed instants; value: period_ms"),
+    "periodic": (fixed.Periodic, "as all, but at fixed instants; value: period_ms"),
     "random": (fixed.RandomSubset, "a uniformly random non-empty set; value: k fixes its size"),
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
@@ -31,14 +31,14 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-arrived": (WaitArrived, "as wait, but frames that arrive meanwhile, however old (6.16)"),
-    "wait-flush": (WaitFlush, "as wait, and aborts the transmissions under way at the decision (6.5)"),
+    "wait-flush": (WaitFlush, "as wait, but abort the transmissions under way at the decision (6.5)"),
 }
 
 
 # name -> (module, class, one line of help)
 TREATMENTS: dict[str, tuple[str, str, str]] = {
-    "mask": ("motion_mask", "MotionMask", "of stale views, pixels that were moving count for less"),
-    "freshen": ("flow_warp", "FlowWarp", "stale views are carried forward to now by their optical flow"),
+    "mask": ("motion_mask", "MotionMask", "pixels of stale views that were moving count for less"),
+    "freshen": ("flow_warp", "FlowWarp", "stale views are warped to the present by their optical flow"),
 }
 
 # Prefix of a learned policy: the path of a learner's checkpoint follows.

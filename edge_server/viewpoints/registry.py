@@ -15,12 +15,20 @@ from edge_server.viewpoints.candidates import Candidates, ViewpointError
 
 # name -> (module, class, one line of help)
 SELECTORS: dict[str, tuple[str, str, str]] = {
-    "random": ("geometric", "RandomOrder", "any candidate, each as likely"),
-    "uniform": ("geometric", "UniformSpacing", "an evenly spaced set of the size of the budget"),
+    "random": ("geometric", "RandomOrder", "any candidate, uniformly at random"),
+    "uniform": ("geometric", "UniformSpacing", "an evenly spaced set, as large as the budget"),
     "farthest": ("geometric", "FarthestPoint", "the candidate farthest from all earlier views"),
-    "coverage": ("geometric", "Coverage", "most of the object's box newly seen, from its geometry alone"),
-    "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far"),
-    "ppo": ("policy", "CandidatePolicy", "ppo:FILE, a policy learned from preferences (study preferences)"),
+    "coverage": (
+        "geometric",
+        "Coverage",
+        "sees most of the object's box that is still unseen; needs no images",
+    ),
+    "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far (FisherRF)"),
+    "ppo": (
+        "policy",
+        "CandidatePolicy",
+        "ppo:FILE: a policy learned from preferences (--ask, study preferences)",
+    ),
 }
 
 

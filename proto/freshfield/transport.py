@@ -247,21 +247,21 @@ class Transport:
 
 def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None:
     """Add the security options that all processes share. listens: whether this one is a server."""
-    group = parser.add_argument_group("security", "off unless given; the same options for every process")
-    group.add_argument("--tls-cert", type=Path, metavar="PEM", help="own certificate")
-    group.add_argument("--tls-key", type=Path, metavar="PEM", help="own private key")
+    group = parser.add_argument_group("security", "off unless given; all processes take the same options")
+    group.add_argument("--tls-cert", type=Path, metavar="PEM", help="certificate of this process")
+    group.add_argument("--tls-key", type=Path, metavar="PEM", help="private key of this process")
     group.add_argument(
         "--tls-ca", type=Path, metavar="PEM",
-        help="trusted authority: a client then uses TLS, a server then demands client certificates",
+        help="trusted CA certificate: a client then uses TLS, a server demands client certificates",
     )  # fmt: skip
     group.add_argument(
         "--token-file", type=Path, metavar="FILE",
-        help="lines NAME TOKEN; a name: operator, viewer, camera:ID[,ID], camera:*. A client sends the first "
-        "line's token (which may stand alone), a server takes them all",
+        help="file of lines NAME TOKEN; NAME: operator, viewer, camera:ID[,ID] or camera:*. A client sends "
+        "the first token (NAME may be left out), a server accepts all",
     )  # fmt: skip
     group.add_argument(
         "--insecure", action="store_true",
-        help="listen beyond this machine without TLS or without asking who calls" if listens
+        help="listen beyond this machine without TLS or without authentication" if listens
         else "send the token to another machine without TLS",
     )  # fmt: skip
 

@@ -26,21 +26,21 @@ EXAMPLES = """examples:
   camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --drive
-  camera-node calibrate accuracy --quick                                    what poses and gaps are worth
+  camera-node calibrate accuracy --quick                                    errors by gaps, speed and poses
 """
 
-HAND_EYE = """Estimates where a camera sits on a hand (or in the base of the arm, --eye-to-hand), T_EE^C of
-the thesis (4.2), by Tsai-Lenz, four other closed forms, and a joint refinement that estimates the arm's noise
-too. Motions that do not determine it are refused with the reason.
+HAND_EYE = """Estimates the pose of a camera on the end effector ("hand"), T_EE^C of the thesis (4.2), or with
+--eye-to-hand in the arm's base frame: by Tsai-Lenz, four other closed-form methods, and a joint refinement
+that also estimates the arm's noise. Degenerate motions are refused with the reason.
 
-from, one of:
+input, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], meters and radians)
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
-  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when there is
-                 enough; with --drive the arm moves by itself. Hand poses come from the camera's source
-                 (without hand_eye), or from --hand CSV, by seconds since the first frame
+  --live SCENARIO --camera ID   guided session: move the hand, hold still; it says which poses are missing and
+                 when there are enough; with --drive the arm moves by itself. Hand poses come from the
+                 camera's source (without hand_eye), or from --hand CSV, by seconds since the first frame
 """
 
 
@@ -60,89 +60,110 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
     what = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raw = argparse.RawDescriptionHelpFormatter
-    _add_hand_eye(what.add_parser("hand-eye", help="where the camera sits on the hand", description=HAND_EYE,
-                                  epilog=EXAMPLES, formatter_class=raw))  # fmt: skip
-    lens = what.add_parser("intrinsics", help="a camera's lens from pictures of a target", epilog=EXAMPLES,
-                           formatter_class=raw)  # fmt: skip
+    _add_hand_eye(what.add_parser("hand-eye", help="pose of a camera on the end effector",
+                                  description=HAND_EYE, epilog=EXAMPLES, formatter_class=raw))  # fmt: skip
+    lens = what.add_parser("intrinsics", help="a camera's intrinsics from pictures of a target",
+                           epilog=EXAMPLES, formatter_class=raw)  # fmt: skip
     lens.add_argument(
         "folder", type=Path, nargs="?", metavar="FOLDER",
-        help="10 to 20 pictures, the target tilted and in every corner",
+        help="folder of 10 to 20 pictures, the target tilted and in every corner",
     )  # fmt: skip
     lens.add_argument(
         "--live", metavar="SCENARIO",
-        help="instead, a guided session with its --camera: tells where to show the target, and when to stop",
+        help="instead of FOLDER: a guided session that says where to show the target and when to stop",
     )  # fmt: skip
     _add_board(lens, required=True)
-    lens.add_argument("--camera", default="cam00", metavar="ID", help="its name in the file (%(default)s)")
     lens.add_argument(
-        "--out", type=Path, metavar="FILE", help="calibration JSON, as the video source reads it"
+        "--camera",
+        default="cam00",
+        metavar="ID",
+        help="camera of --live, and its name in the file [%(default)s]",
     )
-    lens.add_argument("--json", action="store_true", help="print what --out writes")
+    lens.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="calibration JSON to write, as source kinds camera and video read it",
+    )
+    lens.add_argument("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
     live = _add_live_group(lens)
-    live("--moving", action="store_true", help="also take pictures while the target moves: short exposures")
-    target = what.add_parser("target", help="a picture of a target, to print", epilog=EXAMPLES,
+    live(
+        "--moving",
+        action="store_true",
+        help="also take pictures while the target moves; needs short exposures",
+    )
+    target = what.add_parser("target", help="write an image of a target, to print", epilog=EXAMPLES,
                              formatter_class=raw)  # fmt: skip
-    target.add_argument("board", metavar="SPEC", help="see hand-eye --board")
-    target.add_argument("--out", type=Path, required=True, metavar="FILE.png")
-    target.add_argument("--dpi", type=float, default=300.0, help="dots an inch (default %(default)g)")
-    study = what.add_parser("accuracy", help="what gaps, speed and number of poses cost", epilog=EXAMPLES,
-                            formatter_class=raw)  # fmt: skip
-    study.add_argument("--quick", action="store_true", help="seconds instead of minutes")
-    study.add_argument("--seed", type=int, default=0, metavar="N", help="(default %(default)s)")
-    study.add_argument("--out", type=Path, metavar="DIR", help="tables as CSV, and a picture")
+    target.add_argument("board", metavar="SPEC", help="target, as in hand-eye --board")
+    target.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="image to write")
+    target.add_argument("--dpi", type=float, default=300.0, help="dots per inch [%(default)g]")
+    study = what.add_parser("accuracy", help="simulated errors by gaps, speed and number of poses",
+                            epilog=EXAMPLES, formatter_class=raw)  # fmt: skip
+    study.add_argument("--quick", action="store_true", help="a smaller study: seconds, not minutes")
+    study.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
+    study.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write the tables (CSV) and a figure to"
+    )
     study.add_argument("--json", action="store_true", help="print the tables as JSON")
 
 
 def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
     """Add the options of every guided session. Returns what adds further ones to their group."""
     live = parser.add_argument_group("with --live").add_argument
-    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
-    live("--preview", type=Path, metavar="FILE.png", help="the newest picture with its corners, replaced")
-    live("--seconds", type=float, metavar="S", help="end the session after so long")
+    live("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    live(
+        "--preview",
+        type=Path,
+        metavar="FILE.png",
+        help="keep the newest picture, with the corners found, in this file",
+    )
+    live("--seconds", type=float, metavar="S", help="end the session after S seconds")
     return live
 
 
 def _add_board(parser: argparse.ArgumentParser, required: bool) -> None:
     parser.add_argument(
         "--board", required=required, metavar="SPEC",
-        help="charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners), apriltag:36h11:0:80mm, "
-        "qr:60mm[:TEXT]",
+        help="target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners), "
+        "apriltag:36h11:0:80mm, qr:60mm[:TEXT]",
     )  # fmt: skip
 
 
 # fmt: off
 def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("folder", type=Path, nargs="?", metavar="FOLDER")
-    add("--pairs", type=Path, metavar="FILE")
-    add("--hand", type=Path, metavar="CSV")
-    add("--target", type=Path, metavar="CSV")
-    add("--live", metavar="SCENARIO")
+    add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and hand poses, see above")
+    add("--pairs", type=Path, metavar="FILE", help="pairs of poses, JSON")
+    add("--hand", type=Path, metavar="CSV", help="stream of hand poses")
+    add("--target", type=Path, metavar="CSV", help="stream of target poses in the camera")
+    add("--live", metavar="SCENARIO", help="guided session with a camera of this scenario")
     _add_board(parser, required=False)
     add("--lens", type=Path, metavar="FILE",
-        help="calibration JSON or ViSP's XML (default: the folder's XML, the live camera's own)")
+        help="intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]")
     add("--eye-to-hand", action="store_true", help="the camera stands still, the hand holds the target")
     add("--method", default=DEFAULT_METHOD, metavar="NAME",
-        help="gives the result: tsai, park, horaud, andreff, daniilidis or refined (default)")
+        help="tsai, park, horaud, andreff, daniilidis or refined [%(default)s]")
     add("--max-gap-ms", type=float, metavar="MS",
-        help=f"largest time from a target pose to a hand pose of a stream (default {MAX_GAP_S * 1e3:g})")
+        help=f"largest time from a target pose to a hand pose of a stream [{MAX_GAP_S * 1e3:g}]")
     add("--json", action="store_true",
         help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
-    add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
-    add("--plot", type=Path, metavar="FILE.png", help="residuals, rotation axes, scatter of the target")
+    add("--out", type=Path, metavar="FILE.yaml",
+        help="file to write, for source.arm.cameras or source.trajectory.hand_eye")
+    add("--plot", type=Path, metavar="FILE.png",
+        help="figure to write: residuals, rotation axes, scatter of the target")
     live = _add_live_group(parser)
-    live("--camera", metavar="ID", help="of the scenario")
+    live("--camera", metavar="ID", help="camera of the scenario")
     live("--want-mm", type=float, metavar="MM",
-         help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
+         help=f"end when the standard deviation of the position is below this [{WANT_MM:g}]")
     live("--moving", action="store_true", help="also take pictures while the hand moves; with an arm, the "
          "time offset between its stamps and the camera's is estimated from the motion")
-    live("--drive", action="store_true", help="once the target was seen, the scenario's arm moves to the "
+    live("--drive", action="store_true", help="once the target is seen, move the scenario's arm to the "
          "proposed poses, with the speed and floor_m of source.arm.path; asks first")
-    live("--yes", action="store_true", help="with --drive: the arm's space is clear: do not ask")
+    live("--yes", action="store_true", help="with --drive: the arm's workspace is clear, do not ask")
     live("--tracks", type=Path, metavar="DIR",
-         help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
+         help="with --moving and an arm: write both streams to hand.csv and target.csv, for --hand, --target")
     live("--samples", type=Path, metavar="FILE",
-         help="keeps each sample as --pairs reads it; continues with those of an earlier session")
+         help="write each sample, as --pairs reads it; continues from those of an earlier session")
 # fmt: on
 
 

@@ -21,39 +21,40 @@ from edge_server.report.machine import machine, versions
 from freshfield.files import out_file, write_json, write_text
 
 DESCRIPTION = """\
-Measure this machine. Figures are medians; outside_cores says how many cores others kept busy meanwhile.
+Measure speed and quality on this machine. Figures are medians; outside_cores is the number of cores that
+other processes kept busy meanwhile.
 
-  edge-server bench                       # all parts but those marked below, hours
+  edge-server bench                       # the parts not marked "not part of all"; hours
   edge-server bench field --quick
   edge-server bench field --field ngp,splat --option device=cuda --json gpu.json
   edge-server bench track --scene room --field ngp
   edge-server bench field track options --json docs/results/field.json
   edge-server bench ingest --json ingest.json
 
-field      steps, rays and samples a second, ms a rendering, compile time, memory, seconds to 22..30 dB
-track      updates after motion: how far behind a fit from scratch
-drift      the same for 300 updates of room: whether a field wears out
+field      steps, rays and samples a second, ms per rendering, compile time, memory, seconds to 22..30 dB
+track      updates after motion: how many dB behind a fit from scratch
+drift      the same over 300 updates of room: whether a field degrades
 options    what each optional part of a representation costs in time and gains in dB
 limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
-ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
-decide     what a decision of a learnt policy takes, embeddings aside, with 18 and with 200 cameras
-embed      ms to embed a frame, beside ONNX Runtime alone, by the shipped detectors or --model FILE; needs
+ingest     a real edge server that trains, and a real client: response time, growth of memory
+decide     time of a learned policy's decision, without embeddings, with 18 and with 200 cameras
+embed      ms to embed a frame with the shipped detectors or --model FILE, beside plain ONNX Runtime; needs
            the extra embed; not part of all
-foreground masks of lego against its alpha: IoU and ms by options, and dB that a field gains; needs
+foreground masks of lego against its alpha: IoU and ms by option, and dB that a field gains; needs
            FRESHFIELD_DATA; not part of all
 peer       seconds to 20 and 25 dB on lego and kitchen, beside ngp in plain torch and, where installed
            (docs/fields.md), nerfstudio's nerfacto and OpenSplat; needs FRESHFIELD_DATA; not part of all
 shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
-           perfect field would show, and where the decibels go; not part of all
-growth     how cost grows with cameras, image size, speed and people, from room: age shown, dB, cores, what is
-           shed; in virtual time; not part of all
+           perfect field would show, and the causes of lost dB; not part of all
+growth     how cost grows with cameras, image size, speed and people, from room: age shown, dB, cores,
+           frames left out of updates; in virtual time; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
            each stage; needs the extra surface; not part of all
-scanned    meshes of the tile alone, of scenario scan: from images cut out by its detector, by GrabCut, by
-           true masks, and whole; needs the extras surface and embed; not part of all
+scanned    meshes of the tile alone, of scenario scan: from images masked by its detector, by GrabCut, by
+           true masks, and unmasked; needs the extras surface and embed; not part of all
 
-With --json FILE figures are written scene by scene as they are measured; at the end of a part also FILE
-with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
+With --json FILE, figures are written scene by scene as they are measured, and at the end of a part also
+its tables (FILE with .md) and PART.png. After Ctrl-C, --resume continues where it stopped.
 """
 
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "decide")
@@ -124,32 +125,42 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("bench", DESCRIPTION)
     add = parser.add_argument
-    add("part", nargs="*", metavar="PART", help=f"{', '.join((*PARTS, *MORE))}, all [all]")
-    add("--json", type=out_file, metavar="FILE", help="write figures there; plots and tables beside")
-    add("--resume", action="store_true", help="keep what FILE holds already, measure the rest")
+    add("part", nargs="*", metavar="PART", help=f"what to measure: {', '.join((*PARTS, *MORE))}, all [all]")
+    add(
+        "--json",
+        type=out_file,
+        metavar="FILE",
+        help="write the figures to FILE as JSON; plots and tables beside it",
+    )
+    add("--resume", action="store_true", help="continue: keep the figures in FILE, measure the rest")
     add(
         "--field",
         action="append",
         default=[],
         metavar="NAME",
-        help="of field, track, drift, options, surface [all there are]",
+        help="representations for field, track, drift, options, surface [all]",
     )
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
-    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
     add(
         "--only",
         action="append",
         default=[],
         metavar="NAME",
-        help="of options: 'exposure', ...; of surface: 'cell' [all]",
+        help="measure only this row of options (e.g. exposure) or of surface (cell); may be repeated [all]",
     )
-    add("--model", type=Path, metavar="FILE", help="of embed: a YOLO ONNX [the shipped ones]")
+    add(
+        "--model",
+        type=Path,
+        metavar="FILE",
+        help="ONNX file of a YOLO detector, for embed [the shipped ones]",
+    )
     add("--scene", action="append", default=[], metavar="NAME",
-        help=f"of field: {', '.join(_SCENES['field'])} [all]; of track, drift: "
-        f"{', '.join(_SCENES['track'])} [track: both; drift: room]; of shown: a row of its table, or any "
-        "scenario of a synthetic world [all rows]")  # fmt: skip
+        help=f"scene, for field: {', '.join(_SCENES['field'])} [all]; for track, drift: "
+        f"{', '.join(_SCENES['track'])} [track: both; drift: room]; for shown: a row of its table, or any "
+        "scenario with a synthetic scene [all rows]")  # fmt: skip
     add("--option", action="append", default=[], metavar="KEY=VALUE",
-        help="of field, track, drift: a setting of the representation, for example device=cuda")  # fmt: skip
+        help="option of the field, for field, track, drift, e.g. device=cuda; may be repeated")  # fmt: skip
     return parser
 
 

@@ -29,7 +29,7 @@ def add_folders(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     add("--lpips", type=Path, metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+        help="folder of LPIPS weights [$FRESHFIELD_LPIPS, else lpips/ in the data folder]")  # fmt: skip
 
 
 def folders_of(args: argparse.Namespace) -> Folders:

@@ -27,7 +27,7 @@ from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
-from edge_server.fields.registry import field_names, option_help
+from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
@@ -43,12 +43,12 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
   edge-server fit ~/data/apartment --format eyeful --holdout split
 
-DATA is the folder of a data set, or one of our own scenes: room, tile, tower. Its files say what it is:
+DATA is the folder of a data set, or a synthetic scene: room, tile, tower. The format is found from the files:
 transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), videos with a calibration JSON, DyNeRF (videos
 with poses_bounds.npy), ZJU-MoCap (annots.npy), Eyeful Tower (cameras.json or .xml), a COLMAP model (text or
-binary). Name the describing file itself, or give --format, where several lie there. What moves is fitted at
-one instant (--frame, 15 a second in a scene). Time spent on evaluation is not counted as fitting. Ctrl-C
-ends it early; report, pictures and checkpoint are written all the same, and --resume goes on from there.
+binary). If the folder holds several, name the describing file or give --format. A moving scene is fitted at
+one instant (--frame; synthetic scenes have 15 frames a second). Time spent on evaluation is not counted as
+fitting. Ctrl-C ends the fit early; report, pictures and checkpoint are still written, and --resume continues.
 """
 
 BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -61,37 +61,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = command_parser("fit", DESCRIPTION)
     add = parser.add_argument
-    add("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
-    add("--format", choices=list(FORMATS), help="of the data set [what its files say]")
-    add("--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]")
-    add("--list-options", action="store_true", help="say what the field's options mean")
-    add("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
+    add("data", type=Path, nargs="?", metavar="DATA", help="data set (folder or file), or a synthetic scene")
+    add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
+    add(
+        "--field",
+        default="ngp",
+        metavar="NAME",
+        help=f"representation: {', '.join(field_names())} [%(default)s]",
+    )
+    add("--list-options", action="store_true", help="list the options of --field, with defaults, and exit")
+    add("--seconds", type=float, default=60.0, metavar="S", help="seconds of fitting [%(default)g]")
     add(
         "--holdout", metavar="K|NAME,...",
-        help="of a data set: every K-th view, or these images or cameras; split: what it keeps for testing; "
-        "0: none [8]",
+        help="views of a data set to test on: every K-th, or these images or cameras; split: the data set's "
+        "test set; 0: none [8]",
     )  # fmt: skip
-    add("--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]")
-    add("--frame", type=at_least(0), default=0, metavar="N", help="instant of a moving set [%(default)s]")
+    add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes by K [%(default)g]")
+    add(
+        "--frame",
+        type=at_least(0),
+        default=0,
+        metavar="N",
+        help="frame of a moving scene to fit, from 0 [%(default)s]",
+    )
     add(
         "--background", choices=sorted(BACKGROUNDS), default="white",
-        help="what transparent images are laid on [%(default)s]",
+        help="background of transparent images [%(default)s]",
     )  # fmt: skip
-    add("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
+    add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add(
         "--option", action="append", default=[], metavar="KEY=VALUE",
-        help="setting of the field, e.g. levels=12; again for more",
+        help="option of the field, e.g. levels=12 (--list-options); may be repeated",
     )  # fmt: skip
-    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--out", type=out_folder, metavar="DIR", help="[runs/fit-NAME]")
-    add("--resume", action="store_true", help="go on from OUT until --seconds in all")
+    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")
+    add("--resume", action="store_true", help="continue the fit in OUT, up to --seconds in total")
     args = parser.parse_args(argv)
     if args.list_options:
         try:
-            known = option_help(args.field)
+            known, defaults = option_help(args.field), settings_of(args.field)
         except ValueError as error:
             parser.error(str(error))
-        print("\n".join(f"{name:18} {text}" for name, text in known.items()))
+        print(f"{'effort':18} preset of the options below: {', '.join(efforts_of(args.field))} [medium]")
+        print("\n".join(f"{name:18} {text} [{getattr(defaults, name)}]" for name, text in known.items()))
         return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")

@@ -32,24 +32,24 @@ from freshfield.files import out_file, out_folder, write_json
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = """\
-What fidelity costs in time, in two figures.
+Fidelity against time, in two figures.
 
   edge-server frontier --quick --out runs/frontier
   edge-server frontier --scene room --seeds 3 --lpips ~/data/lpips
   edge-server frontier --scene ~/data/lego --scale 2 --holdout 8 --field all
 
-1. From scratch: effort levels of the field against seconds of fitting, on a camera that was held out: PSNR,
-   SSIM and LPIPS, the Pareto front marked. What a step costs on this machine is measured on the way.
+1. From scratch: PSNR, SSIM and LPIPS on a held-out camera against seconds of fitting, for each effort level
+   of the field, with the Pareto front marked. The time of a step on this machine is measured on the way.
 2. Live: the scene moves, the network delays, and an update that takes longer shows an older world. The whole
-   deployment runs in virtual time, one that charges what updates of the moving scene were measured to take
-   here (a step, and everything else), so the second figure is the same bit for bit for one seed and one such
-   measurement. It says how long an update should take at each speed, by what is shown at random instants.
-   splat in layers on arrivals is one of the curves: there it is the time from one update to the next.
+   deployment runs in virtual time, which charges the measured time of an update of the moving scene (a step,
+   and the rest), so this figure is the same bit for bit for one seed and one such measurement. It says how
+   long an update should take at each speed, judged by what is shown at random instants. One curve is splat in
+   layers, updated on arrivals: there the time is that from one update to the next.
 
-A scenario with a deadline_ms chooses the effort and the time of its updates from figure 2: of the file it
-names (frontier: OUT/frontier.json), else of one that was measured once and is shipped.
+A scenario with a deadline_ms chooses the effort and the duration of its updates from figure 2: from the file
+that it names (frontier: OUT/frontier.json), else from the shipped measurement.
 
-Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command goes on where it stopped;
+Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command continues where it stopped;
 with other settings, points are measured anew.
 """
 
@@ -134,20 +134,48 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("frontier", DESCRIPTION)
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
-    size("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
-    size("--shipped", action="store_true", help="the points to ship, with --field all --points FILE")
-    add("--scene", default="room", metavar="NAME|DATA", help="room, tile or a data set [%(default)s]")
-    add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
-    add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")
-    add("--frame", type=int, default=0, metavar="N", help="of a data set, as in fit [%(default)s]")
+    size(
+        "--quick",
+        action="store_true",
+        help="a smaller sweep: four minutes on two cores, not one to two hours",
+    )
+    size("--shipped", action="store_true", help="the sweep that is shipped, with --field all --points FILE")
+    add("--scene", default="room", metavar="NAME|DATA", help="scene: room, tile or a data set [%(default)s]")
+    add(
+        "--holdout",
+        default="8",
+        metavar="K|NAME,...",
+        help="views of a data set to test on, as in fit [%(default)s]",
+    )
+    add(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="K",
+        help="divide image sizes of a data set by K [%(default)g]",
+    )
+    add("--frame", type=int, default=0, metavar="N", help="frame of a moving data set, from 0 [%(default)s]")
     add("--field", metavar="NAME,...|all", default="ngp", help="representations [%(default)s]")
-    add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
-    add("--policy", default="all", metavar="NAME[:VALUE]", help="of figure 2 [%(default)s]")
-    add("--seeds", type=int, metavar="N", help="repetitions [1 with --quick, else 3]")
-    add("--seed", type=int, default=0, metavar="N", help="the first one [%(default)s]")
-    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--points", type=out_file, metavar="FILE", help="figure 2 there, too: what deadline_ms chooses from")
-    add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="[%(default)s]")
+    add(
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of the field, as in fit; may be repeated",
+    )
+    add("--policy", default="all", metavar="NAME[:VALUE]", help="update policy in figure 2 [%(default)s]")
+    add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
+    add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
+    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add(
+        "--points",
+        type=out_file,
+        metavar="FILE",
+        help="also write the points of figure 2, for deadline_ms, to FILE",
+    )
+    add(
+        "--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]"
+    )
     return parser
 
 

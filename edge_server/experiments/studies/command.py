@@ -29,37 +29,37 @@ from freshfield.scenario import ScenarioError
 # name -> (module, class, one line of help)
 STUDIES = {
     "metrics": ("metric_distortions", "Metrics",
-                "figure 3.6: what PSNR, SSIM and LPIPS say of three artefacts"),
+                "figure 3.6: what PSNR, SSIM and LPIPS say about three artifacts"),
     "mat": ("age.max_age", "Mat", "figures 5.6, 5.7: fidelity against the maximum age of used views"),
     "mat-delay": ("age.max_age_by_delay", "MatDelay",
                   "figure 5.8: the best maximum age against the mean delay"),
-    "lambda": ("age.age_weight", "Weighing", "equation 5.8: the weight of timeliness"),
+    "lambda": ("age.age_weight", "Weighing", "equation 5.8: fidelity against the weight of timeliness"),
     "omega": ("age.omega", "Omega",
-              "figures 6.3, 6.4: threshold and wait in both readings, by traffic and queue, flush"),
+              "figures 6.3, 6.4: threshold and wait in both interpretations, by traffic and queue; flush"),
     "images": ("age.image_count", "Images", "figures 6.5, 6.6: LPIPS and age against the number of images"),
     "representations": ("age.representations", "Representations",
-                        "figure 6.7: the same trade with other representations"),
+                        "figure 6.7: the same trade-off with other representations"),
     "phase": ("age.trade_map", "Phase",
-              "where the trade exists: speed x delay x memory x compute, and what mask and freshen gain"),
+              "where the trade-off exists: speed x delay x memory x compute, and gain of mask, freshen"),
     "viewpoints": ("viewpoints", "Viewpoints",
-                   "tables 4.1, 4.3, figures 4.7, 4.8: which views to take of an object that stands still"),
+                   "tables 4.1, 4.3, figures 4.7, 4.8: which views to take of a static object"),
     "preferences": ("preferences", "Preferences",
-                    "figure 4.6, tables 4.2, 4.3: what simulated experts' preferences teach"),
+                    "figure 4.6, tables 4.2, 4.3: what is learned from simulated experts' preferences"),
     "ppo-select": ("learning.ppo_select", "PpoSelect",
-                   "figure 5.9: a scheduler that learns which views to use, against everything else"),
+                   "figure 5.9: a scheduler that learns which views to use, against all other policies"),
     "ppo-wait": ("learning.ppo_wait", "PpoWait",
-                 "figure 6.8: one that learns how long to wait, or how old is too old, by traffic"),
+                 "figure 6.8: a scheduler that learns how long to wait, or a maximum age, by traffic"),
     "ablation": ("learning.state_ablation", "Ablation",
-                 "what ages, poses and semantics in the state are worth to what is learnt"),
+                 "how much ages, poses and semantics in the state contribute to a learned policy"),
     "weights": ("learning.reward_weights", "Weights",
-                "what is learnt by other weights of the reward, judged by all of them"),
+                "policies learned with other weights of the reward, judged by all of them"),
     "drift": ("learning.channel_drift", "Drift",
-              "the channel changes during use: fixed, learnt, and still learning"),
-    "transfer": ("learning.transfer", "Transfer", "learnt on one scene and channel, used on another"),
+              "the channel changes during use: fixed, learned and still learning policies"),
+    "transfer": ("learning.transfer", "Transfer", "policies of one scene and channel, used on another"),
     "semantics": ("learning.semantics", "Semantics",
-                  "where it helps to look at the pictures, and what it costs where it does not"),
+                  "where image embeddings in the state help, and their cost where they do not"),
     "reward-cost": ("learning.reward_cost", "RewardCost",
-                    "what is learnt against the time it takes, by the effort of a fit and the embedding"),
+                    "reward against training time, by the effort of a fit and the embedding"),
 }  # fmt: skip
 # Studies that consist of cases: --case selects some of them.
 CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "ablation", "reward-cost")
@@ -68,8 +68,8 @@ LEARNING = tuple(name for name, (module, *_) in STUDIES.items() if module.starts
 # Studies of captures: they run in this process, and are not part of "all" either.
 CAPTURING = ("viewpoints", "preferences")
 DESCRIPTION = f"""\
-The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
-with 95 % intervals over seeds, and whether it holds.
+Reproduce the thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was
+found here with 95 % intervals over seeds, and whether it holds.
 
   edge-server study mat --quick --out runs/study
   edge-server study all --quick --data ~/data
@@ -77,16 +77,16 @@ with 95 % intervals over seeds, and whether it holds.
   edge-server study phase --ray auto
 
 {"".join(f"  {name:17} {line}{chr(10)}" for name, (_, _, line) in STUDIES.items())}
-Studies of what learns, ppo-select and below, take half an hour to an hour each with --quick on two cores,
-with one training an arm; without it, with three and more episodes, most of a day and more. In between:
+Studies that train policies, ppo-select and below, take half an hour to an hour each with --quick on two
+cores, with one training per variant; without it, with three or more, most of a day or more. In between:
 
   edge-server study ppo-select --quick --case priced --episodes 600
   edge-server study drift --quick --case bursts --case dies
   edge-server study ablation --quick --case flush --episodes 60
 
 Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs on one
-kind of processor. Results are kept in OUT/trials by content and processor; after Ctrl-C the same command goes
-on with what is missing.
+kind of processor. Results are kept in OUT/trials by settings and processor; after Ctrl-C the same command
+continues.
 """
 
 
@@ -160,33 +160,39 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("study", DESCRIPTION)
     add = parser.add_argument
     add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
-        help=f"{', '.join(STUDIES)}; all: before viewpoints; learning: from ppo-select on")  # fmt: skip
+        help=f"{', '.join(STUDIES)}; all: up to phase; learning: from ppo-select on")  # fmt: skip
     add(
         "--quick",
         action="store_true",
-        help="small pictures, few points and seeds: all in a quarter of an hour, and each of those that "
-        "learn in half an hour to an hour",
+        help="small images, few points and seeds: a quarter of an hour for all, half an hour to an hour for "
+        "each study that trains",
     )
-    add("--seeds", type=int, metavar="N", help="repetitions of every point [the study's own]")
-    add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")
+    add("--seeds", type=int, metavar="N", help="seeds per point [the study's own]")
+    add(
+        "--jobs",
+        type=int,
+        default=usable_cores(),
+        metavar="N",
+        help="number of worker processes [%(default)s]",
+    )
     add(
         "--case",
         action="append",
         default=[],
         metavar="WORDS",
-        help=f"of {', '.join(CASED)}: only cases with these words in their name; words that no name has list "
-        "them all",
+        help=f"only cases with these words in their name, in {', '.join(CASED)}; words that no name has "
+        "list all cases",
     )
-    add("--episodes", type=int, metavar="N", help="of one training, where there is one [the study's own]")
+    add("--episodes", type=int, metavar="N", help="episodes of each training [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
     add(
         "--scene",
         metavar="NAME,...",
-        help="shipped scenarios with fixed cameras, as kitchen or dynerf (viewpoints and preferences: cell "
-        "too); room: room19 [the study's own]",
+        help="shipped scenarios with fixed cameras, such as kitchen or dynerf (viewpoints and preferences: "
+        "cell, too); room means room19 [the study's own]",
     )
     add("--field", choices=field_names(), default="splat",
-        help="representation, where the study names none [%(default)s]")  # fmt: skip
+        help="representation, unless the study names its own [%(default)s]")  # fmt: skip
     add_folders(parser)
-    add("--out", type=out_folder, default="runs/study", metavar="DIR", help="[%(default)s]")
+    add("--out", type=out_folder, default="runs/study", metavar="DIR", help="folder to write [%(default)s]")
     return parser

@@ -37,14 +37,14 @@ Chooses where a camera goes next around an object, view by view, within a budget
   edge-server viewpoints cell --budget 2.5m --selector fisher --travel .3
   edge-server viewpoints lego --budget 12 --selector coverage --data ~/data
 
-Candidates of a synthetic world stand on a half-hemisphere round its object; a scenario with an arm says which
-of them it reaches. A recording's candidates are the views that it has. Writes OUT/plan.json (the stops with
-their poses, values and reasons) and OUT/plan.png (the candidates by value, and the path). The quality that is
-printed is of a splat field fitted to the chosen views, on viewpoints held out.
+The candidates of a synthetic scene lie on a half-hemisphere around its object; if the scenario has an arm,
+only those that it reaches count. The candidates of a recording are its views. Writes OUT/plan.json (the
+stops with their poses, values and reasons) and OUT/plan.png (the candidates by value, and the path). The
+printed quality is that of a splat field fitted to the chosen views, on held-out viewpoints.
 
---ask plans by preferences instead of --selector: a page shows pairs of reconstructions of different views, a
-person (or a simulated expert) says which is better, the reward model learns from the answers and a policy
-from the reward. Writes OUT/answers.json after each answer, from which the next call goes on, and
+--ask plans by preferences instead of --selector: a page shows pairs of reconstructions from different views,
+a person (or a simulated expert) says which is better, a reward model learns from the answers and a policy
+from the reward. Writes OUT/answers.json after each answer, from which the next call continues, and
 OUT/policy.npz for --selector ppo:OUT/policy.npz.
 
   edge-server viewpoints tile --budget 8 --ask
@@ -130,27 +130,56 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("viewpoints", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
-    add("--budget", required=True, metavar="N|Dm|N,Dm", help="views, meters of path, or both")
-    add("--selector", default="coverage", metavar="NAME", help="[%(default)s]")
+    add(
+        "--budget",
+        required=True,
+        metavar="N|Dm|N,Dm",
+        help="number of views, meters of path, or both: 8, 2.5m, 8,2.5m",
+    )
+    add("--selector", default="coverage", metavar="NAME", help="how to choose, see above [%(default)s]")
     add("--travel", type=float, default=0.2, metavar="W",
-        help="of the way against the value, as shares of their ranges; 0: none [%(default)g]")  # fmt: skip
-    add("--candidates", type=int, default=100, metavar="N", help="of a synthetic world [%(default)s]")
-    add("--steps", type=at_least(1), default=400, metavar="N", help="of each fit [%(default)s]")
+        help="weight of path length against value, each over its range; 0: none [%(default)g]")  # fmt: skip
+    add(
+        "--candidates",
+        type=int,
+        default=100,
+        metavar="N",
+        help="number of candidates in a synthetic scene [%(default)s]",
+    )
+    add(
+        "--steps",
+        type=at_least(1),
+        default=400,
+        metavar="N",
+        help="optimizer steps of each fit [%(default)s]",
+    )
     add(
         "--seed",
         type=at_least(0),
         default=0,
         metavar="N",
-        help="of the first view and what is drawn [%(default)s]",
+        help="random seed, also of the first view [%(default)s]",
     )
     add("--ask", nargs="?", const=PERSON, choices=[PERSON, *TASTES], metavar="WHO",
-        help=f"compare reconstructions first: {PERSON} (on the page, where no WHO is given), or a simulated "
+        help=f"compare reconstructions first, by a {PERSON} on the page (if WHO is left out) or a simulated "
         f"expert: {', '.join(TASTES)}")  # fmt: skip
-    add("--questions", type=at_least(1), default=60, metavar="N", help="of --ask [%(default)s]")
-    add("--reconstructions", type=at_least(2), default=24, metavar="N", help="of --ask [%(default)s]")
-    add("--page-port", type=int, default=8080, metavar="PORT", help="of --ask's page [%(default)s]")
-    add("--page-host", default="127.0.0.1", metavar="HOST", help="of --ask's page [%(default)s]")
+    add("--questions", type=at_least(1), default=60, metavar="N", help="pairs that --ask shows [%(default)s]")
+    add(
+        "--reconstructions",
+        type=at_least(2),
+        default=24,
+        metavar="N",
+        help="reconstructions that --ask compares [%(default)s]",
+    )
+    add("--page-port", type=int, default=8080, metavar="PORT", help="port of --ask's page [%(default)s]")
+    add("--page-host", default="127.0.0.1", metavar="HOST", help="address of --ask's page [%(default)s]")
     transport.add_arguments(parser)
     add_folders(parser)
-    add("--out", type=out_folder, default="runs/viewpoints", metavar="DIR", help="[%(default)s]")
+    add(
+        "--out",
+        type=out_folder,
+        default="runs/viewpoints",
+        metavar="DIR",
+        help="folder to write [%(default)s]",
+    )
     return parser

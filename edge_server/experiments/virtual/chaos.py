@@ -42,9 +42,9 @@ from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario
 
 DESCRIPTION = """\
-Run small deployments in virtual time, each with faults that its seed draws: processes that crash and stall,
-full and slow disks, cameras that go away, clocks that step, hostile messages, policies switched, checkpoints
-resumed.
+Run small deployments in virtual time, each with faults drawn from its seed: processes that crash and stall,
+full and slow disks, cameras that go away, clocks that step, hostile messages, switched policies, resumed
+checkpoints.
 
   edge-server chaos --seeds 0..99 --jobs 2
   edge-server chaos --seeds 0..9999 --out runs/chaos.jsonl     # resumes where it was stopped
@@ -52,9 +52,9 @@ resumed.
 
 After each run: every frame is accounted for as it really ended (ledgers against what happened), queues and
 memory are within their bounds, no number is NaN, every camera and the field are up to date again within 2 s
-of the last fault, and a second run has the same digest. Cameras that share one line may starve each other by
-its discipline: of these one must be up to date. For a seed that fails, its faults are reduced to those that
-it takes, and the command that repeats it is printed.
+of the last fault, and a second run has the same digest. The queue discipline of a shared line may starve
+cameras: of these one must be up to date. For a seed that fails, a minimal set of its faults is found, and the
+command that repeats the failure is printed.
 """
 _SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0,
                         epoch_ms=100.0, score_every_ms=None)  # fmt: skip
@@ -210,10 +210,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status: 1 where a seed fails."""
     parser = command_parser("chaos", DESCRIPTION)
     add = parser.add_argument
-    add("--seeds", type=_seeds, required=True, metavar="A..B", help="from A to B, or A alone")
-    add("--faults", type=_numbers, metavar="K,...", help="only these of the seeds' faults")
-    add("--jobs", type=at_least(1), default=1, metavar="N", help="processes [%(default)s]")
-    add("--out", type=out_file, metavar="FILE", help="keep results there; known ones are not run again")
+    add("--seeds", type=_seeds, required=True, metavar="A..B", help="random seeds A to B, or A alone")
+    add("--faults", type=_numbers, metavar="K,...", help="numbers of the seeds' faults to inject [all]")
+    add("--jobs", type=at_least(1), default=1, metavar="N", help="number of worker processes [%(default)s]")
+    add("--out", type=out_file, metavar="FILE", help="keep results in FILE; seeds in it are not run again")
     args = parser.parse_args(argv)
     began, failed, slowest = time.monotonic(), 0, 0.0
     store = ResultStore.in_lines(args.out) if args.out else ResultStore()

@@ -32,8 +32,8 @@ from freshfield.frame import BufferedFrame
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
-What an update of a scenario takes on this machine: milliseconds an update, a step and a frame taken in. The
-file is named in a scenario (edge.compute: FILE), so that training and simulation charge the same.
+Measure what an update of a scenario takes on this machine: milliseconds per update, step and frame taken in.
+Name the file in the scenario (edge.compute: FILE); training and simulation then charge these times.
 
   edge-server costs card --out deploy/scenarios/card/costs.json
 """
@@ -51,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = command_parser("costs", DESCRIPTION)
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S",
-        help="of virtual time, three times [%(default)g]")  # fmt: skip
-    parser.add_argument("--out", type=out_file, required=True, metavar="FILE", help="JSON to write")
+        help="seconds of virtual time of each of three runs [%(default)g]")  # fmt: skip
+    parser.add_argument("--out", type=out_file, required=True, metavar="FILE", help="JSON file to write")
     add_folders(parser)
     args = parser.parse_args(argv)
     try:

@@ -31,17 +31,16 @@ from freshfield.files import out_folder, write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
-Cameras, emulated network, buffer, policy and field of a scenario in virtual time: no ports, no waiting.
+Run cameras, emulated network, buffer, policy and field of a scenario in virtual time: no ports, no waiting.
 
   edge-server simulate room --seconds 10
   edge-server simulate room19 --policy threshold:120 --seed 3 --json
   edge-server simulate room --compute 4:30 --steps 60 --out runs/virtual
 
-The parts are the live ones, faults included; only the clock differs. An update spends a number of optimiser
-steps, and virtual time is charged for them: zero, as the thesis does, or ms a step and ms an update
-(edge.compute of the scenario, or --compute; edge-server frontier measures what a machine takes). One seed,
-one result on one kind of processor: the digest that is printed is of every publication and of the field's
-parameters.
+The parts are the live ones, faults included; only the clock differs. An update takes a number of optimizer
+steps, and they take virtual time: none, as in the thesis, or ms per step and ms per update (edge.compute of
+the scenario, or --compute; edge-server costs measures them). The same seed gives the same result on the same
+kind of processor: the printed digest covers every publication and the field's parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
 _SCORED_EVERY_MS = 250.0  # publications, and what is shown at random instants
@@ -227,15 +226,19 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("simulate", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
-    add("--seconds", type=float, default=10.0, metavar="S", help="of virtual time [%(default)g]")
-    add("--seed", type=int, metavar="K", help="instead of the scenario's")
-    add("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's, e.g. threshold:120")
-    add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
-    add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
+    add("--seconds", type=float, default=10.0, metavar="S", help="seconds of virtual time [%(default)g]")
+    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+    )
+    add("--steps", type=int, metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
+    add("--compute", metavar="zero|MS:MS", help="ms per step and ms per update [edge.compute, else zero]")
     add("--epoch-ms", type=float, metavar="MS",
-        help=f"between decisions [{_CYCLE_MS:g}; edge.update_ms where updates follow arrivals]")  # fmt: skip
+        help=f"ms between decisions [{_CYCLE_MS:g}; edge.update_ms if updates follow arrivals]")  # fmt: skip
     add_folders(parser)
     add("--out", type=out_folder, metavar="DIR",
-        help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
-    add("--json", action="store_true", help="everything, as one JSON object")
+        help="folder to write simulation.json, series.jsonl and a learned policy's decisions to")  # fmt: skip
+    add("--json", action="store_true", help="print the result as one JSON object")
     return parser

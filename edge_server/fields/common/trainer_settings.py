@@ -24,35 +24,45 @@ class FieldSettings:
     name: ClassVar[str]
     has_cuda: ClassVar[bool] = False  # whether the representation runs on a GPU, too
 
-    centre_m: tuple[float, float, float] | None = option(None, "centre of the scene's box")
-    radius_m: float | None = option(None, "half the side of the scene's box")
-    near_m: float | None = option(None, "no density is seen nearer to a camera than this")
-    contracted: bool | None = option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
+    centre_m: tuple[float, float, float] | None = option(
+        None, "center of the scene's box, x y z in meters; None: found from the cameras"
+    )
+    radius_m: float | None = option(
+        None, "half the side of the scene's box, meters; None: found from the cameras"
+    )
+    near_m: float | None = option(
+        None, "near plane, meters: nothing closer to a camera is rendered; None: found from the cameras"
+    )
+    contracted: bool | None = option(
+        None, "whether the scene extends beyond its box (rooms, outdoors); None: found from the cameras"
+    )
     background: str = option("auto", "auto (plain, or the mean color), white, black, random, or '#rrggbb'")
-    min_views: int = option(2, "no density where fewer cameras than this look (never more than there are)")
+    min_views: int = option(2, "no density where fewer cameras than this look (at most all of them)")
     rate_end: float = option(0.1, "share of the learning rate that is left at the end of a fit")
     epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
-    changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")
-    age_tau_ms: float = option(0.0, "age at which a view counts by 1/e beside the newest; 0: all alike")
+    changed_share: float = option(0.25, "share of rays drawn from pixels that changed in the newest view")
+    age_tau_ms: float = option(
+        0.0, "age relative to the newest view, in ms, at which a view's weight is 1/e; 0: all weigh 1"
+    )
     mask_stale_ms: float = option(
-        0.0, "views older than this beside the newest teach only what stood still; 0: off"
+        0.0, "mask moved pixels of views that are this many ms older than the newest; 0: off"
     )
     mask_grow_px_s: float = option(
-        0.0, "pixels by which ``mask_stale_ms`` widens what moved, per second of age"
+        0.0, "dilation of the mask of ``mask_stale_ms``, in pixels per second of age"
     )
     refuse_beyond: float = option(
         2.5,
-        "a view is refused whose typical error is so many times the usual one; 0, or while cameras' "
-        "errors are learned: none is",
+        "refuse views whose typical error is more than this many times the usual one; 0, or while cameras' "
+        "exposures or poses are learned: refuse none",
     )
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(
         None,
-        "worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or a core each, at most 8",
+        "worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or one a core, at most 8",
     )
-    nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
+    nice: int = option(0, "niceness added to worker threads (Linux), 0 to 19; in a server 5")
     device: str = option(
-        "auto", "cpu, or cuda (``ngp`` and ``splat`` alone, only where asked for); auto: cpu"
+        "auto", "cpu, cuda (``ngp`` and ``splat`` only) or auto (cpu; never a GPU by itself)"
     )
 
     def __post_init__(self) -> None:
@@ -99,23 +109,23 @@ class TrainerSettings(FieldSettings):
     hidden: int = option(32, "units of each hidden layer, a multiple of 4")
     hidden_layers: int = option(1, "hidden layers of the network")
     harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
-    rays: int = option(4096, "rays of one step at most")
-    batch_samples: int = option(16384, "samples of one step at most, a multiple of 2048")
-    samples: int = option(192, "steps across the scene's box, corner to corner")
-    samples_start: int = option(64, "the same at first: fog is cheaper to see through in long steps")
-    samples_ramp: int = option(600, "steps after which ``samples`` is reached")
+    rays: int = option(4096, "maximum number of rays in a training step")
+    batch_samples: int = option(16384, "maximum number of samples in a training step, a multiple of 2048")
+    samples: int = option(192, "ray-marching steps across the scene's box, corner to corner")
+    samples_start: int = option(64, "initial value of ``samples``: early, foggy fields need fewer")
+    samples_ramp: int = option(600, "training steps after which ``samples`` is reached")
     cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
-    distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
+    distortion: float = option(1e-2, "weight of the distortion loss, which concentrates density along rays")
     depth_guide: float | None = option(
         None,
-        "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
-        "where the background is found to be plain, or of six views at most, else 0",
+        "weight of the penalty on density away from the depth that a plane sweep of the images finds; 0: "
+        "off; None: 0.1 if the background is plain or there are six views at most, else 0",
     )
-    guide_steps: int = option(300, "steps over which ``depth_guide`` falls to nothing")
-    exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
-    refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
-    refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
+    guide_steps: int = option(300, "steps over which the weight ``depth_guide`` falls to 0")
+    exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias per channel)")
+    refine_m: float = option(0.0, "largest correction of a camera's position, meters; 0: none")
+    refine_deg: float = option(0.0, "largest correction of a camera's rotation, degrees; 0: none")
 
     def __post_init__(self) -> None:
         name = self.name
@@ -151,16 +161,16 @@ class HashGridSettings(TrainerSettings):
     """What representations with a hash grid add. Lengths in meters; None means: found from the cameras."""
 
     levels: int = option(8, "levels of the hash grid, coarse to fine")
-    log2_table: int = option(16, "largest number of vertices a level stores, as a power of two")
+    log2_table: int = option(16, "maximum number of vertices that a level stores, as a power of two")
     base_resolution: int = option(16, "cells a side of the coarsest level")
     finest_resolution: int | None = option(None, "cells a side of the finest level; None: about a pixel")
     rate: float = option(8e-2, "learning rate of the hash tables at the start of a fit")
     rate_net: float = option(3e-2, "learning rate of the network at the start of a fit")
-    decay: float = option(0.0, "pull of the tables' entries towards zero, per step and rate")
+    decay: float = option(0.0, "weight decay of the hash tables, per step, times the learning rate")
     smooth: float = option(1.5e-3, "weight of the total variation of the levels that are not hashed")
-    levels_start: int = option(4, "levels in use at first; the finer ones follow (coarse to fine)")
+    levels_start: int = option(4, "levels in use at the start; finer ones are switched on later")
     levels_every: int = option(30, "steps after which one more level is switched on")
-    samples_start: int = option(32, "``samples`` at first: fog is cheaper to see through in long steps")
+    samples_start: int = option(32, "initial value of ``samples``: early, foggy fields need fewer")
 
     def __post_init__(self) -> None:
         self._within(

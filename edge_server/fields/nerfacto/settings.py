@@ -15,15 +15,17 @@ class NerfactoSettings(HashGridSettings):
     name = "nerfacto"
 
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
-    samples: int = option(24, "samples of a ray, placed by the proposal")
-    samples_start: int = option(24, "samples of a ray at first")
-    samples_ramp: int = option(200, "steps after which ``samples`` is reached")
-    bins: int = option(96, "bins of a ray, each a lookup in the proposal")
-    proposal_cells: int = option(64, "cells a side of the proposal")
-    interlevel: float = option(5.0, "weight of the proposal's loss; 0: samples stay uniform")
+    samples: int = option(24, "samples of a ray, placed by the proposal density")
+    samples_start: int = option(24, "initial value of ``samples``")
+    samples_ramp: int = option(200, "training steps after which ``samples`` is reached")
+    bins: int = option(96, "bins of a ray, one lookup of proposal density in each")
+    proposal_cells: int = option(64, "cells a side of the proposal's grid")
+    interlevel: float = option(
+        5.0, "weight of the interlevel loss, which trains the proposal; 0: uniform samples"
+    )
     proposal_decay: float = option(3e-2, "pull of the proposal's raw densities back to thin fog")
     even: float = option(0.4, "share of a ray's samples that is allocated uniformly")
-    anneal: int = option(40, "steps over which that share falls from 1, while the proposal is untrained")
+    anneal: int = option(40, "steps over which the uniform share falls from 1 to ``even``")
     smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
     appearance: int = option(0, "numbers learned for each camera's appearance (exposure, tint); 0: none")
 

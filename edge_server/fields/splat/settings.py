@@ -20,24 +20,30 @@ class SplatSettings(FieldSettings):
     gaussians: int = option(8192, "largest number of Gaussians")
     start: int = option(4096, "number of Gaussians at the start, at most ``gaussians``")
     harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
-    views_a_step: int = option(1, "views that a step trains on")
-    loss: str = option("mse", "of colors: mse (squared errors) or l1 (absolute ones)")
+    views_a_step: int = option(1, "number of views that a training step uses")
+    loss: str = option("mse", "color loss: mse (squared errors) or l1 (absolute errors)")
     dssim: float = option(0.0, "weight of (1 - SSIM) / 2, tile by tile (Kerbl et al.: 0.2 beside l1)")
-    seed_cells: int = option(64, "cells a side of the grid that finds first positions; 0: random positions")
-    seed_scale: float = option(0.5, "first scale of Gaussians, in distances to their neighbors")
+    seed_cells: int = option(64, "cells a side of the grid that gives initial positions; 0: random ones")
+    seed_scale: float = option(0.5, "initial scale of Gaussians, in distances to their neighbors")
     seed_opacity: float = option(0.3, "opacity of new Gaussians")
-    near_m: float | None = option(None, "near plane: nothing closer to a camera is rendered")
+    near_m: float | None = option(
+        None, "near plane, meters: nothing closer to a camera is rendered; None: found from the cameras"
+    )
     min_views: int = option(2, "no Gaussian starts where fewer cameras than this look")
     rate_position: float = option(0.4, "learning rate of positions at the start of a fit, in pixels")
     rate_scale: float = option(0.08, "learning rate of the logarithms of scales")
     rate_rotation: float = option(0.02, "learning rate of quaternions")
     rate_opacity: float = option(0.15, "learning rate of opacities before the sigmoid")
     rate_color: float = option(0.02, "learning rate of colors; a tenth of it for harmonics")
-    settle_after: float = option(300.0, "steps of a Gaussian at full rates; then they fall as 1 / steps")
-    rate_settled: float = option(0.1, "share of the rates below which they do not fall")
+    settle_after: float = option(
+        300.0, "steps for which a Gaussian trains at full rates; then they fall as 1 / steps"
+    )
+    rate_settled: float = option(0.1, "minimum share of the full rates, reached after ``settle_after``")
     epsilon: float = option(1e-3, "Adam's epsilon, on gradients summed over pixels")
     fade: float = option(0.0, "penalty on opacity: removes Gaussians that no view needs")
-    densify_every: int = option(50, "steps between densifications, at least one pass over all views")
+    densify_every: int = option(
+        50, "minimum number of steps between densifications, and at least one pass over all views"
+    )
     grow: float = option(0.15, "share of Gaussians split by a densification, largest gradient first")
     prune: float = option(0.02, "opacity below which Gaussians are removed")
     opacity_reset: int = option(0, "steps after which opacities are lowered to a tenth; 0: never")

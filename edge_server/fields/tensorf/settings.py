@@ -16,13 +16,13 @@ class TensorfSettings(TrainerSettings):
 
     density_rank: int = option(8, "components of density for each orientation, a multiple of 8")
     color_rank: int = option(16, "components of color for each orientation, a multiple of 8")
-    resolution_start: int = option(48, "vertices a side of planes and lines at first")
+    resolution_start: int = option(48, "vertices a side of planes and lines at the start")
     resolution: int | None = option(None, "vertices a side in the end; None: about a pixel, 256 at most")
-    upsample: tuple[int, ...] = option((100, 200, 400), "steps after which planes and lines get finer")
+    upsample: tuple[int, ...] = option((100, 200, 400), "steps after which planes and lines are refined")
     rate: float = option(2e-2, "learning rate of planes and lines at the start of a fit")
     rate_net: float = option(4e-2, "learning rate of the network at the start of a fit")
     epsilon: float = option(1e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
-    decay: float = option(0.0, "pull of planes and lines towards zero, per step and rate")
+    decay: float = option(0.0, "weight decay of planes and lines, per step, times the learning rate")
     first: float = option(0.1, "standard deviation of the factors' initial values")
 
     def __post_init__(self) -> None:

@@ -19,31 +19,31 @@ class VoxelSettings(FieldSettings):
 
     sizes: tuple[int, ...] | None = option(None, "vertices a side, coarse to fine; None: to about a pixel")
     refine_at: tuple[int, ...] = option((15, 40, 80), "steps after which the next of ``sizes`` is taken")
-    rays: int = option(8192, "rays of one step")
+    rays: int = option(8192, "rays in one training step")
     rate: float = option(0.05, "learning rate of density at the start of a fit")
     rate_color: float = option(0.06, "learning rate of color at the start of a fit")
     settle: float = option(
         3.0, "passes over all pixels, after which a fit's rates decay as 1 / steps; 0: never"
     )
-    warm: float = option(0.3, "share of the rates in a fit that starts from a grid of its last size")
-    soften: float = option(0.2, "largest optical depth of one step left where something moved")
-    growth: float = option(20.0, "growth of density's rate with density x: times 1 + growth x")
-    l1: float = option(0.003, "pull of density towards zero, in rates: empties what no image needs")
+    warm: float = option(0.3, "share of the rates that a fit uses if it starts from a grid at its final size")
+    soften: float = option(0.2, "cap on the optical depth of one step where something moved")
+    growth: float = option(20.0, "density x has 1 + growth x times the learning rate ``rate``")
+    l1: float = option(0.003, "L1 penalty on density, in learning rates: empties what no image needs")
     outline: float = option(
-        0.25, "weight of the error of opacity, where alpha or a plain background gives it"
+        0.25, "weight of the opacity loss, where alpha or a plain background gives the truth"
     )
     diffuse: float = option(
-        1.0, "share of the way to its neighbors' mean that a vertex goes in four steps at full rates"
+        1.0, "share of the difference to its neighbors' mean that a vertex loses in four steps at full rates"
     )
     diffuse_edge: float = option(
-        0.025, "bound of a difference between neighbors in ``diffuse``, as a share of the largest possible"
+        0.025, "largest difference between neighbors that ``diffuse`` counts, as a share of the range"
     )
     diffuse_views: int = option(
-        32, "viewpoints above which ``diffuse`` weakens: times this number over theirs"
+        32, "number of viewpoints above which ``diffuse`` falls in inverse proportion to them"
     )
     first: float = option(0.1, "initial optical depth of one step")
     prune: float = option(0.2, "optical depth of one step below which a cell counts as empty")
-    prune_from: int = option(15, "step from which empty cells are skipped and others diffuse")
+    prune_from: int = option(15, "step from which empty cells are skipped and ``diffuse`` acts")
     cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
     parts: int = option(2, "gradient buffers, the number of cores that train at once; results depend on it")
 

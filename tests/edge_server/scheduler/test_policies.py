@@ -196,7 +196,7 @@ def test_an_unknown_policy_lists_the_known_ones():
 
 def test_names_of_treated_and_learned_policies_and_their_help(tmp_path):
     assert make_policy("wait+mask", 40.0, np.random.default_rng(0)).name == "wait+mask"
-    assert policy_help("mask") == "of stale views, pixels that were moving count for less"
+    assert policy_help("mask") == "pixels of stale views that were moving count for less"
     what = "frames no older than omega (6.12-6.14)"
     assert policy_help("threshold") == f"{what}; value: omega_ms"
     assert policy_help("threshold+mask") == f"{what}; {policy_help('mask')}; value: omega_ms"

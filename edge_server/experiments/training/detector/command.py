@@ -15,19 +15,19 @@ from edge_server.experiments.common.arguments import at_least, command_parser, r
 from freshfield.files import out_folder, write_json
 
 DESCRIPTION = """\
-Train a small detector on variations of our own scenes: the one whose backbone gives the default embeddings,
-or one that finds an object to scan and cuts it out.
+Train a small detector on variations of the synthetic scenes: the one whose backbone gives the default
+embeddings, or one that finds an object to scan and segments it.
 
   edge-server train-detector --out runs/detector              # about 15 minutes on two cores
   edge-server train-detector --of tile --out runs/tile        # about 20
-  edge-server train-detector --quick --out runs/try           # a minute: everything once, little learnt
+  edge-server train-detector --quick --out runs/try           # a minute: every stage once, little is learned
 
-Pictures and boxes are rendered (room, tower, tile with people, carts, balls and drums; --of tile: the tile
-among other things, with its masks), the detector is trained, exported to ONNX in float32 and in static 8
-bits, and each is measured on worlds and cameras that it has never seen. Ctrl-C stops after which the same
-command goes on; the same seed gives the same weights. --start begins from the weights of an
-earlier training. In OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality), with
---of tile tile_fp32.onnx and so on. Use one:
+Images and boxes are rendered (room, tower, tile with people, carts, balls and drums; --of tile: the tile
+among other things, with its masks); the detector is trained, exported to ONNX in float32 and in static int8,
+and each export is evaluated on scenes and cameras that it has never seen. After Ctrl-C the same command
+continues; the same seed gives the same weights. --start begins from the weights of an earlier training. In
+OUT: detector_fp32.onnx, detector_int8.onnx, detector.json (log and quality), with --of tile tile_fp32.onnx
+and so on. To use one:
 
   edge: {embedding: {model: runs/detector/detector_fp32.onnx}}
   edge: {foreground: {detector: runs/tile/tile_int8.onnx}}
@@ -171,17 +171,22 @@ def show(results: dict[str, Any]) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-detector", DESCRIPTION)
     add = parser.add_argument
-    add("--of", choices=("scenes", "tile"), default="scenes", help="what it finds: people, carts, balls and "
-        "drums of our scenes, or the tile, with its mask [%(default)s]")  # fmt: skip
-    add("--out", type=out_folder, metavar="DIR", help="[runs/detector, of tile runs/detector-tile]")
-    add("--seed", type=int, default=0, help="[%(default)s]")
+    add("--of", choices=("scenes", "tile"), default="scenes", help="what to detect: people, carts, balls "
+        "and drums (scenes), or the tile with its mask [%(default)s]")  # fmt: skip
+    add(
+        "--out",
+        type=out_folder,
+        metavar="DIR",
+        help="folder to write [runs/detector; with --of tile runs/detector-tile]",
+    )
+    add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add(
         "--worlds", type=at_least(20), default=400, metavar="N",
-        help="to train on, 8 pictures each [%(default)s]",
+        help="number of training scenes, 8 images each [%(default)s]",
     )  # fmt: skip
-    add("--epochs", type=at_least(1), default=18, metavar="N", help="[%(default)s]")
-    add("--rate", type=float, default=2e-3, help="of learning [%(default)s]")
+    add("--epochs", type=at_least(1), default=18, metavar="N", help="training epochs [%(default)s]")
+    add("--rate", type=float, default=2e-3, help="learning rate [%(default)s]")
     add("--start", type=Path, metavar="FILE", help="checkpoint.pt of an earlier training to begin from")
-    add("--quick", action="store_true", help="20 worlds, 2 epochs: to try it out")
+    add("--quick", action="store_true", help="20 scenes, 2 epochs: to try it out")
     add("--json", action="store_true", help="print detector.json instead of a summary")
     return parser

@@ -27,12 +27,12 @@ Fit the perceptual distance of the shipped detector's backbone (thesis 3.34, 3.3
 
   edge-server train-perceptual --lpips ~/data/lpips --out runs/perceptual
 
-Renderings of our own scenes are distorted in ten ways (blur, noise, JPEG, exposure, stale, ghost, coarse,
-displaced, floaters, warped) at random strength; weights that are not negative and a power are fitted to what
-LPIPS says of them, and the rank correlation with LPIPS is measured on variations that were not fitted to,
-and on what a field of ours renders of the shipped scenes while it learns. All of these are room, tower or
-tile; for a scene of another kind look at what is found with one scene left out of the fit altogether. Needs
-the weights of LPIPS; whoever uses the distance does not. In OUT: perceptual.npz and perceptual.json.
+Renderings of the synthetic scenes are distorted in ten ways (blur, noise, JPEG, exposure, stale, ghost,
+coarse, displaced, floaters, warped) at random strength. Non-negative weights and a power are fitted to their
+LPIPS; the rank correlation with LPIPS is measured on variations outside the fit, and on renderings of a field
+in training. All of these are room, tower or tile; for other kinds of scenes, see the results with one scene
+left out of the fit. Needs LPIPS weights; using the distance does not. In OUT: perceptual.npz and
+perceptual.json.
 """
 # Range of the power, and the start of its search.
 POWERS, _START = (0.3, 2.0), 0.7
@@ -232,9 +232,15 @@ def show(results: dict[str, Any]) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
-    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    add("--out", type=out_folder, default="runs/perceptual", metavar="DIR", help="[%(default)s]")
-    add("--seed", type=int, default=0, help="[%(default)s]")
-    add("--quick", action="store_true", help="8 worlds, small pictures: to try it out")
+    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add(
+        "--out",
+        type=out_folder,
+        default="runs/perceptual",
+        metavar="DIR",
+        help="folder to write [%(default)s]",
+    )
+    add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
+    add("--quick", action="store_true", help="8 scenes, small images: to try it out")
     add("--json", action="store_true", help="print perceptual.json instead of a summary")
     return parser

@@ -48,9 +48,9 @@ from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
-Learns when and of which views to update the field: decisions are drawn from the scenario in virtual time,
+Learn when to update the field and from which views: decisions are drawn from the scenario in virtual time,
 each action is carried out by a real field fit and rewarded on a held-out camera at the instant of
-publication. Another camera, which is not trained on either, reports how well it learnt.
+publication. Another camera, which is not trained on either, reports how well the policy has learned.
 
   edge-server train-scheduler room19 --out runs/select
   edge-server train-scheduler room19 --kind wait --reward corrected --episodes 200 --out runs/wait
@@ -62,25 +62,25 @@ publication. Another camera, which is not trained on either, reports how well it
   --kind wait-arrived   the same for views that arrive meanwhile, however old (6.16, algorithm 2)
 
   --hold MS          the scheduler decides in the running deployment, every MS milliseconds; the reward is
-                     what is shown until the next decision, with computing charged (edge.compute). The field
-                     is the scenario's
+                     for what is shown until the next decision, with computing charged (edge.compute). The
+                     field is the scenario's
 
-  --on whole | moving   whose PSNR it is. Of the whole image of a scene that hardly moves it teaches to ignore
-                        how old views are; where nothing moves there are no moving pixels
+  --on whole | moving   pixels that the reward's PSNR is over. In a scene that hardly moves, the whole image
+                        teaches to ignore how old views are; where nothing moves there are no moving pixels
 
-  --reward set        0.02 PSNR + 0.5 SSIM - LPIPS (5.19); usual for select
-  --reward corrected  -F_w (6.36-6.38), a better SSIM rewarded; usual for threshold and wait
+  --reward set        0.02 PSNR + 0.5 SSIM - LPIPS (5.19); default for select
+  --reward corrected  -F_w (6.36-6.38) with the sign of SSIM corrected; default for threshold and wait
   --reward thesis     -F_w as printed, which rewards a worse SSIM
 
-An episode is --decisions decisions at random instants. Of each, --tries actions are carried out from a copy
-of the same field, so that they can be compared: one that knows the scene, or nothing (--scratch, the thesis).
-In a world each episode has a motion of its own, so that it is tested on motions it never saw. Pictures are
-small (--size) and the field is quick (--field), so that there are many decisions.
+An episode is --decisions decisions at random instants. At each, --tries actions are carried out from copies
+of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as
+in the thesis). In a synthetic scene each episode has its own motion, so that tests are on unseen motions.
+Images are small (--size) and the field is fast (--field), so that there are many decisions.
 
-OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
-apart, OUT/evaluation.csv and summary.json how it does on seeds it was never trained on. With --hold these two
-are OUT/scores.json, of the scenario as it is, and OUT/actor.npz has what deciding needs of the policy. After
-Ctrl-C the same command goes on, bit for bit; so it does whatever --jobs is.
+OUT/policy.npz is the learned policy, OUT/training.csv and .png the learning curve with each term of the
+reward, OUT/evaluation.csv and summary.json its rewards on seeds it was not trained on. With --hold, instead
+of these two, OUT/scores.json has its scores in the unmodified scenario, and OUT/actor.npz the part of the
+policy that decides. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
 """
 
 
@@ -277,44 +277,69 @@ def _parts(text: str) -> tuple[str, ...]:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-scheduler", DESCRIPTION)
     add = parser.add_argument
-    add("scenario", help="scenario file, or the name of a shipped one; it must hold a camera out")
-    add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")
-    add("--episodes", type=int, default=600, metavar="N", help="[%(default)s]")
-    add("--decisions", type=int, default=4, metavar="N", help="of an episode [%(default)s]")
+    add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
+    add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
+    add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
+    add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
     add("--hold", type=float, default=0.0, metavar="MS",
-        help="decide in the running deployment, every MS milliseconds")  # fmt: skip
-    add("--batch", type=int, default=10, metavar="N", help="episodes of one update [%(default)s]")
-    add("--tries", type=int, default=2, metavar="N", help="actions tried at a decision [%(default)s]")
-    add("--reward", choices=tuple(REWARDS), help="[set for select, else corrected]")
-    add("--on", choices=("whole", "moving"), default="whole", help="pixels of the PSNR [%(default)s]")
+        help="decide in the running deployment, every MS milliseconds [single decisions]")  # fmt: skip
+    add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
+    add("--tries", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
+    add(
+        "--reward",
+        choices=tuple(REWARDS),
+        help="reward, see above [set for select and with --hold, else corrected]",
+    )
+    add(
+        "--on",
+        choices=("whole", "moving"),
+        default="whole",
+        help="pixels that the reward's PSNR is over [%(default)s]",
+    )
     add(
         "--distance",
         choices=("lpips", "perceptual", "none"),
         default="lpips",
-        help="the reward's distance; perceptual is the stand-in where LPIPS has no weights [%(default)s]",
+        help="distance in the reward; perceptual: a substitute without LPIPS weights [%(default)s]",
     )
     add("--price", type=float, default=0.0, metavar="R",
-        help="what a view used takes off the reward; free ones hardly ever harm [0]")  # fmt: skip
+        help="cost of each used view, taken off the reward; at 0, policies tend to use all [0]")  # fmt: skip
     add("--report", metavar="CAM,...",
-        help="cameras that only report; none: the one that rewards [the last of several that are held out, "
-        "else one of the training cameras]")  # fmt: skip
+        help="cameras that only report; none: the rewarding one reports [the last of several held-out "
+        "cameras, else one of the training cameras]")  # fmt: skip
     add(
         "--parts",
         default="age,pose",
         metavar="P,...",
-        help=f"of the state: {', '.join(STATE_PARTS)} [%(default)s]",
+        help=f"parts of the state that the policy sees: {', '.join(STATE_PARTS)} [%(default)s]",
     )
-    add("--omegas", metavar="MS,...", help="what threshold and wait choose from; A..B: every one")
+    add(
+        "--omegas",
+        metavar="MS,...",
+        help="ms that threshold and wait choose from: 20,60,120, or A..B: each whole number",
+    )
     add("--network", choices=("pooled", "flat"), default="pooled",
-        help="pooled takes any number of cameras, flat is the thesis's [%(default)s]")  # fmt: skip
-    add("--scratch", action="store_true", help="updates begin with nothing, as in the thesis")
-    add("--fit-steps", type=int, metavar="N", help="of an update [20; 50 with --scratch]")
-    add("--size", type=int, default=64, metavar="PX", help="of a world's pictures, 0: its own [%(default)s]")
+        help="pooled: any number of cameras; flat: the thesis's, a fixed number [%(default)s]")  # fmt: skip
+    add("--scratch", action="store_true", help="each update starts from an empty field, as in the thesis")
+    add("--fit-steps", type=int, metavar="N", help="optimizer steps of an update [20; 50 with --scratch]")
+    add(
+        "--size",
+        type=int,
+        default=64,
+        metavar="PX",
+        help="pixels a side in synthetic scenes; 0: the scenario's [%(default)s]",
+    )
     add("--field", metavar="NAME",
-        help="representation, '': the scenario's ['' with --hold, else splat]")  # fmt: skip
-    add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")
-    add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
-    add("--jobs", type=int, default=usable_cores(), metavar="J", help="processes [%(default)s]")
+        help="representation; '': the scenario's ['' with --hold, else splat]")  # fmt: skip
+    add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
+    add("--test", type=int, default=20, metavar="N", help="unseen seeds to test on at the end [%(default)s]")
+    add(
+        "--jobs",
+        type=int,
+        default=usable_cores(),
+        metavar="N",
+        help="number of worker processes [%(default)s]",
+    )
     add_folders(parser)
-    add("--out", type=out_folder, required=True, metavar="DIR", help="where everything is written")
+    add("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     return parser

@@ -152,25 +152,31 @@ def _named(name: str) -> Judged:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog=f"python -m {__spec__.name}",
-        description="What policies without learning show in a scenario in virtual time, over seeds, each "
-        "minus the first; and what hindsight of each second would win.",
+        description="Compare what policies without learning show in a scenario in virtual time, over seeds, "
+        "each minus the first; and what hindsight of each second would gain.",
     )
-    parser.add_argument(
-        "scenario", help="scenario file, or the name of a shipped one, with computing charged"
-    )
+    parser.add_argument("scenario", help="scenario file, or the name of a shipped one, with edge.compute")
     parser.add_argument(
         "policies", nargs="+", metavar="NAME[:VALUE]",
-        help="as edge.policy; hindsight:MS,MS,... takes each second the threshold that will show most",
+        help="as edge.policy; hindsight:MS,MS,... takes each second the best of these thresholds",
     )  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=8, metavar="N", help="[%(default)s]")
-    parser.add_argument("--seconds", type=float, default=SPAN_MS / 1e3, help="that are scored [%(default)g]")
+    parser.add_argument("--seeds", type=int, default=8, metavar="N", help="number of seeds [%(default)s]")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=SPAN_MS / 1e3,
+        metavar="S",
+        help="seconds that are scored [%(default)g]",
+    )
     parser.add_argument("--costs", type=Path, metavar="FILE",
-        help="of `edge-server costs` [edge.compute of the scenario]")  # fmt: skip
+        help="file written by `edge-server costs` [edge.compute of the scenario]")  # fmt: skip
     parser.add_argument("--slower", type=float, default=1.0, metavar="K",
         help="an edge on which all computing takes K times as long [%(default)g]")  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes [%(default)s]")
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="number of worker processes [%(default)s]"
+    )
     parser.add_argument("--json", type=out_file, required=True, metavar="FILE",
-        help="finished runs: beside it")  # fmt: skip
+        help="write the result to FILE; finished runs are kept beside it")  # fmt: skip
     add_folders(parser)
     args = parser.parse_args(argv)
     try:
