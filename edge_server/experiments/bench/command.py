@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from edge_server.experiments.bench.run import SCENES, BenchError, BenchRun
-from edge_server.experiments.common.arguments import command_parser, parse_options
+from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options
 from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.fields.registry import field_names, make_field
@@ -141,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         help="representations for field, track, drift, options, surface [all]",
     )
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
-    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add_lpips(parser)
     add(
         "--only",
         action="append",

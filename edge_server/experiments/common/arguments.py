@@ -28,8 +28,17 @@ def add_folders(parser: argparse.ArgumentParser) -> None:
     """Add ``--data`` and ``--lpips``, which ``folders_of`` reads."""
     add = parser.add_argument
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--lpips", type=Path, metavar="DIR",
-        help="folder of LPIPS weights [$FRESHFIELD_LPIPS, else lpips/ in the data folder]")  # fmt: skip
+    add_lpips(parser)
+
+
+def add_lpips(parser: argparse.ArgumentParser) -> None:
+    """Add ``--lpips``, which ``weights_folder`` reads."""
+    parser.add_argument(
+        "--lpips",
+        type=Path,
+        metavar="DIR",
+        help="folder of LPIPS weights [$FRESHFIELD_LPIPS, else lpips/ in the data folder]",
+    )
 
 
 def folders_of(args: argparse.Namespace) -> Folders:

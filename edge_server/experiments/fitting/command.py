@@ -19,7 +19,13 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.common.arguments import OptionError, at_least, command_parser, parse_options
+from edge_server.experiments.common.arguments import (
+    OptionError,
+    add_lpips,
+    at_least,
+    command_parser,
+    parse_options,
+)
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
@@ -93,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--option", action="append", default=[], metavar="KEY=VALUE",
         help="option of the field, e.g. levels=12 (--list-options); may be repeated",
     )  # fmt: skip
-    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add_lpips(parser)
     add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")
     add("--resume", action="store_true", help="continue the fit in OUT, up to --seconds in total")
     args = parser.parse_args(argv)

@@ -17,7 +17,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
-from edge_server.experiments.common.arguments import command_parser, parse_options, run_command
+from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
 from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
 from edge_server.experiments.frontier import effort_sweep, update_time
 from edge_server.experiments.frontier.output import write_output
@@ -166,7 +166,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--policy", default="all", metavar="NAME[:VALUE]", help="update policy in figure 2 [%(default)s]")
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
-    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add_lpips(parser)
     add(
         "--points",
         type=out_file,

@@ -8,14 +8,13 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import MODELS, EmbeddingError
-from edge_server.experiments.common.arguments import command_parser, run_command
+from edge_server.experiments.common.arguments import add_lpips, command_parser, run_command
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, Layers, Perceptual, save_coefficients
 from freshfield.files import out_folder, write_json
@@ -232,7 +231,7 @@ def show(results: dict[str, Any]) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
-    add("--lpips", type=Path, metavar="DIR", help="folder of LPIPS weights [$FRESHFIELD_LPIPS]")
+    add_lpips(parser)
     add(
         "--out",
         type=out_folder,
