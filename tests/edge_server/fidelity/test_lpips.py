@@ -96,7 +96,8 @@ def test_the_folder_may_come_from_the_environment(monkeypatch):
 
 
 def test_missing_weights_give_a_reason_that_says_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
+    for name in (FOLDER_VARIABLE, "FRESHFIELD_DATA"):
+        monkeypatch.delenv(name, raising=False)
     lpips, reason = open_lpips()
     assert lpips is None and "--lpips" in reason and FOLDER_VARIABLE in reason
     lpips, reason = open_lpips(tmp_path)

@@ -102,6 +102,7 @@ def test_pairs_are_a_function_of_the_seed():
 def test_without_lpips_there_is_nothing_to_fit_to(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("FRESHFIELD_LPIPS", raising=False)
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     assert edge_server(["train-perceptual", "--quick", "--out", str(tmp_path)]) == 2
     assert "real LPIPS is what is fitted to" in capsys.readouterr().err
 
