@@ -171,7 +171,7 @@ def _add_simulate(commands: Any) -> None:
         type=int,
         default=20_000,
         metavar="N",
-        help="size of a frame, for the bandwidth fault [%(default)s]",
+        help="size of a frame, for bandwidth and mahimahi [%(default)s]",
     )
     sub.add_argument(
         "--slot-ms", type=float, default=1.0, metavar="MS", help="slot of the slotted mean age [%(default)g]"

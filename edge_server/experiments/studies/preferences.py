@@ -14,7 +14,7 @@ from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import Row, scenario_of
-from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, Workload, plan
+from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, SCENES, Workload, plan
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
 from edge_server.fidelity.scorer import Scorer
@@ -49,7 +49,7 @@ class Preferences(Study):
         verdicts: list[Verdict] = []
         parts = ["# " + self.title, ""]
         store = ResultStore.in_lines(request.out / "trials" / "preferences.jsonl")
-        for scene in request.scenes_here(("tile",)):
+        for scene in request.scenes_here(SCENES[request.quick]):
             answered, captured, text = self._of_scene(request, scene, store)
             verdicts += judge_answers(scene, answered) + judge_captures(scene, captured)
             rows += [{"scene": scene, **row} for row in answered]

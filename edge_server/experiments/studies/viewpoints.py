@@ -40,6 +40,7 @@ ARMS = {
     "coverage, short way": ("coverage", 0.3),
 }  # fmt: skip
 JUDGED = 8  # views of table 4.3 and of the figures
+SCENES = {True: ("tile",), False: ("tile", "lego", "kitchen", "cell")}  # by whether it is a quick pass
 _SHOWN = ("random", "uniform", "coverage", "FisherRF")
 _METRICS = ("psnr_db", "ssim", "lpips")
 
@@ -72,7 +73,7 @@ class Viewpoints(Study):
         rows: list[Row] = []
         verdicts: list[Verdict] = []
         parts = ["# " + self.title, ""]
-        for scene in request.scenes_here(("tile",) if request.quick else ("tile", "kitchen")):
+        for scene in request.scenes_here(SCENES[request.quick]):
             stage = open_stage(str(scenario_of(scene).path), work.candidates, work.size, request.folders.data)
             scorer = Scorer(lpips, background=stage.background)
             counts = tuple(c for c in work.counts if c <= int(stage.candidates.reachable.sum()))
