@@ -199,7 +199,7 @@ def baselines() -> str:
     for scene in ("tile", "room", "kitchen", "lego", "fox"):
         part = found[scene]
         known = part["baseline"]
-        rows.append([part["scene"], part["angle_deg"], known["mean_color_db"], known["nearest_view_db"]])
+        rows.append([part["scene"], part["angle_deg"], known["mean_colour_db"], known["nearest_view_db"]])
     return table(
         ["scene", "held-out view to nearest other, degrees", "mean color, dB", "nearest view, dB"], rows
     )

@@ -39,8 +39,8 @@ class Walk:
     direction: 1.0 is counterclockwise from above, -1.0 clockwise.
     start_s: time into the loop at instant 0.
     course: one of ``COURSES``. loop: round and round; stops: a rest of PERIOD_UNIT_S after each
-        PERIOD_UNIT_S;
-        reverses: half a loop and backwards again; jumps: half a loop, then a jump back to its start.
+        PERIOD_UNIT_S; reverses: half a loop and backwards again; jumps: half a loop, then a jump back to its
+        start.
     """
 
     center: tuple[float, float]

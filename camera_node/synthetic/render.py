@@ -2,8 +2,7 @@
 
 Static parts are cast, textured, lit and shadowed once per camera and kept. A frame then costs only the rays
 within the moving parts' bounding spheres. Shading is Lambertian under a soft light and a sky-to-ground
-ambient
-term: it depends only on the surface point, not on the viewer.
+ambient term: it depends only on the surface point, not on the viewer.
 
 Effects may add specular reflection, shadows of moving parts and a medium (camera_node.synthetic.effects),
 which are computed only then.

@@ -1,8 +1,7 @@
 """Two-state hidden Markov model in continuous time: likelihood, maximum, intervals (thesis 6.24 to 6.27).
 
 The hidden state is a continuous-time Markov chain with generator Q (6.26). Two kinds of observations depend
-on
-it: a frame's delay, exponential with the mean of the state in which it started, and the arrivals, Poisson
+on it: a frame's delay, exponential with the mean of the state in which it started, and the arrivals, Poisson
 with the rate of the state (MMPP). While ``c`` cameras wait for arrivals, the joint probability of the state
 and of no arrival evolves by exp((Q - c L) u), with L the diagonal matrix of rates; an arrival multiplies it
 by the rate. There is no grid of slots.

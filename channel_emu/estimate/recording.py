@@ -26,7 +26,7 @@ from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 
-# Longer than any stream lives; longer delays are left out.
+# Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
 MAX_DELAY_MS = 1e9
 _MAX_ROWS_MS = 1e12
 _MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
@@ -42,7 +42,7 @@ class Camera:
 
     arrived_ms: when the link's arrival process sampled the frame; NaN if it did not.
     started_ms: start of transmission; NaN if it did not start, or is not known to have started.
-    delay_ms: from the start to the delivery; NaN likewise.
+    delay_ms: from the start until the frame was due, also if it was then lost; NaN likewise.
     outcome: a ``link.EventKind``, or "" for a frame that was still inside.
     """
 

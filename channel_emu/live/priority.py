@@ -1,8 +1,7 @@
 """Asks the system to run the emulator as soon as a message is due, even while other processes compute.
 
 Lateness of a timer at the 50th / 90th / 99th percentile, measured on two cores with two computing processes
-on
-each: by default 0.19 / 2.8 / 9.9 ms; with niceness -15 no better (schedulers that group by session or
+on each: by default 0.19 / 2.8 / 9.9 ms; with niceness -15 no better (schedulers that group by session or
 container compare niceness only within a group); with a short slice 0.21 / 0.5 / 4.4 ms; with real-time round
 robin 0.20 / 0.25 / 0.6 ms.
 """

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from freshfield.untrusted import UntrustedError, read_yaml
+from freshfield.untrusted import UntrustedError, read_json, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
@@ -179,9 +179,9 @@ def delays_ms(path: Path) -> list[float]:
     text = read_text(path)
     if text.startswith("{"):
         try:
-            records = [json.loads(line) for line in text.split("\n")[1:-1]]
+            records = [read_json(line) for line in text.split("\n")[1:-1]]
             return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
-        except (KeyError, TypeError, ValueError, RecursionError):
+        except (KeyError, TypeError, ValueError):
             raise SpellingError(f"{path}: neither delays nor a trace of this emulator") from None
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}

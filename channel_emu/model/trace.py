@@ -25,7 +25,8 @@ from typing import Any, TextIO
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
-from freshfield.untrusted import UntrustedError, read_json
+from freshfield.scenario import ScenarioError
+from freshfield.untrusted import read_json
 
 VERSION = 2
 _INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
@@ -125,7 +126,9 @@ def read(path: Path) -> Trace:
             raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
         config = channel_from_mapping(head["channel"], f"{path}: channel")
         seed = int(head["seed"])
-    except (UntrustedError, KeyError, TypeError, OverflowError):
+    except (ScenarioError, TraceError):
+        raise
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise TraceError(f"{path}: not a freshfield trace: the first line has no trace header") from None
     records = []
     for number, line in enumerate(lines[1:-1], start=2):

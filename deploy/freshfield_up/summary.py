@@ -28,7 +28,7 @@ def summarize(out: Path) -> str:
         f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run{views} "
         f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
         f"LPIPS {fmt(final.get('lpips'), '.3f')})",
-        f"baselines  mean color {fmt(baseline.get('mean_color_db'), '.1f')} dB, "
+        f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
         f"nearest view {fmt(baseline.get('nearest_view_db'), '.1f')} dB",
         f"age        mean {fmt(age.get('mean'), '.0f')} ms, p95 {fmt(age.get('p95'), '.0f')} ms",
         f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "

@@ -18,7 +18,7 @@ from edge_server.fields import View
 class Baseline:
     """PSNR in dB of both baselines; None where there was no training view."""
 
-    mean_color_db: float | None
+    mean_colour_db: float | None
     nearest_view_db: float | None
 
 
@@ -29,12 +29,12 @@ def baseline(
     if not views:
         return Baseline(None, None)
     return Baseline(
-        mean_color_db=mean_color_db([v.image for v in views], truth, background),
+        mean_colour_db=mean_colour_db([v.image for v in views], truth, background),
         nearest_view_db=view_db(nearest_view(views, camera_to_world).image, truth, background),
     )
 
 
-def mean_color_db(images: Sequence[NDArray], truth: NDArray, background: Color = BLACK) -> float:
+def mean_colour_db(images: Sequence[NDArray], truth: NDArray, background: Color = BLACK) -> float:
     """PSNR of a flat image in the mean color of the training images (each image weighs the same)."""
     mean = np.mean([to_unit(i, "training view", background).mean((0, 1)) for i in images], axis=0)
     return psnr_of_mse(float(((to_unit(truth, "truth", background) - mean) ** 2).mean()))

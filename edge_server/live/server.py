@@ -412,7 +412,7 @@ class EdgeServer:
             },
             "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
-            "baseline": {name: mean(name) for name in ("mean_color_db", "nearest_view_db")},
+            "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
             "learning": None if self.trainer is None else self.trainer.policy.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,

@@ -53,7 +53,7 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         top, bottom = axes[:, 0]
         _plot(top, series, "psnr_db", BLUE, "whole image")
         _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
-        flat = {"nearest_view_db": "nearest view", "mean_color_db": "mean color"}
+        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
         for (key, label), dash in zip(flat.items(), ("--", ":")):
             if found["baseline"].get(key) is not None:
                 top.axhline(found["baseline"][key], color=GRAY, linestyle=dash, linewidth=1.2, label=label)

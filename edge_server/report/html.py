@@ -131,7 +131,7 @@ def _fidelity_table(report: Report) -> str:
     if not fit and found["shown"]["psnr_db"] is not None:
         shown = [_n(found["shown"].get(metric), digits) for metric, digits in metrics.items()]
         rows.insert(1, ["shown, last fifth of the run", *shown])
-    for name, label in (("nearest_view_db", "nearest training view"), ("mean_color_db", "mean color")):
+    for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean color")):
         rows.append([label, _n(found["baseline"][name], 2), *[""] * (len(metrics) - 1)])
     remarks = []
     if SELECTED in found["scored_on"]:

@@ -139,7 +139,7 @@ def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]
     return {
         "final": _means(late, METRICS),
         "mean": _means(series, METRICS),
-        "baseline": {name: baseline.get(name) for name in ("mean_color_db", "nearest_view_db")},
+        "baseline": {name: baseline.get(name) for name in ("mean_colour_db", "nearest_view_db")},
         "lpips_missing": edge.get("lpips_missing"),
         "lpips_network": edge.get("lpips_network"),
         "scored_on": sorted({str(row["scored_on"]) for row in series if row.get("scored_on")}),

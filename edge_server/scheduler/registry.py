@@ -25,7 +25,7 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
     "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
-    "whittle": (index.Whittle, "the k views that most reduce the squared ages of used views; value: k"),
+    "whittle": (index.Whittle, "the k views that most reduce the squared ages of frames used last; value: k"),
     "aoii": (index.IncorrectAge, "the k views with the largest age of incorrect information; value: k"),
     "covariance": (index.PredictedCovariance, "the k views whose predicted variance falls most; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),

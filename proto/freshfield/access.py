@@ -183,8 +183,8 @@ class HttpDoor:
         """Refuse requests that another web site made a browser send.
 
         Raises HttpRefused if ``origin`` is not the page itself (cross-site request), or if ``host`` is not a
-        name of this machine (DNS rebinding). Host is not checked if there is a login, because browsers do not
-        send it under another name; an IP address always passes, because it is the one connected to.
+        name of this machine (DNS rebinding). Host is not checked if there is a login, because a browser does
+        not send the login to another name; an IP address always passes, because it is the one connected to.
         """
         name = (host or "").lower()
         name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]

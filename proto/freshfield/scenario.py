@@ -263,7 +263,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return Path(value)
     names = {int: "a whole number", str: "text", bool: "true or false"}
     if type(value) is not hint:
-        raise ScenarioError(f"{where}: expected {names.get(hint, hint)}, got {value!r}")
+        quote = ": put it in quotes" if hint is str and type(value) in (int, float) else ""
+        raise ScenarioError(f"{where}: expected {names.get(hint, hint)}, got {value!r}{quote}")
     return value
 
 

@@ -54,21 +54,23 @@ class _Loader(yaml.SafeLoader):
 
 
 class YamlWriter(yaml.SafeDumper):
-    """For ``yaml.dump``: quotes the words that ``read_yaml`` would take for numbers."""
+    """For ``yaml.dump``: quotes text that ``read_yaml`` or a reader of YAML 1.1 would take for a number."""
 
 
-# Numbers as YAML 1.2 writes them. In 1.1, which PyYAML reads, 1:30 is 90, 010 is 8, and 1e-3 is a word.
+# Numbers nearly as YAML 1.2 writes them: in 1.1, which PyYAML reads, 1:30 is 90, 010 is 8, and 1e-3 is text.
+# What is rather a name or a serial number stays text: 08, 048322070531, 19443010E1234567.
 _INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
 _NUMBERS = {
-    _INT: r"([-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$",
-    _FLOAT: r"[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$",
+    _INT: r"([-+]?(0|[1-9][0-9]*(_[0-9]+)*)|0x[0-9a-fA-F]+|0o[0-7]+)$",
+    _FLOAT: r"[-+]?((\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]{1,3})?|\.(inf|Inf|INF))$|"
+    r"\.(nan|NaN|NAN)$",
 }
-for _kind in (_Loader, YamlWriter):
-    _kind.yaml_implicit_resolvers = {
-        first: [(tag, form) for tag, form in known if tag not in _NUMBERS]
-        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-    for _tag, _form in _NUMBERS.items():
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, form) for tag, form in known if tag not in _NUMBERS]
+    for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _form in _NUMBERS.items():
+    for _kind in (_Loader, YamlWriter):
         _kind.add_implicit_resolver(_tag, re.compile(_form), list("-+.0123456789"))
 _Loader.add_constructor(_INT, _Loader.construct_whole_number)
 

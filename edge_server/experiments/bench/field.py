@@ -266,7 +266,7 @@ def table(figures: dict[str, Any]) -> str:
     bases = [
         (
             part["scene"], f"{part['angle_deg']:.1f}",
-            *(number(part["baseline"][key], 1) for key in ("mean_color_db", "nearest_view_db")),
+            *(number(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
         )
         for part in scenes.values()
     ]  # fmt: skip

@@ -308,7 +308,7 @@ def table(figures: dict[str, Any]) -> str:
             f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
             _both(whole, moving, "median_db"),
             f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
-            ", ".join(_db(bases[key]) for key in ("mean_color_db", "nearest_view_db")),
+            ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
             _db(of_field.get("outside_cores")),
         ))  # fmt: skip
     return markdown_table(head.split("|"), rows)

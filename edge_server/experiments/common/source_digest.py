@@ -17,8 +17,8 @@ _EXCLUDED = (
     "edge_server/page", "edge_server/report", f"{_EXPERIMENTS}/studies",
     f"{_EXPERIMENTS}/common/statistics.py", f"{_EXPERIMENTS}/common/arguments.py",
 )  # fmt: skip
-# The one file below them that computes results.
-_INCLUDED = f"{_EXPERIMENTS}/studies/trial.py"
+# The files below them that compute results.
+_INCLUDED = tuple(f"{_EXPERIMENTS}/studies/{name}.py" for name in ("trial", "viewpoints", "preferences"))
 
 
 @cache
@@ -29,6 +29,6 @@ def source_digest() -> str:
         root = Path(str(package.__file__)).parent
         for path in sorted(root.rglob("*.py")):
             name = f"{root.name}/{path.relative_to(root).as_posix()}"
-            if name == _INCLUDED or not name.startswith(_EXCLUDED):
+            if name in _INCLUDED or not name.startswith(_EXCLUDED):
                 digest.update(name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

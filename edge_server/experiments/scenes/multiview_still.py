@@ -77,7 +77,7 @@ def mean_baselines(
     """PSNR of the baselines without a field, as means over the held-out views; None without any. color: the
     background."""
     found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
-    names = ("mean_color_db", "nearest_view_db")
+    names = ("mean_colour_db", "nearest_view_db")
     return {name: statistics.fmean(getattr(b, name) for b in found) if found else None for name in names}
 
 

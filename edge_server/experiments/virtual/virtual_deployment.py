@@ -2,8 +2,8 @@
 
 It uses the live parts with a virtual clock. With one seed a run repeats bit for bit, faults included.
 ``Compute`` sets the cost of an update; an update is published when that cost has elapsed. A frame is
-captured, encoded and checksummed only when an update uses it or a fault damages it, which does not change
-results, because nothing reads a frame earlier.
+captured and encoded only when an update uses it, a fault damages it, or a fault of its link depends on its
+size, which does not change results, because nothing reads a frame earlier.
 """
 
 from __future__ import annotations
@@ -312,6 +312,12 @@ class VirtualDeployment:
             payload=b"",
             clock_offset_ns=offset_ns,
         )
+        if self._links[name].by_size:
+            try:
+                frame = self._with_image(frame)
+            except ValueError:
+                self.failed[name] += 1
+                return
         self.captured[name] += 1
         self._send(frame, now_ns)
 
@@ -324,7 +330,7 @@ class VirtualDeployment:
     def _send(self, frame: Frame, now_ns: int) -> None:
         """Offer a frame to its link."""
         link = self._links[frame.camera]
-        size = len(self._with_image(frame).payload) if link.by_size else 0
+        size = to_request(frame).ByteSize() if link.by_size else 0
         self._take(link.offer(now_ns - self._channel_origin_ns, frame, size)[1])
 
     def _advance_links(self, now_ns: int) -> None:

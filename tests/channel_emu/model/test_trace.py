@@ -101,6 +101,7 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
         (1, '"camera"', '"kamera"', "line 2 is not a trace record"),
         (1, '"bytes":', '"bytes":1,"bytes":', "line 2 is not a trace record"),
         (0, '"seed":', '"seed":1,"seed":', "no trace header"),
+        (0, '"seed":', '"seed":NaN,"of":', "no trace header"),
         (1, '"offered_ns":', '"offered_ns":-', "line 2: offered_ns: expected nanoseconds"),
         (1, '"outcome":"', '"outcome":"un', "line 2: outcome: unknown"),
         (1, '"bytes":', '"bytes":-', "line 2: bytes: expected a message's size, got -1"),

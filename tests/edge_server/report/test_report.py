@@ -38,7 +38,7 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
         "refused",
     }  # fmt: skip
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
-    assert set(report["fidelity"]["baseline"]) == {"mean_color_db", "nearest_view_db"}
+    assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
     assert report["fidelity"]["lpips_missing"] is None
     assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
     assert report["channel"] == CHANNEL

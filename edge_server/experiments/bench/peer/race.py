@@ -159,7 +159,7 @@ def table(figures: Mapping[str, Any]) -> str:
             rows.append((scene, f"`{name}`", len(runs), *times, last, f"{max(outside, default=0.0):.1f}"))
     heads = ("scene", "contestant", "runs", *(f"s to {t} dB" for t in _T), "best, dB", "outside cores")
     about = "; ".join(
-        f"`{s}`: {a['scene']}, {a['held_out']} held out, mean color {a['mean_color_db']:.1f} dB"
+        f"`{s}`: {a['scene']}, {a['held_out']} held out, mean color {a['mean_colour_db']:.1f} dB"
         for s in SCALES
         if (a := figures.get(s, {}).get("about"))
     )

@@ -1,8 +1,7 @@
 """Measures how much of the moving bodies each camera sees, for an oracle policy and for testing embeddings.
 
 It is computed from the scene itself, which no policy knows. A study uses it to find out why embeddings do or
-do
-not help: whether they show motion, whether knowing it would help, and whether it was learned.
+do not help: whether they show motion, whether knowing it would help, and whether it was learned.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ class SeesMotion:
 
 def embedding_areas(visible: VisibleMotion, moments: Sequence[DecisionPoint]) -> tuple[float, float]:
     """How well a linear rule predicts whether a camera sees motion, from the embedding of its frame and from
-    the
-    identity of the camera: areas under the ROC curve. The rules are fitted to every other episode and
+    the identity of the camera: areas under the ROC curve. The rules are fitted to every other episode and
     measured on the others; NaN if all cameras see motion, or none."""
     rows, names, seen, episodes = [], [], [], []
     for moment in moments:

@@ -191,8 +191,7 @@ def augmented(
 ) -> tuple[NDArray[np.float32], Boxes]:
     """Randomly augment an image (side, side, 3), returned in [0, 1], and its boxes: mirrored, scaled,
     shifted, with a random exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the
-    mask of its
-    single object, from 0 to 255: it is transformed as well, and the box is computed from it."""
+    mask of its single object, from 0 to 255: it is transformed as well, and the box is computed from it."""
     side = image.shape[0]
     boxes = boxes.copy()
     if rng.random() < 0.5:

@@ -65,7 +65,7 @@ def test_field(tmp_path, monkeypatch):
     row = found["tile"]["ngp"]
     assert row["steps_per_s"] > 0.0 and row["samples_per_s"] > row["rays_per_s"]
     assert row["render_128_ms"] < row["render_256_ms"]
-    assert row["best_db"] > max(18.0, found["tile"]["baseline"]["mean_color_db"])
+    assert row["best_db"] > max(18.0, found["tile"]["baseline"]["mean_colour_db"])
     assert (tmp_path / "field.png").stat().st_size > 1000
     assert "| tile | ngp | 1 | 0.3: " in (tmp_path / "bench.md").read_text()
 
@@ -114,7 +114,7 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, capsys, monkeypa
         # The owner's condition for our own scenes.
         assert part["angle_deg"] >= 15.0
         bases = part["baseline"]
-        assert f"| {part['scene']} | {part['angle_deg']:.1f} | {bases['mean_color_db']:.1f} |" in text
+        assert f"| {part['scene']} | {part['angle_deg']:.1f} | {bases['mean_colour_db']:.1f} |" in text
         assert f"| {scene} | ngp | 2 | 0.5: 24.0, 1: 25.0 | 0.50, -, -, - | 0.25 |" in text
         assert f"| {scene} | ngp | 71.50 | 98,765 | 2,500,000 | 8.25 | 31.00 | 0.50 |" in text
     assert "| ngp | 11.50 | 10.25 | 0.38 | 0.25 | 456.00 | - |" in text

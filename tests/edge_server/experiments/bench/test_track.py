@@ -179,7 +179,7 @@ def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monke
     assert edge_server([*words, str(tmp_path / "bench.json")]) == 0
     found = json.loads((tmp_path / "bench.json").read_text())["track"]["kitchen"]
     assert found["scene"] == "kitchen: 4 views of 24 x 24" and found["ngp"]["1_s"]["updates"] == 3
-    assert found["baseline"]["mean_color_db"] > 0.0
+    assert found["baseline"]["mean_colour_db"] > 0.0
     monkeypatch.delenv("FRESHFIELD_DATA")
     assert edge_server([*words, str(tmp_path / "none.json")]) == 1
     assert "kitchen: set FRESHFIELD_DATA" in capsys.readouterr().err
