@@ -115,6 +115,11 @@ VERDICTS = (
     ("ppo-wait", "room, ch6, age -0.015/ms, threshold", "best fixed"),
     ("ppo-wait", "room, ch6, age -0.015/ms", ""),
     ("ppo-wait", "room, ch6, age -0.015/ms, threshold", "the ages tell"),
+    ("viewpoints", "tile, FisherRF", ""),
+    ("viewpoints", "tile, FisherRF, 8 views", ""),
+    ("viewpoints", "tile, FisherRF, 8 views, path", ""),
+    ("preferences", "tile, policy, object, 8 views", ""),
+    ("preferences", "tile, policy, object, 8 views, path", ""),
     ("metrics", "LPIPS", ""),
     ("metrics", "SSIM", "lowest"),
 )
@@ -395,6 +400,27 @@ def verdicts() -> str:
     return table(["figure", "claim", "where", "found here", "verdict"], rows)
 
 
+def taught() -> str:
+    """What policies taught by preferences gain over others, the lowest and the highest of them, by scene."""
+    verdicts = measured("docs/results/thesis/preferences.json")["verdicts"]
+    found: dict[str, dict[str, list[tuple[float, str]]]] = {}
+    for v in verdicts:
+        scene, kind, *_ = v["about"].split(", ")
+        if kind == "policy":
+            of = re.sub(r" \(.*", "", v["claim"])
+            found.setdefault(scene, {}).setdefault(of, []).append((v["interval"][0], v["verdict"]))
+    columns = {"better than random": "dB over random views", "better than FisherRF": "dB over FisherRF",
+               "shorter than random's": "path, m shorter than random views'"}  # fmt: skip
+
+    def cell(of: list[tuple[float, str]]) -> str:
+        values, won = [mean for mean, _ in of], sum(verdict == "holds" for _, verdict in of)
+        shown = {0: "none", len(of): "all"}.get(won, str(won))
+        return f"{min(values):.1f} to {max(values):.1f}; shown for {shown}"
+
+    rows = [[f"`{scene}`", *(cell(of[name]) for name in columns)] for scene, of in found.items()]
+    return table(["8 views of", *columns.values()], rows)
+
+
 def figures() -> str:
     """A section for each study: how it was run, how often each claim holds, and folded, where."""
     names = [study["study"] for study in studies()]
@@ -632,6 +658,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "hindsight-overload": lambda: compared("hindsight-overload"),
     "figures": figures,
     "verdicts": verdicts,
+    "taught": taught,
     "masks": masks,
     "scanned": scanned,
     "cell-meshes": cell_meshes,
