@@ -182,6 +182,7 @@ class VirtualDeployment:
             raise ValueError("the cameras and the buffer's are not the same, or in another order")
         self._channel = Channel(channel, seed)
         self._links: dict[str, Link] = {name: self._channel.link(name) for name in self._cameras}
+        self._by_size = any(link.by_size for link in self._links.values())
         self._admission = FrameAdmission(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
@@ -312,7 +313,7 @@ class VirtualDeployment:
             payload=b"",
             clock_offset_ns=offset_ns,
         )
-        if self._links[name].by_size:
+        if self._by_size:
             try:
                 frame = self._with_image(frame)
             except ValueError:
@@ -329,9 +330,8 @@ class VirtualDeployment:
 
     def _send(self, frame: Frame, now_ns: int) -> None:
         """Offer a frame to its link."""
-        link = self._links[frame.camera]
-        size = to_request(frame).ByteSize() if link.by_size else 0
-        self._take(link.offer(now_ns - self._channel_origin_ns, frame, size)[1])
+        size = to_request(frame).ByteSize() if self._by_size else 0
+        self._take(self._links[frame.camera].offer(now_ns - self._channel_origin_ns, frame, size)[1])
 
     def _advance_links(self, now_ns: int) -> None:
         for link in self._links.values():
