@@ -9,14 +9,7 @@ from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import Link
 from channel_emu.model.queue_server import QueueServer
-from channel_emu.model.service_time import (
-    ServiceTime,
-    WorkSampler,
-    exponential,
-    gamma,
-    lognormal,
-    replayed,
-)
+from channel_emu.model.service_time import ServiceTime, WorkSampler, exponential, gamma, lognormal, replayed
 from channel_emu.model.traffic import PoissonArrivals
 
 

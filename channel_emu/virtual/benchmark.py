@@ -51,10 +51,7 @@ def periodic_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 
 
 
 def bench_simulate(
-    cameras: int = 18,
-    seconds: float = 2000.0,
-    rounds: int = 5,
-    loop_seconds: float = 60.0,
+    cameras: int = 18, seconds: float = 2000.0, rounds: int = 5, loop_seconds: float = 60.0
 ) -> dict[str, Any]:
     """Speed in link-slots (of 1 ms) a second of wall time: simulator with and without ages, and plain loop.
 

@@ -30,10 +30,7 @@ class Network:
     """
 
     def __init__(
-        self,
-        name: str,
-        parameters: Mapping[str, NDArray[np.float32]],
-        lin: Sequence[NDArray[np.float32]],
+        self, name: str, parameters: Mapping[str, NDArray[np.float32]], lin: Sequence[NDArray[np.float32]]
     ) -> None:
         self._slices = {"alex": _alex_slices, "squeeze": _squeeze_slices}[name]
         self._parameters = {key: torch.from_numpy(array) for key, array in parameters.items()}

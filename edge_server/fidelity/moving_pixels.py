@@ -42,11 +42,7 @@ def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = BOUND
     return mask
 
 
-def frames_at_lags(
-    times_ns: Sequence[int],
-    present_ns: int,
-    lags_ms: Sequence[float] = LAGS_MS,
-) -> list[int]:
+def frames_at_lags(times_ns: Sequence[int], present_ns: int, lags_ms: Sequence[float] = LAGS_MS) -> list[int]:
     """Indices into ``times_ns`` of the frames nearest to each of ``lags_ms`` before ``present_ns``, without
     repeats.
 

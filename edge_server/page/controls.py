@@ -61,9 +61,7 @@ class ControlPanel:
         self.frontier = gui.add_html("", visible=state.frontier is not None)
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
         self.view = gui.add_dropdown(
-            "view",
-            VIEWS,
-            hint="Automatic shows the field's points at first, then its rendering.",
+            "view", VIEWS, hint="Automatic shows the field's points at first, then its rendering."
         )
         self.occlude = gui.add_checkbox("occlusion", False, hint="Hide cameras behind the field's surfaces.")
         self._paused: bool | None = None

@@ -42,11 +42,7 @@ class DetailLevel:
 # While the visitor moves, at rest, and at rest with nothing new to show. An image below min_rows is not worth
 # its fixed cost, the wait for a training step of the field to end.
 MOVING, NEWER = 0, 1
-LEVELS = (
-    DetailLevel(0.08, 0.5, 64, 240),
-    DetailLevel(0.20, 0.2, 120, 480),
-    DetailLevel(1.2, 0.15, 200, 720),
-)
+LEVELS = (DetailLevel(0.08, 0.5, 64, 240), DetailLevel(0.20, 0.2, 120, 480), DetailLevel(1.2, 0.15, 200, 720))
 # Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second.
 LEAST_S = 0.03
 BAND_S = 0.1

@@ -103,10 +103,7 @@ class FrameCounts:
         """Frames captured and copies sent that have no end by the sums of the module's docstring: both 0
         where the sums hold, negative where more ended than there were."""
         ended = sum(getattr(self, name) for name in ENDS if name != "rejected") + self.rejected.total()
-        return (
-            self.captured - self.replaced - self.waiting - self.sent,
-            self.sent + self.duplicated - ended,
-        )
+        return (self.captured - self.replaced - self.waiting - self.sent, self.sent + self.duplicated - ended)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, in the order in which a frame passes the states."""

@@ -37,11 +37,7 @@ class LoadMeter:
         wall = max(now[0] - then_s, 1e-6)
         row: dict[str, Any] = {
             "t_s": round(t_s, 3),
-            self._name: {
-                "rss_mb": rss_mb(),
-                "cpu": round((now[1] - own_then) / wall, 2),
-                "pid": os.getpid(),
-            },
+            self._name: {"rss_mb": rss_mb(), "cpu": round((now[1] - own_then) / wall, 2), "pid": os.getpid()},
         }
         if now[2] is not None and busy_then is not None:
             row["machine"] = {"cpu": round((now[2] - busy_then) / wall, 2)}

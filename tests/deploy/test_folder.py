@@ -67,10 +67,7 @@ def test_anything_else_is_refused_and_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_still_going_on_is_refused(tmp_path: Path) -> None:
-    with (
-        prepare(tmp_path, {"run": 1}),
-        pytest.raises(FolderError, match="another run is writing"),
-    ):
+    with prepare(tmp_path, {"run": 1}), pytest.raises(FolderError, match="another run is writing"):
         prepare(tmp_path, {"run": 2})
     assert json.loads((tmp_path / MARKER).read_text()) == {"run": 1}
 

@@ -10,14 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from freshfield.machine_load import (
-    LoadMeter,
-    cpu_s,
-    outside_cores,
-    outside_load,
-    peak_rss_mb,
-    rss_mb,
-)
+from freshfield.machine_load import LoadMeter, cpu_s, outside_cores, outside_load, peak_rss_mb, rss_mb
 
 
 @pytest.mark.alone

@@ -35,10 +35,7 @@ from freshfield.geometry import Pose
 
 Rows = list[dict[str, Any]]
 
-INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {
-    "nearest": None,
-    "line": Pose.interpolate,
-}
+INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {"nearest": None, "line": Pose.interpolate}
 PERIODS_MS = (2.0, 8.0, 20.0, 50.0, 100.0, 200.0)
 SPEEDS_M_PER_S = (0.05, 0.1, 0.25, 0.5, 1.0)
 COUNTS = (4, 6, 8, 10, 15, 20, 30, 50)

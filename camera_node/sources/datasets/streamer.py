@@ -13,14 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from camera_node.config import (
-    FPS_RANGE,
-    RecordedConfig,
-    TrajectoryConfig,
-    VideoConfig,
-    errors_of,
-    find_data,
-)
+from camera_node.config import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
 from camera_node.pose.providers import FixedPose, PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source, rate

@@ -58,10 +58,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "voxel": ("voxel", {}),
 }
 # Kinds of depth for meshes, and their settings.
-DEPTHS = {
-    "of the field": MeshSettings(sharpen=False),
-    "sharpened": MeshSettings(),
-}
+DEPTHS = {"of the field": MeshSettings(sharpen=False), "sharpened": MeshSettings()}
 CELL_FIELD, CELL_STEPS = "ngp", 300
 TARGET = (
     f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
@@ -181,10 +178,7 @@ def _case(
         snapshot = field.snapshot()
         middle = workload.voxels_mm[len(workload.voxels_mm) // 2]
         every = [("tsdf", mm) for mm in workload.voxels_mm]
-        for depth, wanted in (
-            ("of the field", [("tsdf", middle)]),
-            ("sharpened", [*every, ("sdf", middle)]),
-        ):
+        for depth, wanted in (("of the field", [("tsdf", middle)]), ("sharpened", [*every, ("sdf", middle)])):
             seconds: dict[str, float] = {}
             began = time.perf_counter()
 

@@ -18,13 +18,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import (
-    RECORDINGS,
-    BenchError,
-    BenchRun,
-    data_file,
-    result_settings,
-)
+from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, data_file, result_settings
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db

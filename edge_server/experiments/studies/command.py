@@ -9,12 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import (
-    add_folders,
-    command_parser,
-    folders_of,
-    run_command,
-)
+from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.study import StudyRequest, run_study
 from edge_server.experiments.studies.trial import SCENARIOS, scenario_of

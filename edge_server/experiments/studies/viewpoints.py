@@ -14,14 +14,7 @@ from edge_server.experiments.common.source_digest import source_digest
 from edge_server.experiments.common.statistics import Interval, interval, negated, paired
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.studies.drawing import Image, draw_curve, draw_images
-from edge_server.experiments.studies.study import (
-    METRICS,
-    Curve,
-    Study,
-    StudyRequest,
-    Table,
-    Verdict,
-)
+from edge_server.experiments.studies.study import METRICS, Curve, Study, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import Row, scenario_of
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_stage

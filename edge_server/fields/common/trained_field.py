@@ -277,10 +277,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             background=self.view_store.background(),
             random_background=s.background == "random",
         )
-        weights = Weights(
-            distortion=np.float32(s.distortion),
-            guide=np.float32(self._present_guide_weight()),
-        )
+        weights = Weights(distortion=np.float32(s.distortion), guide=np.float32(self._present_guide_weight()))
         self._train(data, recipe, space, weights)
         rays = max(int(batch.rays.sum()), 1)
         self._gather(levels, NOMINAL_RAYS / rays)

@@ -20,11 +20,7 @@ from edge_server.fields.common.supervision import (
     without_views,
 )
 from edge_server.fields.common.trainer_settings import FieldSettings
-from edge_server.fields.common.view_outliers import (
-    RenderPoints,
-    find_outliers,
-    pixel_weights,
-)
+from edge_server.fields.common.view_outliers import RenderPoints, find_outliers, pixel_weights
 from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:

@@ -51,11 +51,7 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def plane_depth(
-    raster: RasterBuffers,
-    gaussians: Gaussians,
-    camera: NDArray[np.float32],
-    lens: Pinhole,
-    slot: int = 0,
+    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32], lens: Pinhole, slot: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) along the rays, scene units, and opacity (H, W). Depth is 0 where the plane is seen at too
     flat an angle.

@@ -14,13 +14,7 @@ from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
-from edge_server.fields.tensorf.kernels.vector_matrix import (
-    CHANNELS,
-    MODES,
-    ROWS,
-    Planes,
-    scatter_planes,
-)
+from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, MODES, ROWS, Planes, scatter_planes
 from edge_server.fields.tensorf.settings import TensorfSettings
 
 assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"

@@ -88,12 +88,7 @@ class OnlineTrainer:
 
 
 def open_online_trainer(
-    path: Path,
-    reward: str,
-    fallback: str,
-    rng: np.random.Generator,
-    lpips_missing: str | None,
-    out: Path,
+    path: Path, reward: str, fallback: str, rng: np.random.Generator, lpips_missing: str | None, out: Path
 ) -> OnlineTrainer:
     """Trainer of the learner in ``path``.
 

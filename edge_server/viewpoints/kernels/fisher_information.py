@@ -16,14 +16,7 @@ import numpy as np
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import fetch_add, is_finite
-from edge_server.fields.splat.kernels.composite import (
-    ALPHA_MAX,
-    SAVED,
-    STRIP,
-    STRIPS,
-    bin_strips,
-    composite,
-)
+from edge_server.fields.splat.kernels.composite import ALPHA_MAX, SAVED, STRIP, STRIPS, bin_strips, composite
 from edge_server.fields.splat.kernels.project import BLOCK, COLOR, MEAN_X, MEAN_Y, RED, TILE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,

@@ -121,8 +121,7 @@ def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["fog", "lens_distortion", "motion_blur", "rolling_shutter", "shadows", "specular", "vignetting"],
+    "name", ["fog", "lens_distortion", "motion_blur", "rolling_shutter", "shadows", "specular", "vignetting"]
 )
 def test_recordings_have_lenses_and_weather_of_their_own(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})

@@ -72,9 +72,7 @@ def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
 
 
 @given(
-    st.tuples(*[st.floats(-1, 1)] * 3),
-    st.tuples(*[st.floats(-1, 1)] * 3),
-    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3)
 )
 def test_two_bones_meet_the_joint(root, tip, pole):
     upper, lower = 0.6, 0.5

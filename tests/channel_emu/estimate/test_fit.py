@@ -201,10 +201,7 @@ def test_drops_of_a_busy_link_come_in_runs(tmp_path: Path) -> None:
         ("0,5\nrain\n", "line 2: expected offered_ms"),
         ("0,5\nnan,7\n", "line 2: expected offered_ms"),
         ("0;7,5\n30;37,5\n", "line 1: expected .* numbers with a point, one separator"),
-        (
-            "offered_ms;delivered_ms\n0,5\n",
-            "line 2: expected .* numbers with a point, one separator",
-        ),
+        ("offered_ms;delivered_ms\n0,5\n", "line 2: expected .* numbers with a point, one separator"),
         ("0\t7,5\n", "line 1: expected .* numbers with a point, one separator"),
     ],
 )

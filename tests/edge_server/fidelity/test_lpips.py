@@ -14,10 +14,7 @@ from tests.conftest import data_dir
 # Values published with the weights: (reference, p0) and (reference, p1) of the authors' example images.
 GOLDEN = {"alex": (0.7219, 0.1376), "squeeze": (0.7110, 0.1479)}
 # On a fox photograph at 270 x 480, Gaussian blur of sigma 0.5, 1, 2, 4 and 8.
-GOLDEN_BLUR = {
-    "alex": (0.022, 0.186, 0.388, 0.593, 0.748),
-    "squeeze": (0.020, 0.146, 0.348, 0.621, 0.824),
-}
+GOLDEN_BLUR = {"alex": (0.022, 0.186, 0.388, 0.593, 0.748), "squeeze": (0.020, 0.146, 0.348, 0.621, 0.824)}
 
 
 def metric(network):

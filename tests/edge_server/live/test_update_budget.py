@@ -16,12 +16,7 @@ from hypothesis import strategies as st
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
-from edge_server.live.update_budget import (
-    FrontierPoint,
-    UpdateBudget,
-    best_point,
-    read_frontier,
-)
+from edge_server.live.update_budget import FrontierPoint, UpdateBudget, best_point, read_frontier
 from edge_server.scheduler import make_policy
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame

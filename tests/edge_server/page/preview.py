@@ -67,9 +67,7 @@ class BallScene:
         color = np.where((ball <= floor)[..., None], self._ball_color(hit), self._floor_color(hit))
         color = np.where(seen[..., None], color, EMPTY)
         return Rendering(
-            color.astype(np.float32),
-            np.where(seen, depth, 0.0).astype(np.float32),
-            seen.astype(np.float32),
+            color.astype(np.float32), np.where(seen, depth, 0.0).astype(np.float32), seen.astype(np.float32)
         )
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -8,14 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from edge_server.scheduler import (
-    OFFERED,
-    POLICIES,
-    TREATMENTS,
-    Epoch,
-    make_policy,
-    policy_help,
-)
+from edge_server.scheduler import OFFERED, POLICIES, TREATMENTS, Epoch, make_policy, policy_help
 from edge_server.scheduler.registry import VIRTUAL_ONLY
 
 MS = 1_000_000

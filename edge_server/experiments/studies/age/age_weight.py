@@ -8,15 +8,7 @@ import numpy as np
 
 from edge_server.experiments.common.statistics import Interval, move_of_optimum, optimum
 from edge_server.experiments.studies.age.max_age import GAMMAS, QUICK_GAMMAS
-from edge_server.experiments.studies.study import (
-    Curve,
-    Point,
-    Row,
-    SceneStudy,
-    StudyRequest,
-    Table,
-    Verdict,
-)
+from edge_server.experiments.studies.study import Curve, Point, Row, SceneStudy, StudyRequest, Table, Verdict
 from edge_server.report.style import CYCLE, figure, label_lines
 
 # Weights of one second of age relative to a mean squared error of 0.01 (20 dB).

@@ -6,14 +6,7 @@ from typing import Any
 
 from edge_server.experiments.common.statistics import interval, optimum
 from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
-from edge_server.experiments.studies.study import (
-    METRICS,
-    Point,
-    SceneStudy,
-    StudyRequest,
-    Table,
-    Verdict,
-)
+from edge_server.experiments.studies.study import METRICS, Point, SceneStudy, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import recording
 
 GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)

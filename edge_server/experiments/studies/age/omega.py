@@ -14,14 +14,7 @@ from edge_server.experiments.common.statistics import (
     paired,
 )
 from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
-from edge_server.experiments.studies.study import (
-    METRICS,
-    Point,
-    SceneStudy,
-    StudyRequest,
-    Table,
-    Verdict,
-)
+from edge_server.experiments.studies.study import METRICS, Point, SceneStudy, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import recording
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -123,10 +116,7 @@ class Omega(SceneStudy):
             f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on."
         )
         ahead = "better than threshold, each at its own best omega (6.5.2)."
-        found = [
-            Verdict(about, claim, text, answer, loss),
-            _is_better(about, ahead, over, metric),
-        ]
+        found = [Verdict(about, claim, text, answer, loss), _is_better(about, ahead, over, metric)]
         if policy == "wait-arrived":
             over = _best_against(table, metric, policy, labels, "wait")
             claim = "frames that arrive meanwhile (6.16) serve better than those generated meanwhile (6.5)."

@@ -23,15 +23,7 @@ from edge_server.experiments.common.statistics import (
     paired,
     share_closed,
 )
-from edge_server.experiments.studies.study import (
-    LEAST_DB,
-    Point,
-    Study,
-    StudyRequest,
-    Table,
-    Verdict,
-    number,
-)
+from edge_server.experiments.studies.study import LEAST_DB, Point, Study, StudyRequest, Table, Verdict, number
 from edge_server.experiments.studies.trial import recording
 from edge_server.report.style import figure
 

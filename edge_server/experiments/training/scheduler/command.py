@@ -12,12 +12,7 @@ from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import read_config
-from edge_server.experiments.common.arguments import (
-    add_folders,
-    command_parser,
-    folders_of,
-    run_command,
-)
+from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker

@@ -24,9 +24,7 @@ from edge_server.fields.splat.kernels.composite import (
     composite,
     composite_backward,
 )
-from edge_server.fields.splat.kernels.project import (
-    TILE,
-)
+from edge_server.fields.splat.kernels.project import TILE
 
 # Rows of a tile's memory: light, color and depth, in the order of ``composite``; the loss's gradient by each
 # color, and the background's term, in the order of ``composite_backward``.

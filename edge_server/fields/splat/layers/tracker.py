@@ -57,11 +57,7 @@ class MotionTracker:
     """
 
     def __init__(
-        self,
-        moving: MovingSet,
-        observations: Observations,
-        cameras: dict[str, FixedCamera],
-        times: PartTimes,
+        self, moving: MovingSet, observations: Observations, cameras: dict[str, FixedCamera], times: PartTimes
     ) -> None:
         self.moving, self.observations, self.cameras, self.times = moving, observations, cameras, times
         self.anchors_s = self.seeded_s = -np.inf

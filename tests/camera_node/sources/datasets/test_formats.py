@@ -297,10 +297,7 @@ def test_eyeful_damage_is_named(tmp_path):
         (lambda e: e.update(width=float("inf")), "width, height or distortion is wrong"),
         (lambda e: e.update(height=10**400), "too many"),
         (lambda e: e.update(distortion=[10**400] * 5), "width, height or distortion is wrong"),
-        (
-            lambda e: e.update(cameraId="10/10_DSC0000"),
-            "json: 2 of its entries are of the image 10/10",
-        ),
+        (lambda e: e.update(cameraId="10/10_DSC0000"), "json: 2 of its entries are of the image 10/10"),
         (lambda e: e.update(distortion=[0.1]), "RadialAndTangential' with 1 coefficients"),
         (lambda e: e.update(cameraId="/x"), "does not lie within the folder"),
         (lambda e: e.update(cameraId="x"), "cameraId is 'x'"),

@@ -160,10 +160,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
 
 
 def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
-    still, (effort, *_) = (
-        synthetic_still("tile", cameras=3, size=16),
-        effort_sweep.efforts("voxel", {}),
-    )
+    still, (effort, *_) = (synthetic_still("tile", cameras=3, size=16), effort_sweep.efforts("voxel", {}))
     sweep = replace(command.QUICK, planned_s=(0.5,))
     measured = []
 

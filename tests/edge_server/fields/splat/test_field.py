@@ -227,12 +227,7 @@ for module in (plane_sweep, view_evidence, project, rasterize, bin_tiles, optimi
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-1000:]
     counts = dict(line.split() for line in done.stdout.splitlines())
-    assert {
-        "collect_evidence",
-        "position_gradients",
-        "compare_tiles",
-        "train_tiles",
-    } <= counts.keys()
+    assert {"collect_evidence", "position_gradients", "compare_tiles", "train_tiles"} <= counts.keys()
     assert set(counts.values()) == {"1"}, counts
 
 

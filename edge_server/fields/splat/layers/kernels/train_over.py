@@ -18,14 +18,7 @@ from edge_server.fields.splat.kernels.composite import (
     composite_backward,
 )
 from edge_server.fields.splat.kernels.project import TILE
-from edge_server.fields.splat.kernels.rasterize import (
-    _BEHIND,
-    _ER,
-    _R,
-    _T,
-    clear_tile,
-    strip_scratch,
-)
+from edge_server.fields.splat.kernels.rasterize import _BEHIND, _ER, _R, _T, clear_tile, strip_scratch
 
 _F0, _F2 = np.float32(0.0), np.float32(2.0)
 _BYTE = np.float32(1.0 / 255.0)
