@@ -48,12 +48,20 @@ class UsageError(Exception):
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="camera-node", formatter_class=argparse.RawDescriptionHelpFormatter, epilog=EXAMPLES,
+        prog="camera-node",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EXAMPLES,
         description="Streams timestamped, posed frames of one or several cameras to the next hop.",
-    )  # fmt: skip
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(commands.add_parser("run", help="stream cameras of a scenario", epilog=EXAMPLES,
-                                 formatter_class=argparse.RawDescriptionHelpFormatter))  # fmt: skip
+    _add_run(
+        commands.add_parser(
+            "run",
+            help="stream cameras of a scenario",
+            epilog=EXAMPLES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+    )
     prepare = commands.add_parser(
         "prepare", help="render and cache a scenario's frames, which run otherwise does when it starts"
     )
@@ -66,11 +74,14 @@ def main(arguments: list[str] | None = None) -> int:
     for each in (sources, effects):
         each.set_defaults(run=_print_list)
     arm_cli.add_commands(commands)
-    _add_doctor(commands.add_parser(
-        "doctor", help="check this machine's part of a setup: what is wrong, and how to fix it",
-        description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
-        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
-    ))  # fmt: skip
+    _add_doctor(
+        commands.add_parser(
+            "doctor",
+            help="check this machine's part of a setup: what is wrong, and how to fix it",
+            description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
+            "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+        )
+    )
     args = parser.parse_args(arguments)
     try:
         return int(args.run(args))
@@ -84,34 +95,32 @@ def _add_cameras(command: argparse.ArgumentParser) -> None:
     who = command.add_mutually_exclusive_group(required=True)
     who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
     who.add_argument("--all", action="store_true", help="all cameras of the scenario")
-    command.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]"
-    )
+    command.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
 
 
 def _add_run(run: argparse.ArgumentParser) -> None:
     run.set_defaults(run=_run)
     _add_cameras(run)
+    run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
     run.add_argument(
-        "--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server"
-    )
-    run.add_argument(
-        "--out",
-        type=out_folder,
-        metavar="DIR",
-        help="folder to write the ledger and status file to [not written]",
+        "--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]"
     )
     run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
     run.add_argument(
-        "--cache-mb", type=float, default=DEFAULT_CACHE_MB, metavar="MB",
+        "--cache-mb",
+        type=float,
+        default=DEFAULT_CACHE_MB,
+        metavar="MB",
         help="memory for compressed frames kept for the next loop; 0: none [%(default)g]",
-    )  # fmt: skip
+    )
     run.add_argument(
-        "--response-timeout", type=float, default=5.0, metavar="S",
-        help="reconnect if a frame is not answered within S seconds, or much later than earlier ones "
-        "[%(default)g]",
-    )  # fmt: skip
+        "--response-timeout",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="reconnect if a frame is not answered within S seconds, or much later than earlier ones [%(default)g]",
+    )
     run.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     transport.add_arguments(run, listens=False)
 
@@ -119,14 +128,10 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 def _add_doctor(doctor: argparse.ArgumentParser) -> None:
     doctor.set_defaults(run=_doctor)
     doctor.add_argument(
-        "scenario",
-        nargs="?",
-        help="scenario file, or the name of a shipped one [check what every scenario needs]",
+        "scenario", nargs="?", help="scenario file, or the name of a shipped one [check what every scenario needs]"
     )
     doctor.add_argument("--to", metavar="HOST:PORT", help="address of the channel emulator or edge server")
-    doctor.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]"
-    )
+    doctor.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     doctor.add_argument(
         "--out",
         type=Path,

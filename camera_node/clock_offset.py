@@ -80,9 +80,7 @@ class ClockSync:
     channel, metadata: of the calls to the peer.
     """
 
-    def __init__(
-        self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock
-    ) -> None:
+    def __init__(self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock) -> None:
         self._channel = channel
         self._metadata = metadata
         self._clock = clock

@@ -104,9 +104,7 @@ class ArmConfig(Bounded):
             raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
         # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
         if self.simulated and not self.host.startswith("127."):
-            raise ValueError(
-                f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2"
-            )
+            raise ValueError(f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2")
 
 
 @dataclass(frozen=True)
@@ -329,7 +327,5 @@ def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data
             )
         path = folder / path
     if not path.exists():
-        raise ScenarioError(
-            f"{where}: {path} does not exist; --data or FRESHFIELD_DATA names the folder above"
-        )
+        raise ScenarioError(f"{where}: {path} does not exist; --data or FRESHFIELD_DATA names the folder above")
     return path

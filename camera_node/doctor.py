@@ -167,9 +167,7 @@ def _disk(out: Path) -> str:
         file.write(b"\0")
     free_gb = shutil.disk_usage(place).free / 1e9
     if free_gb < LEAST_FREE_GB:
-        raise CheckFailed(
-            f"{place}: {free_gb:.1f} GB free: make room for {LEAST_FREE_GB:g} GB, or choose --out"
-        )
+        raise CheckFailed(f"{place}: {free_gb:.1f} GB free: make room for {LEAST_FREE_GB:g} GB, or choose --out")
     return f"{place}: {free_gb:.0f} GB free, can be written to"
 
 

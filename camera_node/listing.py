@@ -28,9 +28,7 @@ def effects() -> str:
     """Every effect with its parameters and their defaults."""
     from camera_node.synthetic.effects import NAMES, effect_class
 
-    lines = [
-        "source: {effects: {NAME: {parameters}}}; held-out cameras are not affected unless in_truth: true"
-    ]
+    lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are not affected unless in_truth: true"]
     for name in NAMES:
         effect = effect_class(name)
         lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", *_keys(effect)]

@@ -96,9 +96,13 @@ class Node:
             self.outboxes[camera.name] = outbox
             self._syncs[camera.name] = self._sync_of(camera.name, channel, metadata)
             self.senders[camera.name] = Sender(
-                outbox, channel, metadata, self._syncs[camera.name].offset,
-                self._scenario.rng("backoff", camera.name), self._options.response_timeout_s,
-            )  # fmt: skip
+                outbox,
+                channel,
+                metadata,
+                self._syncs[camera.name].offset,
+                self._scenario.rng("backoff", camera.name),
+                self._options.response_timeout_s,
+            )
         try:
             await self._work()
         finally:
@@ -111,9 +115,7 @@ class Node:
             if ledger is not None:
                 ledger.close(self._clock.now_ns())
 
-    def _sync_of(
-        self, camera: str, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...]
-    ) -> ClockSync:
+    def _sync_of(self, camera: str, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...]) -> ClockSync:
         """The offset estimate of a camera: shared by cameras on the exact clock; a wrong clock has its
         own."""
         clock = self._clocks[camera]
@@ -154,9 +156,7 @@ class Node:
         start_ns = self._clock.now_ns()
         tasks = [asyncio.ensure_future(self._capture(c, start_ns)) for c in self._cameras]
         try:
-            await asyncio.wait(
-                tasks, timeout=self._options.seconds or None, return_when=asyncio.FIRST_EXCEPTION
-            )
+            await asyncio.wait(tasks, timeout=self._options.seconds or None, return_when=asyncio.FIRST_EXCEPTION)
         finally:
             for task in tasks:
                 task.cancel()

@@ -96,13 +96,7 @@ class Sender:
             answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
             try:
                 await self._session()
-            except (
-                grpc.RpcError,
-                grpc.aio.BaseError,
-                TimeoutError,
-                ProtocolError,
-                asyncio.InvalidStateError,
-            ) as error:
+            except (grpc.RpcError, grpc.aio.BaseError, TimeoutError, ProtocolError, asyncio.InvalidStateError) as error:
                 self._report(error)
             except asyncio.CancelledError:
                 # gRPC raises this also if only the call was cancelled; a cancelled task ends the sender.

@@ -50,16 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (
-        _add_run,
-        _add_simulate,
-        _add_presets,
-        _add_replay,
-        _add_proxy,
-        _add_fit,
-        _add_bench,
-        _add_accuracy,
-    ):
+    for add in (_add_run, _add_simulate, _add_presets, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
         add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -77,16 +68,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_run(commands: Any) -> None:
     sub = commands.add_parser(
-        "run", help="the live emulator: cameras connect to it, it connects to the edge server",
+        "run",
+        help="the live emulator: cameras connect to it, it connects to the edge server",
         description="Delays, drops and damages each camera's frames as the scenario's channel section says. "
         "Writes OUT/channel.json twice a second and a ledger of every frame; ends cleanly on Ctrl-C.",
-    )  # fmt: skip
+    )
     sub.add_argument("scenario", help="scenario file, or the name of a shipped one")
     sub.add_argument(
         "--to", default="127.0.0.1:7000", metavar="HOST:PORT", help="address of the edge server [%(default)s]"
     )
-    sub.add_argument("--out", type=out_folder, required=True, metavar="DIR",
-                     help="folder to write: channel.json and the ledger")  # fmt: skip
+    sub.add_argument(
+        "--out", type=out_folder, required=True, metavar="DIR", help="folder to write: channel.json and the ledger"
+    )
     sub.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
     _add_live_options(sub, "frame")
     sub.set_defaults(go=_run)
@@ -106,18 +99,11 @@ def _run(args: argparse.Namespace) -> int:
 def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
     """Add the options of both live commands, which ``_serve`` reads. what: unit that passes the link."""
     sub.add_argument(
-        "--listen",
-        default="127.0.0.1:7001",
-        metavar="HOST:PORT",
-        help="address to accept clients on [%(default)s]",
+        "--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="address to accept clients on [%(default)s]"
     )
-    sub.add_argument(
-        "--trace", type=out_file, metavar="FILE", help=f"record the fate of every {what} in FILE"
-    )
+    sub.add_argument("--trace", type=out_file, metavar="FILE", help=f"record the fate of every {what} in FILE")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat the decisions of a recorded --trace")
-    sub.add_argument(
-        "--no-priority", action="store_true", help="run at normal scheduling priority, not raised"
-    )
+    sub.add_argument("--no-priority", action="store_true", help="run at normal scheduling priority, not raised")
     transport.add_arguments(sub)
 
 
@@ -130,9 +116,13 @@ def _serve(
     from channel_emu.model import trace
 
     chosen = ProxyOptions(
-        args.listen, args.to, transport.from_arguments(args), trace=args.trace,
-        replay=trace.read(args.replay) if args.replay else None, **options,
-    )  # fmt: skip
+        args.listen,
+        args.to,
+        transport.from_arguments(args),
+        trace=args.trace,
+        replay=trace.read(args.replay) if args.replay else None,
+        **options,
+    )
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     return_freed_memory()
 
@@ -151,21 +141,22 @@ def _serve(
 
 def _add_simulate(commands: Any) -> None:
     sub = commands.add_parser(
-        "simulate", help="the same links in virtual time: ages and losses of a channel",
+        "simulate",
+        help="the same links in virtual time: ages and losses of a channel",
         description="Simulates every camera's link and prints mean age (continuous time average), mean age "
         "at slot boundaries, peak age, frames delivered and dropped, time shares of the states, and delays.",
-    )  # fmt: skip
+    )
     _add_channel_options(sub)
-    sub.add_argument(
-        "--spread", action="store_true", help="spread periodic cameras' frames evenly over the period"
-    )
+    sub.add_argument("--spread", action="store_true", help="spread periodic cameras' frames evenly over the period")
     sub.add_argument("--cameras", type=int, default=1, metavar="N", help="number of cameras [%(default)s]")
-    sub.add_argument(
-        "--seconds", type=float, default=600.0, metavar="S", help="seconds to simulate [%(default)g]"
-    )
+    sub.add_argument("--seconds", type=float, default=600.0, metavar="S", help="seconds to simulate [%(default)g]")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    sub.add_argument("--frame-period-ms", type=float, metavar="MS", help="frame period of the cameras; "
-                     "Poisson arrivals then sample their newest frame, as live")  # fmt: skip
+    sub.add_argument(
+        "--frame-period-ms",
+        type=float,
+        metavar="MS",
+        help="frame period of the cameras; Poisson arrivals then sample their newest frame, as live",
+    )
     sub.add_argument(
         "--frame-bytes",
         type=int,
@@ -176,15 +167,26 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument(
         "--slot-ms", type=float, default=1.0, metavar="MS", help="slot of the slotted mean age [%(default)g]"
     )
-    sub.add_argument("--engine", choices=["auto", "python", "kernel"], default="auto",
-                     help="python: any channel; kernel: faster, no faults but loss; same results "
-                     "[auto: kernel if possible]")  # fmt: skip
-    sub.add_argument("--metric", action="append", default=[], metavar="NAME[:VALUE...]",
-                     help="further age metrics; may be repeated. "
-                     + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items())
-                     )  # fmt: skip
-    sub.add_argument("--csv", type=out_file, metavar="FILE", help="write a row per frame, when offered and "
-                     "delivered, as fit reads it")  # fmt: skip
+    sub.add_argument(
+        "--engine",
+        choices=["auto", "python", "kernel"],
+        default="auto",
+        help="python: any channel; kernel: faster, no faults but loss; same results [auto: kernel if possible]",
+    )
+    sub.add_argument(
+        "--metric",
+        action="append",
+        default=[],
+        metavar="NAME[:VALUE...]",
+        help="further age metrics; may be repeated. "
+        + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items()),
+    )
+    sub.add_argument(
+        "--csv",
+        type=out_file,
+        metavar="FILE",
+        help="write a row per frame, when offered and delivered, as fit reads it",
+    )
     sub.add_argument("--plot", type=out_file, metavar="FILE", help="write a figure: ages over time, delays")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_simulate)
@@ -193,32 +195,49 @@ def _add_simulate(commands: Any) -> None:
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     """Add the options that describe a channel, which ``_config_of`` reads."""
     source = sub.add_mutually_exclusive_group()
-    source.add_argument("--preset", default="ideal", metavar="NAME", help="channel, one that channel-emu "
-                        "presets lists; the options below change it [%(default)s]")  # fmt: skip
-    source.add_argument("--scenario", help="the channel section of a scenario instead")
-    sub.add_argument("--arrivals", metavar="SPEC", help="when frames arrive: as-offered, periodic:30ms, "
-                     "poisson:1/30ms, or a rate for each state, mmpp:1/120ms,1/30ms; mmpp alone takes these "
-                     "rates (thesis 6.4.2)")  # fmt: skip
-    sub.add_argument("--service", metavar="SPEC", help="delay: none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-                     "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms")  # fmt: skip
-    sub.add_argument(
-        "--service-by-state", metavar="SPEC,SPEC", help="--service for each state: exp:30ms,exp:60ms"
+    source.add_argument(
+        "--preset",
+        default="ideal",
+        metavar="NAME",
+        help="channel, one that channel-emu presets lists; the options below change it [%(default)s]",
     )
-    sub.add_argument("--fault", metavar="NAME:VALUE", action="append", help=f"{', '.join(faults.NAMES)}; "
-                     "e.g. loss:0.1, loss:[0.01, 0.5] by state, reset:{at_ms: [50]}; "
-                     "may be repeated")  # fmt: skip
-    sub.add_argument("--chain", metavar="SPEC", help="Markov chain of states: mu1=1/30,mu2=1/30 (rates per "
-                     "ms), states=low/high, scope=per-camera, initial=low, slots=1ms, or "
-                     "{generator_per_ms: [[..]]}")  # fmt: skip
+    source.add_argument("--scenario", help="the channel section of a scenario instead")
+    sub.add_argument(
+        "--arrivals",
+        metavar="SPEC",
+        help="when frames arrive: as-offered, periodic:30ms, "
+        "poisson:1/30ms, or a rate for each state, mmpp:1/120ms,1/30ms; mmpp alone takes these "
+        "rates (thesis 6.4.2)",
+    )
+    sub.add_argument(
+        "--service",
+        metavar="SPEC",
+        help="delay: none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
+        "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms",
+    )
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="--service for each state: exp:30ms,exp:60ms")
+    sub.add_argument(
+        "--fault",
+        metavar="NAME:VALUE",
+        action="append",
+        help=f"{', '.join(faults.NAMES)}; "
+        "e.g. loss:0.1, loss:[0.01, 0.5] by state, reset:{at_ms: [50]}; "
+        "may be repeated",
+    )
+    sub.add_argument(
+        "--chain",
+        metavar="SPEC",
+        help="Markov chain of states: mu1=1/30,mu2=1/30 (rates per "
+        "ms), states=low/high, scope=per-camera, initial=low, slots=1ms, or "
+        "{generator_per_ms: [[..]]}",
+    )
     sub.add_argument(
         "--service-state",
         choices=["at-start", "modulated"],
         help="state that sets a delay: at the start of transmission, or each during it [at-start]",
     )
     sub.add_argument(
-        "--discipline",
-        choices=DISCIPLINES,
-        help="what a busy link does with a new frame [the preset's, else drop-new]",
+        "--discipline", choices=DISCIPLINES, help="what a busy link does with a new frame [the preset's, else drop-new]"
     )
     sub.add_argument("--shared-server", action="store_true", help="one server for all cameras [one for each]")
 
@@ -229,9 +248,15 @@ def _simulate(args: argparse.Namespace) -> int:
     from channel_emu.virtual.simulate import simulate
 
     simulation = simulate(
-        _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
-        frame_period_ms=args.frame_period_ms, frame_bytes=args.frame_bytes, slot_ms=args.slot_ms,
-    )  # fmt: skip
+        _config_of(args),
+        args.cameras,
+        args.seconds,
+        args.seed,
+        engine=args.engine,
+        frame_period_ms=args.frame_period_ms,
+        frame_bytes=args.frame_bytes,
+        slot_ms=args.slot_ms,
+    )
     result = simulation.summary(args.metric)
     if args.csv:
         output.write_frames(simulation, args.csv)
@@ -241,13 +266,15 @@ def _simulate(args: argparse.Namespace) -> int:
         print(json.dumps(result))
         return 0
     shown = {
-        "mean age (ms)": result["mean_age_ms"], "peak age (ms)": result["peak_age_ms"],
-        "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"], **result["metrics_ms"],
+        "mean age (ms)": result["mean_age_ms"],
+        "peak age (ms)": result["peak_age_ms"],
+        "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"],
+        **result["metrics_ms"],
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
         **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
         **{key: result[key] for key in ("cameras", "seconds", "seed", "engine")},
-    }  # fmt: skip
+    }
     print(format_table([{"what": k, "value": "-" if v is None else v} for k, v in shown.items()]))
     return 0
 
@@ -280,10 +307,11 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
 
 def _add_presets(commands: Any) -> None:
     sub = commands.add_parser(
-        "presets", help="list the named channels, with their parameters and mean delay",
+        "presets",
+        help="list the named channels, with their parameters and mean delay",
         description="Lists the presets: parameters, written as simulate's options and a scenario take them; "
         "the mean delay over the stationary distribution of the states; what each is for.",
-    )  # fmt: skip
+    )
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_presets)
 
@@ -306,10 +334,11 @@ def _presets(args: argparse.Namespace) -> int:
 
 def _add_replay(commands: Any) -> None:
     sub = commands.add_parser(
-        "replay", help="replay a recorded trace in virtual time and compare every decision",
+        "replay",
+        help="replay a recorded trace in virtual time and compare every decision",
         description="Offers the recorded frames to fresh links of the recorded channel and seed, at the "
         "recorded instants. Every decision must come out as recorded. To repeat a trace live: run --replay.",
-    )  # fmt: skip
+    )
     sub.add_argument("trace", type=Path, help="file written by --trace")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_replay)
@@ -331,16 +360,21 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _add_proxy(commands: Any) -> None:
     sub = commands.add_parser(
-        "proxy", help="put any gRPC service behind an emulated link; messages are not parsed",
+        "proxy",
+        help="put any gRPC service behind an emulated link; messages are not parsed",
         description="Clients connect to LISTEN instead of the service at TO. A dropped unary call answers "
         "UNAVAILABLE, a dropped stream message is left out. Prints what happened on Ctrl-C. In tests, use "
         "the pytest fixture of channel_emu.testing.",
-    )  # fmt: skip
+    )
     sub.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the service")
     _add_channel_options(sub)
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    sub.add_argument("--direction", choices=["up", "down", "both"], default="up", help="messages that pass "
-                     "the link: to the service (up), its answers (down) or both [%(default)s]")  # fmt: skip
+    sub.add_argument(
+        "--direction",
+        choices=["up", "down", "both"],
+        default="up",
+        help="messages that pass the link: to the service (up), its answers (down) or both [%(default)s]",
+    )
     sub.add_argument("--shared", action="store_true", help="one link for all methods [one for each]")
     _add_live_options(sub, "message")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
@@ -362,23 +396,30 @@ def _proxy(args: argparse.Namespace) -> int:
 
 def _add_fit(commands: Any) -> None:
     sub = commands.add_parser(
-        "fit", help="estimate a channel from a recording: chain, rates, delays, bursts, with 95 %% intervals",
+        "fit",
+        help="estimate a channel from a recording: chain, rates, delays, bursts, with 95 %% intervals",
         description="Fits a channel with one or two hidden states to a trace of this emulator (its recorded "
         "states are not used) or to a CSV of any link with columns offered_ms, delivered_ms (blank: lost), "
         "camera. Prints the channel section for a scenario.",
-    )  # fmt: skip
-    sub.add_argument("trace", type=Path, help="file written by --trace, or a CSV")
-    sub.add_argument("--states", choices=["1", "2", "auto"], default="auto",
-                     help="number of hidden states; auto: chosen by BIC [%(default)s]")  # fmt: skip
-    sub.add_argument("--scope", choices=SCOPES, default="shared", help="one Markov chain for all "
-                     "cameras, or one for each [%(default)s]")  # fmt: skip
-    sub.add_argument("--discipline", choices=FITTED_DISCIPLINES, help="for a CSV: what the busy link did "
-                     "with a new frame [drop-new]")  # fmt: skip
-    sub.add_argument("--out", type=out_file, metavar="FILE.yaml",
-                     help="write a scenario with the fitted channel")  # fmt: skip
-    sub.add_argument(
-        "--plot", type=out_file, metavar="FILE", help="write a figure: delays over time and the state"
     )
+    sub.add_argument("trace", type=Path, help="file written by --trace, or a CSV")
+    sub.add_argument(
+        "--states",
+        choices=["1", "2", "auto"],
+        default="auto",
+        help="number of hidden states; auto: chosen by BIC [%(default)s]",
+    )
+    sub.add_argument(
+        "--scope",
+        choices=SCOPES,
+        default="shared",
+        help="one Markov chain for all cameras, or one for each [%(default)s]",
+    )
+    sub.add_argument(
+        "--discipline", choices=FITTED_DISCIPLINES, help="for a CSV: what the busy link did with a new frame [drop-new]"
+    )
+    sub.add_argument("--out", type=out_file, metavar="FILE.yaml", help="write a scenario with the fitted channel")
+    sub.add_argument("--plot", type=out_file, metavar="FILE", help="write a figure: delays over time and the state")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_fit)
 
@@ -399,27 +440,29 @@ def _fit(args: argparse.Namespace) -> int:
 
 def _add_bench(commands: Any) -> None:
     sub = commands.add_parser(
-        "bench", help="measure the live emulator on this machine: throughput and error of its delays",
+        "bench",
+        help="measure the live emulator on this machine: throughput and error of its delays",
         description="Runs cameras, emulator and a sink as separate processes on loopback, with exponential "
         "delays, every frame delivered. Prints messages a second, frames lost, a histogram of delay error. "
         "With --simulate or --cost: links in virtual time instead.",
-    )  # fmt: skip
-    what = sub.add_mutually_exclusive_group()
-    what.add_argument("--simulate", action="store_true", help="measure link-slots a second in virtual time, "
-                      "and of a plain Python loop over slots")  # fmt: skip
-    what.add_argument("--cost", action="store_true", help="measure ns per frame of an ideal link, and what "
-                      "each fault, delay distribution and chain adds")  # fmt: skip
-    sub.add_argument("--cameras", type=int, default=18, metavar="N", help="number of cameras [%(default)s]")
-    sub.add_argument(
-        "--rate", type=float, default=33.0, metavar="HZ", help="frames a second per camera [%(default)g]"
     )
+    what = sub.add_mutually_exclusive_group()
+    what.add_argument(
+        "--simulate",
+        action="store_true",
+        help="measure link-slots a second in virtual time, and of a plain Python loop over slots",
+    )
+    what.add_argument(
+        "--cost",
+        action="store_true",
+        help="measure ns per frame of an ideal link, and what each fault, delay distribution and chain adds",
+    )
+    sub.add_argument("--cameras", type=int, default=18, metavar="N", help="number of cameras [%(default)s]")
+    sub.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="frames a second per camera [%(default)g]")
     sub.add_argument("--bytes", type=int, default=20_000, metavar="N", help="bytes per frame [%(default)s]")
     sub.add_argument("--seconds", type=float, metavar="S", help="seconds [15; with --simulate 2000, virtual]")
-    sub.add_argument(
-        "--load", type=int, default=0, metavar="N", help="busy processes running beside it [%(default)s]"
-    )
-    sub.add_argument("--no-priority", action="store_true",
-                     help="run at normal scheduling priority, not raised")  # fmt: skip
+    sub.add_argument("--load", type=int, default=0, metavar="N", help="busy processes running beside it [%(default)s]")
+    sub.add_argument("--no-priority", action="store_true", help="run at normal scheduling priority, not raised")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_bench)
 
@@ -448,14 +491,14 @@ def _bench(args: argparse.Namespace) -> int:
 
 def _add_accuracy(commands: Any) -> None:
     sub = commands.add_parser(
-        "accuracy", help="measure the simulation's error against computing time and slot length",
+        "accuracy",
+        help="measure the simulation's error against computing time and slot length",
         description="Measures the error of the simulated mean age against its exact value: by seconds "
         "simulated and computed, and by slot length (bias and speed).",
-    )  # fmt: skip
+    )
     sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
-    sub.add_argument("--out", type=out_folder, metavar="DIR",
-                     help="folder to write the tables (CSV) and a figure to")  # fmt: skip
+    sub.add_argument("--out", type=out_folder, metavar="DIR", help="folder to write the tables (CSV) and a figure to")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_accuracy)
 

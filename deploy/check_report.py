@@ -39,11 +39,7 @@ def problems(out: Path) -> list[str]:
 
 def main() -> int:
     found = problems(Path(sys.argv[1]))
-    print(
-        "\n".join(found)
-        if found
-        else f"{sys.argv[1]}: the report is complete and every frame is accounted for"
-    )
+    print("\n".join(found) if found else f"{sys.argv[1]}: the report is complete and every frame is accounted for")
     return 1 if found else 0
 
 

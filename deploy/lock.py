@@ -59,9 +59,7 @@ def arm_hashes(requirement: str) -> set[str]:
 
 def _dry_run(*words: str) -> subprocess.CompletedProcess[str]:
     what = ("install", "-q", "--dry-run", "--ignore-installed", "--only-binary=:all:", "--report", "-")
-    return subprocess.run(
-        [sys.executable, "-m", "pip", *what, *words], cwd=ROOT, capture_output=True, text=True
-    )
+    return subprocess.run([sys.executable, "-m", "pip", *what, *words], cwd=ROOT, capture_output=True, text=True)
 
 
 def _wheels(report: str) -> Lock:
@@ -100,9 +98,7 @@ def main() -> None:
     LOCKS.mkdir(exist_ok=True)
     # "===" compares text; "==" would accept builds with another local version (+cpu) as well.
     cuda = resolve(".[edge,embed]", f"torch==={TORCH}")
-    cpu = resolve(
-        ".[edge,embed]", f"torch==={TORCH}+cpu", pins={n: v for n, v in cuda.items() if n != "torch"}
-    )
+    cpu = resolve(".[edge,embed]", f"torch==={TORCH}+cpu", pins={n: v for n, v in cuda.items() if n != "torch"})
     edge = {name: cpu[name] for name in cpu.keys() & cuda.keys() - {"torch"}}
     for name, lock in {
         "build": resolve(*tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]),

@@ -134,8 +134,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A Markdown table; numbers of a row are shown with one decimal."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(
-        "| " + " | ".join(f"{c:.1f}" if isinstance(c, float) else str(c) for c in line) + " |"
-        for line in lines
+        "| " + " | ".join(f"{c:.1f}" if isinstance(c, float) else str(c) for c in line) + " |" for line in lines
     )
 
 
@@ -143,9 +142,7 @@ def from_scratch(scene: str, seconds: Sequence[float]) -> str:
     """PSNR after so many seconds of fitting, a row a representation."""
     found = measured("docs/results/field.json")["field"][scene]
     head = ["representation", *(f"{s:g} s" for s in seconds)]
-    return table(
-        head, ([f"`{f}`", *(found[f]["series"][f"{s:g}_s"]["psnr_db"] for s in seconds)] for f in FIELDS)
-    )
+    return table(head, ([f"`{f}`", *(found[f]["series"][f"{s:g}_s"]["psnr_db"] for s in seconds)] for f in FIELDS))
 
 
 def gpu() -> str:
@@ -154,8 +151,11 @@ def gpu() -> str:
     rows = []
     for name, words in GPU_ROWS.items():
         room, lego = (found[scene].get(name, {}) for scene in ("room", "lego"))
-        cells = [of.get("series", {}).get(f"{s:g}_s", {}).get("psnr_db", "-")
-                 for of, seconds in ((room, (0.5, 1, 2.5, 8)), (lego, (2, 5))) for s in seconds]  # fmt: skip
+        cells = [
+            of.get("series", {}).get(f"{s:g}_s", {}).get("psnr_db", "-")
+            for of, seconds in ((room, (0.5, 1, 2.5, 8)), (lego, (2, 5)))
+            for s in seconds
+        ]
         rate = f"{room['steps_per_s']:.0f}" if "steps_per_s" in room else "-"
         rows.append([words, *cells, rate])
     head = ["", *(f"`room`, {s:g} s" for s in (0.5, 1, 2.5, 8)), *(f"`lego`, {s} s" for s in (2, 5))]
@@ -179,21 +179,19 @@ def representations() -> str:
     rows = []
     for name, what in FIELDS.items():
         start, tile = found["start"][name], found["tile"][name]
-        rows.append([
-            f"`{name}`", what, tile["render_128_ms"], tile["render_256_ms"], start["jit_cold_s"],
-            f"{start['jit_cached_s']:.2f}", math.floor(start["peak_rss_mb"] + 0.5),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"`{name}`",
+                what,
+                tile["render_128_ms"],
+                tile["render_256_ms"],
+                start["jit_cold_s"],
+                f"{start['jit_cached_s']:.2f}",
+                math.floor(start["peak_rss_mb"] + 0.5),
+            ]
+        )
     return table(
-        [
-            "`field:`",
-            "what it is",
-            "render 128², ms",
-            "render 256², ms",
-            "compile, s",
-            "from cache, s",
-            "peak MB",
-        ],
-        rows,
+        ["`field:`", "what it is", "render 128², ms", "render 256², ms", "compile, s", "from cache, s", "peak MB"], rows
     )
 
 
@@ -205,9 +203,7 @@ def baselines() -> str:
         part = found[scene]
         known = part["baseline"]
         rows.append([part["scene"], part["angle_deg"], known["mean_colour_db"], known["nearest_view_db"]])
-    return table(
-        ["scene", "held-out view to nearest other, degrees", "mean color, dB", "nearest view, dB"], rows
-    )
+    return table(["scene", "held-out view to nearest other, degrees", "mean color, dB", "nearest view, dB"], rows)
 
 
 def best_updates() -> str:
@@ -217,16 +213,8 @@ def best_updates() -> str:
         if field.startswith("`splat`") or effort == "medium":
             best = [max(times, key=lambda s, part=part: times[s][part]) for part in (0, 1)]
             at = [f"{times[s][part]:.1f} at {s:g} s" for part, s in enumerate(best)]
-            rows.append(
-                [speed, field, by, *at, "{:.1f} / {:.1f} at {:g} s".format(*times[max(times)], max(times))]
-            )
-    head = (
-        "person, m/s",
-        "representation, effort",
-        "by what was",
-        "best dB, whole image",
-        "best dB, moving pixels",
-    )
+            rows.append([speed, field, by, *at, "{:.1f} / {:.1f} at {:g} s".format(*times[max(times)], max(times))])
+    head = ("person, m/s", "representation, effort", "by what was", "best dB, whole image", "best dB, moving pixels")
     return table((*head, "longest, whole / moving"), rows)
 
 
@@ -326,10 +314,9 @@ def card() -> str:
     """What policies show in the scenario card, and the learnt one against all."""
     found = measured("deploy/scenarios/card/scores.json")
     rows = [
-        [name, *(f"{row['own_seed'][m]:.2f}" for m in ("psnr_db", "psnr_moving_db")),
-         f"{row['own_seed']['views']:.1f}"]
+        [name, *(f"{row['own_seed'][m]:.2f}" for m in ("psnr_db", "psnr_moving_db")), f"{row['own_seed']['views']:.1f}"]
         for name, row in found["policies"].items()
-    ]  # fmt: skip
+    ]
     learnt = found["policies"]["learnt"]
     whole, moving = (_interval(learnt[f"{m}_over_all"]) for m in ("psnr_db", "psnr_moving_db"))
     omegas = ", ".join(f"{state} {_interval(ms, 0)} ms" for state, ms in learnt["omega_ms"].items())
@@ -346,19 +333,22 @@ def compared(file: str) -> str:
     found = measured(f"docs/results/learning/{file}.json")
     first = next(iter(found["policies"]))
     columns = [
-        c for m in ("psnr_db", "psnr_moving_db") for c in (m, f"{m}_over_{first}", f"{m}_over_fixed")
+        c
+        for m in ("psnr_db", "psnr_moving_db")
+        for c in (m, f"{m}_over_{first}", f"{m}_over_fixed")
         if any(c in row for row in found["policies"].values())
-    ]  # fmt: skip
-    rows = [
-        [f"`{name}`",
-         *("" if c not in row or (name == first and "over" in c) else _interval(row[c]) for c in columns),
-         f"{row['views'][0]:.1f}", f"{row['aaoi_ms'][0]:.0f}"]
-        for name, row in found["policies"].items()
-    ]  # fmt: skip
-    words = {"psnr_db": "shown, dB", "psnr_moving_db": "moving, dB"}
-    less = [
-        words.get(c) or f"minus {'the best fixed' if c.endswith('fixed') else f'`{first}`'}" for c in columns
     ]
+    rows = [
+        [
+            f"`{name}`",
+            *("" if c not in row or (name == first and "over" in c) else _interval(row[c]) for c in columns),
+            f"{row['views'][0]:.1f}",
+            f"{row['aaoi_ms'][0]:.0f}",
+        ]
+        for name, row in found["policies"].items()
+    ]
+    words = {"psnr_db": "shown, dB", "psnr_moving_db": "moving, dB"}
+    less = [words.get(c) or f"minus {'the best fixed' if c.endswith('fixed') else f'`{first}`'}" for c in columns]
     head = ("policy", *less, "views an update", "their mean age, ms")
     of_each = "channel and motion" if found.get("motions", True) else "channel"
     best = " Best fixed: on the other half of the seeds." if any(c.endswith("fixed") for c in columns) else ""
@@ -392,9 +382,7 @@ def verdicts() -> str:
         for v in by_name[name]["verdicts"] if name in by_name else ():
             if v["about"] == about and word in v["claim"]:
                 figure = f"{re.sub('^figures? ', '', _figure(by_name[name]))} (`{name}`)"
-                rows.append(
-                    [figure if figure != said[0] else "", v["claim"] if v["claim"] != said[1] else ""]
-                )
+                rows.append([figure if figure != said[0] else "", v["claim"] if v["claim"] != said[1] else ""])
                 rows[-1] += [about, v["found"], v["verdict"]]
                 said = figure, v["claim"]
     return table(["figure", "claim", "where", "found here", "verdict"], rows)
@@ -409,8 +397,11 @@ def taught() -> str:
         if kind == "policy":
             of = re.sub(r" \(.*", "", v["claim"])
             found.setdefault(scene, {}).setdefault(of, []).append((v["interval"][0], v["verdict"]))
-    columns = {"better than random": "dB over random views", "better than FisherRF": "dB over FisherRF",
-               "shorter than random's": "path, m shorter than random views'"}  # fmt: skip
+    columns = {
+        "better than random": "dB over random views",
+        "better than FisherRF": "dB over FisherRF",
+        "shorter than random's": "path, m shorter than random views'",
+    }
 
     def cell(of: list[tuple[float, str]]) -> str:
         values, won = [mean for mean, _ in of], sum(verdict == "holds" for _, verdict in of)
@@ -436,20 +427,20 @@ def figures() -> str:
             claims.setdefault(v["claim"], []).append(row)
         names_of = {claim: f"{claim[0].upper()}{claim[1:].rstrip('.')}" for claim in claims}
         rows = [
-            [names_of[claim] if k == 0 else "", *row]
-            for claim, found in claims.items() for k, row in enumerate(found)
-        ]  # fmt: skip
+            [names_of[claim] if k == 0 else "", *row] for claim, found in claims.items() for k, row in enumerate(found)
+        ]
         counts = [
             [names_of[claim], *(sum(row[1] == word for row in found) or "" for word in VERDICT_WORDS)]
             for claim, found in claims.items()
-        ]  # fmt: skip
+        ]
         longer = tuple(n for n in names if n != name and n.startswith(name))
-        drawn = [p.name for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
-                 if not (longer and p.name.startswith(longer))]  # fmt: skip
+        drawn = [
+            p.name
+            for p in (DOCS / "results" / "thesis").glob(f"{name}*.png")
+            if not (longer and p.name.startswith(longer))
+        ]
         # The usual scene first, and of it the curves.
-        drawn.sort(
-            key=lambda p: (not re.search("room|tile", p), bool(re.search("-(pictures|images|paths)", p)), p)
-        )
+        drawn.sort(key=lambda p: (not re.search("room|tile", p), bool(re.search("-(pictures|images|paths)", p)), p))
         more = "".join(f", [{p.removesuffix('.png')}]({p})" for p in drawn[1:])
         if (DOCS / "results" / "thesis" / f"{name}-tables.md").exists():
             more = f", [tables]({name}-tables.md){more}"
@@ -536,8 +527,15 @@ def soak(name: str) -> str:
     )
     frames = run["frames"]
     account = "all accounted for" if frames["closes"] else f"not accounted for: {'; '.join(frames['doubts'])}"
-    head = ["fault", "times", "no recovery before the next", "recovery, s: median", "worst",
-            "start, s: median", "worst"]  # fmt: skip
+    head = [
+        "fault",
+        "times",
+        "no recovery before the next",
+        "recovery, s: median",
+        "worst",
+        "start, s: median",
+        "worst",
+    ]
     return (
         f"Load average {run['load_average']:.0f}, {run['cores']} cores, a fault each {run['every_s']:.0f} s. "
         + (f"Memory of each last process: {memory}. " if memory else "")
@@ -554,13 +552,26 @@ def attacks() -> str:
         return "" if found is None else " / ".join(f"{found[q]:.1f}" for q in ("p50", "p99"))
 
     rows = [
-        [r["sent"], r["at"], r["answer"], ms(r["refused_ms"]),
-         ms(r["neighbors"]["emulator" if r["at"] == "emulator" else "edge"]["ms"]),
-         " / ".join(map(str, r["memory_mb"])), f"`{r['test']}`" if r["test"] else ""]
+        [
+            r["sent"],
+            r["at"],
+            r["answer"],
+            ms(r["refused_ms"]),
+            ms(r["neighbors"]["emulator" if r["at"] == "emulator" else "edge"]["ms"]),
+            " / ".join(map(str, r["memory_mb"])),
+            f"`{r['test']}`" if r["test"] else "",
+        ]
         for r in run["attacks"]
-    ]  # fmt: skip
-    head = ["attack", "on", "answers", "after, ms: p50 / p99", "neighbor's answers, ms: p50 / p99",
-            "MB before / most / after", "test"]  # fmt: skip
+    ]
+    head = [
+        "attack",
+        "on",
+        "answers",
+        "after, ms: p50 / p99",
+        "neighbor's answers, ms: p50 / p99",
+        "MB before / most / after",
+        "test",
+    ]
     return f"Load average {run['load_average']:.0f}, {run['cores']} cores.\n\n" + table(head, rows)
 
 
@@ -580,26 +591,54 @@ def masks() -> str:
         ours, cut = (log["masks"][name][key] for name in ("tile_int8", "tile_int8, grabcut"))
         alarms = ours["false_alarms"]
         shares = [f"{x:.2f}" for x in (ours["iou"], ours["iou_p10"], cut["iou"])]
-        rows.append([
-            words, ours["images"], f"{boxes['map50']:.2f}", f"{boxes['map50_95']:.2f}",
-            f"{100 * ours['found']:.0f} %", *shares,
-            "" if alarms is None else f"{100 * alarms:.0f} % of {ours['empty_images']}",
-        ])  # fmt: skip
-    head = ["pictures", "that show it", "AP at IoU .5", "AP, .5 to .95", "found", "mask IoU, mean",
-            "one in ten below", "by GrabCut in the same boxes", "false alarms without it"]  # fmt: skip
+        rows.append(
+            [
+                words,
+                ours["images"],
+                f"{boxes['map50']:.2f}",
+                f"{boxes['map50_95']:.2f}",
+                f"{100 * ours['found']:.0f} %",
+                *shares,
+                "" if alarms is None else f"{100 * alarms:.0f} % of {ours['empty_images']}",
+            ]
+        )
+    head = [
+        "pictures",
+        "that show it",
+        "AP at IoU .5",
+        "AP, .5 to .95",
+        "found",
+        "mask IoU, mean",
+        "one in ten below",
+        "by GrabCut in the same boxes",
+        "false alarms without it",
+    ]
     return table(head, rows)
 
 
 def cell_meshes() -> str:
     """Meshes from the viewpoints of ``cell`` (``edge-server bench surface --only cell``)."""
     rows = [
-        [f"{size} x {size}", f"{c['chamfer_mm']:.2f}", f"{100 * c['complete']:.0f} %",
-         f"{100 * c['precise']:.0f} %", f"{c['median_mm']:.2f}",
-         f"{c['exact_chamfer_mm']:.2f} mm, {100 * c['exact_complete']:.0f} %", f"{c['seconds']:.0f}"]
+        [
+            f"{size} x {size}",
+            f"{c['chamfer_mm']:.2f}",
+            f"{100 * c['complete']:.0f} %",
+            f"{100 * c['precise']:.0f} %",
+            f"{c['median_mm']:.2f}",
+            f"{c['exact_chamfer_mm']:.2f} mm, {100 * c['exact_complete']:.0f} %",
+            f"{c['seconds']:.0f}",
+        ]
         for size, c in measured("docs/results/surface.json")["surface"]["cell"].items()
-    ]  # fmt: skip
-    head = ["images", "chamfer, mm (aim 1.5)", "surface within 3 mm (aim 95 %)", "mesh within 3 mm",
-            "median depth error, mm", "with exact depth", "seconds"]  # fmt: skip
+    ]
+    head = [
+        "images",
+        "chamfer, mm (aim 1.5)",
+        "surface within 3 mm (aim 95 %)",
+        "mesh within 3 mm",
+        "median depth error, mm",
+        "with exact depth",
+        "seconds",
+    ]
     return table(head, rows)
 
 
@@ -609,22 +648,37 @@ def scanned() -> str:
     names = {
         "whole images": "nothing: whole images",
         "whole images, mesh cut to a box by hand": "a box in space by hand",
-        "box": "the detector's boxes", "grabcut": "GrabCut in its boxes", "detector": "the detector's masks",
+        "box": "the detector's boxes",
+        "grabcut": "GrabCut in its boxes",
+        "detector": "the detector's masks",
         "true masks": "true masks",
-    }  # fmt: skip
+    }
     rows = []
     for key, words in names.items():
         row = run["rows"][key]
         if "failed" in row:
             rows.append([words, "", row["failed"], "", "", "", ""])
             continue
-        rows.append([
-            words, f"{row['iou']:.2f}" if "iou" in row else "", f"{row['chamfer_mm']:.1f}",
-            f"{row['accuracy_mm']:.1f}", f"{row['completeness_mm']:.1f}", f"{100 * row['complete']:.0f} %",
-            f"{100 * row['precise']:.0f} %",
-        ])  # fmt: skip
-    head = ["cut with", "mask IoU", "chamfer, mm", "mesh to tile, mm", "tile to mesh, mm", "tile within 3 mm",
-            "mesh within 3 mm"]  # fmt: skip
+        rows.append(
+            [
+                words,
+                f"{row['iou']:.2f}" if "iou" in row else "",
+                f"{row['chamfer_mm']:.1f}",
+                f"{row['accuracy_mm']:.1f}",
+                f"{row['completeness_mm']:.1f}",
+                f"{100 * row['complete']:.0f} %",
+                f"{100 * row['precise']:.0f} %",
+            ]
+        )
+    head = [
+        "cut with",
+        "mask IoU",
+        "chamfer, mm",
+        "mesh to tile, mm",
+        "tile to mesh, mm",
+        "tile within 3 mm",
+        "mesh within 3 mm",
+    ]
     size = run["size"]
     about = f"{run['views']} images of {size} x {size}, `{run['field']}`, {run['steps']} steps, one seed."
     return f"{about}\n\n{table(head, rows)}"

@@ -70,14 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 # Commands with options and a main of their own, imported only when called: command -> (module, help).
 _COMMANDS = {
-    "fit": (
-        "experiments.fitting.command",
-        "fit a recorded data set without a network and report fidelity over time",
-    ),
-    "frontier": (
-        "experiments.frontier.command",
-        "sweep the effort of fits and updates, plot fidelity against seconds",
-    ),
+    "fit": ("experiments.fitting.command", "fit a recorded data set without a network and report fidelity over time"),
+    "frontier": ("experiments.frontier.command", "sweep the effort of fits and updates, plot fidelity against seconds"),
     "train-scheduler": (
         "experiments.training.scheduler.command",
         "learn when to update the field and from which views, rewarded by real field fits",
@@ -99,18 +93,9 @@ _COMMANDS = {
         "choose where a camera goes next around an object, within a budget of views or meters",
     ),
     "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
-    "bench": (
-        "experiments.bench.command",
-        "measure speed and quality on this machine: field, track, ingest and more",
-    ),
-    "explain": (
-        "report.explain_command",
-        "explain a policy's decision: shares of state parts, cameras, image regions",
-    ),
-    "export": (
-        "export.command",
-        "write a run's mesh, splats, points, cameras and poses as files for other programs",
-    ),
+    "bench": ("experiments.bench.command", "measure speed and quality on this machine: field, track, ingest and more"),
+    "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
+    "export": ("export.command", "write a run's mesh, splats, points, cameras and poses as files for other programs"),
     "train-detector": (
         "experiments.training.detector.command",
         "train the small detector whose backbone makes the default embeddings",
@@ -120,10 +105,7 @@ _COMMANDS = {
         "fit the substitute for LPIPS to real LPIPS on distorted renderings",
     ),
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
-    "fetch-lpips": (
-        "fidelity.fetch_lpips",
-        "fetch LPIPS weights with the public package and convert them for --lpips",
-    ),
+    "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }
 
 
@@ -140,28 +122,20 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument("scenario", help="scenario file, or the name of a shipped one")
     run.add_argument(
-        "--listen",
-        default="127.0.0.1:7000",
-        metavar="HOST:PORT",
-        help="address to receive frames on [%(default)s]",
+        "--listen", default="127.0.0.1:7000", metavar="HOST:PORT", help="address to receive frames on [%(default)s]"
     )
+    run.add_argument("--page-port", type=int, metavar="PORT", help="serve the live page on this port [no page]")
     run.add_argument(
-        "--page-port", type=int, metavar="PORT", help="serve the live page on this port [no page]"
+        "--page-host", default="127.0.0.1", metavar="HOST", help="address of the page and the metrics [%(default)s]"
     )
+    run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port [none]")
+    run.add_argument("--out", type=out_folder, default="runs/edge", metavar="DIR", help="folder to write [%(default)s]")
     run.add_argument(
-        "--page-host",
-        default="127.0.0.1",
-        metavar="HOST",
-        help="address of the page and the metrics [%(default)s]",
+        "--emulator-out",
+        type=Path,
+        metavar="DIR",
+        help="--out of channel-emu run: the page shows its channel state [this --out]",
     )
-    run.add_argument(
-        "--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port [none]"
-    )
-    run.add_argument(
-        "--out", type=out_folder, default="runs/edge", metavar="DIR", help="folder to write [%(default)s]"
-    )
-    run.add_argument("--emulator-out", type=Path, metavar="DIR",
-        help="--out of channel-emu run: the page shows its channel state [this --out]")  # fmt: skip
     run.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
     run.add_argument(
         "--policy",
@@ -169,10 +143,13 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
     run.add_argument(
-        "--learn", nargs="?", const="", metavar="REWARD[:moving]",
+        "--learn",
+        nargs="?",
+        const="",
+        metavar="REWARD[:moving]",
         help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
         "[edge.learn, else as trained]",
-    )  # fmt: skip
+    )
     run.add_argument(
         "--fallback",
         metavar="NAME[:VALUE]",
@@ -185,20 +162,18 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         help="folder of LPIPS weights [$FRESHFIELD_LPIPS, else lpips/ in the data folder]",
     )
     run.add_argument(
-        "--data",
-        type=Path,
-        metavar="DIR",
-        help="folder of data sets; only its lpips/ is read [$FRESHFIELD_DATA]",
+        "--data", type=Path, metavar="DIR", help="folder of data sets; only its lpips/ is read [$FRESHFIELD_DATA]"
     )
     run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
     run.add_argument(
-        "--checkpoint-every",
-        type=float,
-        metavar="S",
-        help="write OUT/field.npz every S seconds [only at the end]",
+        "--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz every S seconds [only at the end]"
     )
-    run.add_argument("--record", type=out_file, metavar="FILE", help="write the session as MCAP, to view or "
-                     "replay (source kind mcap)")  # fmt: skip
+    run.add_argument(
+        "--record",
+        type=out_file,
+        metavar="FILE",
+        help="write the session as MCAP, to view or replay (source kind mcap)",
+    )
     run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     transport.add_arguments(run)
     run.set_defaults(run=_run)

@@ -36,9 +36,10 @@ FIELDS, SCHEDULER, FIDELITY = (f"edge_server/{room}" for room in ("fields", "sch
 MODULES = {
     "fields": (  # what learns takes minutes a test, too long for a mutant
         [f"{FIELDS}/checkpoint.py", f"{FIELDS}/common/scene_box.py", f"{FIELDS}/common/supervision.py"],
-        [f"tests/{FIELDS}/{name}.py" for name in (
-            "test_checkpoint", "common/test_scene_box", "common/test_supervision"
-        )],
+        [
+            f"tests/{FIELDS}/{name}.py"
+            for name in ("test_checkpoint", "common/test_scene_box", "common/test_supervision")
+        ],
     ),
     "link": (
         ["channel_emu/model/link.py", "channel_emu/model/queue_server.py"],
@@ -46,27 +47,34 @@ MODULES = {
     ),
     "buffer": (["edge_server/live/buffer.py"], ["tests/edge_server/live/test_buffer.py"]),
     "scheduler": (
-        [f"{SCHEDULER}/{name}.py" for name in (
-            "fixed", "policy", "registry", "wait"
-        )],
+        [f"{SCHEDULER}/{name}.py" for name in ("fixed", "policy", "registry", "wait")],
         [f"tests/{SCHEDULER}/test_policies.py", f"tests/{SCHEDULER}/test_registry.py"],
     ),
     "fidelity": (
-        [f"{FIDELITY}/{name}.py" for name in (
-            "baselines", "images", "moving_pixels", "psnr", "scorer", "ssim"
-        )],
-        [f"tests/{FIDELITY}/test_{name}.py" for name in (
-            "baselines", "moving_pixels", "psnr", "scorer", "ssim"
-        )],
+        [f"{FIDELITY}/{name}.py" for name in ("baselines", "images", "moving_pixels", "psnr", "scorer", "ssim")],
+        [f"tests/{FIDELITY}/test_{name}.py" for name in ("baselines", "moving_pixels", "psnr", "scorer", "ssim")],
     ),
     "ledger": (["proto/freshfield/ledger.py"], ["tests/freshfield/test_ledger.py"]),
-}  # fmt: skip
+}
 SWAPS = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
-    ast.And: ast.Or, ast.Or: ast.And, ast.Add: ast.Sub, ast.Sub: ast.Add,
-    ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
-}  # fmt: skip
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+}
 # What these hold is not computed with: messages, names of types.
 PASSED_OVER = (ast.Raise, ast.JoinedStr, ast.AnnAssign, ast.Assert, ast.Import, ast.ImportFrom)
 
@@ -105,9 +113,7 @@ def drawn(seed: int, count: int) -> list[tuple[str, str, int]]:
     """(group, file, number of the place in it), as many of each group."""
     rng, chosen = random.Random(seed), []
     for number, (group, (files, _)) in enumerate(MODULES.items()):
-        every = [
-            (group, f, k) for f in files for k, _ in enumerate(places(ast.parse((ROOT / f).read_text())))
-        ]
+        every = [(group, f, k) for f in files for k, _ in enumerate(places(ast.parse((ROOT / f).read_text())))]
         chosen += rng.sample(every, min(len(every), (count + number) // len(MODULES)))
     return chosen
 

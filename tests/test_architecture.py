@@ -22,8 +22,12 @@ FORBIDDEN = {
     "channel_emu.live": ("channel_emu.virtual", "channel_emu.estimate"),
     "channel_emu.virtual": ("channel_emu.live", "channel_emu.estimate"),
     "edge_server.fields": (
-        "edge_server.live", "edge_server.scheduler", "edge_server.fidelity", "edge_server.page",
-        "edge_server.report", "edge_server.surface",
+        "edge_server.live",
+        "edge_server.scheduler",
+        "edge_server.fidelity",
+        "edge_server.page",
+        "edge_server.report",
+        "edge_server.surface",
     ),
     "edge_server.fields.common": tuple(
         f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf", "voxel")
@@ -33,10 +37,8 @@ FORBIDDEN = {
     "edge_server.live": ("edge_server.page", "edge_server.report"),
     "edge_server.fidelity": ("edge_server.live", "edge_server.page"),
     "edge_server.report": ("edge_server.live", "edge_server.page"),
-    "edge_server.viewpoints": (
-        "edge_server.live", "edge_server.page", "edge_server.report", "edge_server.fidelity",
-    ),
-}  # fmt: skip
+    "edge_server.viewpoints": ("edge_server.live", "edge_server.page", "edge_server.report", "edge_server.fidelity"),
+}
 FILES_A_LEVEL = 16  # fifteen and an __init__
 
 

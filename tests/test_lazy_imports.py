@@ -38,19 +38,49 @@ import channel_emu.virtual.simulate
 @pytest.mark.parametrize(
     ("program", "unasked"),
     [
-        (EDGE, ("edge_server.embed", "edge_server.foreground", "edge_server.live.keyframes",
-                "edge_server.surface", "edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib",
-                "mcap", "torch")),
-        (NODE, ("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy",
-                "mcap")),
-        (NODE_WITHOUT_ARM, ("camera_node.pose", "camera_node.robot.hand_camera",
-                            "camera_node.sources.devices.live", "rtde", "depthai")),
-        (TILE, ("camera_node.synthetic.scenes.room", "camera_node.synthetic.person", "torch", "numba",
-                "edge_server", "channel_emu", "scipy", "matplotlib")),
+        (
+            EDGE,
+            (
+                "edge_server.embed",
+                "edge_server.foreground",
+                "edge_server.live.keyframes",
+                "edge_server.surface",
+                "edge_server.fields.splat.planar",
+                "onnx",
+                "skimage",
+                "matplotlib",
+                "mcap",
+                "torch",
+            ),
+        ),
+        (NODE, ("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap")),
+        (
+            NODE_WITHOUT_ARM,
+            (
+                "camera_node.pose",
+                "camera_node.robot.hand_camera",
+                "camera_node.sources.devices.live",
+                "rtde",
+                "depthai",
+            ),
+        ),
+        (
+            TILE,
+            (
+                "camera_node.synthetic.scenes.room",
+                "camera_node.synthetic.person",
+                "torch",
+                "numba",
+                "edge_server",
+                "channel_emu",
+                "scipy",
+                "matplotlib",
+            ),
+        ),
         (EMULATOR, ("torch", "numba", "camera_node", "edge_server")),
     ],
     ids=("edge", "node", "node without an arm", "tile", "emulator"),
-)  # fmt: skip
+)
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
     code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -114,9 +114,7 @@ def sample_at(
     return interpolate(samples[before], samples[after], fraction), gap
 
 
-def read_tum(
-    path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0
-) -> Trajectory:
+def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0) -> Trajectory:
     """Read a trajectory file. interpolate, max_gap_ns: see ``Trajectory``.
 
     start_ns: time in the file that becomes 0.

@@ -16,28 +16,25 @@ from camera_node.config import ROBOTS
 def add_commands(commands: Any) -> None:
     """Add their parsers to the sub-commands ``commands``."""
     simulate = commands.add_parser(
-        "simulate-arm", help="a simulated UR controller that real client programs connect to",
+        "simulate-arm",
+        help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
         "registers (30004), dashboard (29999), programs (30001-30003). It executes the commands moveJ, "
         "servoJ, servoStop, stopJ, setWatchdog, kickWatchdog and stopScript. Others "
         "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",
-    )  # fmt: skip
+    )
     simulate.set_defaults(run=partial(_run, "simulated_controller.command"))
     add = simulate.add_argument
     add("scenario", nargs="?", help="scenario whose source.arm gives address, robot and calibration")
     add(
-        "--host", metavar="ADDRESS",
+        "--host",
+        metavar="ADDRESS",
         help="address to serve at; the ports are fixed, so a second arm needs a second address, such as "
         "127.0.0.3 [127.0.0.2]",
-    )  # fmt: skip
-    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm [%(default)s]")
-    add(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="calibration.conf of a real robot [nominal kinematics]",
     )
+    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm [%(default)s]")
+    add("--calibration", type=Path, metavar="FILE", help="calibration.conf of a real robot [nominal kinematics]")
     add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees [a home pose]")
     add(
         "--drift-ppm",
@@ -46,29 +43,20 @@ def add_commands(commands: Any) -> None:
         metavar="PPM",
         help="frequency error of its clock, positive: fast [%(default)g]",
     )
-    add(
-        "--noise-rad",
-        type=float,
-        default=0.0,
-        metavar="RAD",
-        help="standard deviation of encoder noise [%(default)g]",
-    )
+    add("--noise-rad", type=float, default=0.0, metavar="RAD", help="standard deviation of encoder noise [%(default)g]")
     add("--seed", type=int, default=0, metavar="N", help="random seed of the noise [%(default)s]")
 
     drive = commands.add_parser(
-        "drive-arm", help="move the camera on an arm around its target",
+        "drive-arm",
+        help="move the camera on an arm around its target",
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
         "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
-    )  # fmt: skip
+    )
     drive.set_defaults(run=partial(_run, "arm.drive"))
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
     add("--rounds", type=int, default=0, metavar="N", help="number of tours; 0: until Ctrl-C [%(default)s]")
-    add(
-        "--show",
-        action="store_true",
-        help="print the tour from the arm's joint angles and exit without moving",
-    )
+    add("--show", action="store_true", help="print the tour from the arm's joint angles and exit without moving")
     add("--joints", metavar="DEG,...", help="with --show: start from these six joint angles, in degrees")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
 
@@ -99,31 +87,28 @@ HD_CURRENT_BUTTONS.
 
 def _add_teleop(commands: Any) -> None:
     teleop = commands.add_parser(
-        "teleop", help="move an arm by keyboard, gamepad or a stylus on the network", description=TELEOP,
+        "teleop",
+        help="move an arm by keyboard, gamepad or a stylus on the network",
+        description=TELEOP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    )
     teleop.set_defaults(run=partial(_run, "teleop.command"))
     add = teleop.add_argument
     add("scenario", help="a scenario with a source.arm")
     add(
-        "--stylus", required=True, metavar="WHICH",
+        "--stylus",
+        required=True,
+        metavar="WHICH",
         help="keyboard, gamepad[:/dev/input/eventN], network:[HOST:]PORT [HOST: 127.0.0.1]",
-    )  # fmt: skip
-    add(
-        "--dry-run",
-        type=Path,
-        metavar="FILE",
-        help="write the trajectory to FILE (CSV) instead of moving an arm",
     )
+    add("--dry-run", type=Path, metavar="FILE", help="write the trajectory to FILE (CSV) instead of moving an arm")
     add("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
     add("--json", action="store_true", help="print the counts at the end as one JSON object")
 
 
 def log_to_stderr(level: int = logging.INFO) -> None:
-    logging.basicConfig(
-        level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
-    )
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
 
 
 def _run(module: str, args: argparse.Namespace) -> int:

@@ -116,10 +116,7 @@ class HandCamera(Source):
 
 
 def open_hand_cameras(
-    scenario: Scenario,
-    config: ArmConfig,
-    frames: Mapping[str, FrameCache],
-    effects: Mapping[str, Effects | None],
+    scenario: Scenario, config: ArmConfig, frames: Mapping[str, FrameCache], effects: Mapping[str, Effects | None]
 ) -> dict[str, Source]:
     """Connect to the arm and open the cameras of ``frames``, which are on its hand. Raises ScenarioError and
     ArmError."""
@@ -136,8 +133,16 @@ def open_hand_cameras(
     truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
     return {
         camera: HandCamera(
-            camera, each.fps, each.scene, each.scene.cameras[each.camera_id][0],
-            effects.get(camera) or NO_EFFECTS, poses[camera], truth, arm, base, mounts[camera].transform,
+            camera,
+            each.fps,
+            each.scene,
+            each.scene.cameras[each.camera_id][0],
+            effects.get(camera) or NO_EFFECTS,
+            poses[camera],
+            truth,
+            arm,
+            base,
+            mounts[camera].transform,
         )
         for camera, each in frames.items()
-    }  # fmt: skip
+    }

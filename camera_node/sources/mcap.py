@@ -70,9 +70,7 @@ class ReplaySource(Source):
         return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
 
 
-def open_replay(
-    scenario: Scenario, config: McapConfig, cameras: Sequence[str], data: Path | None
-) -> dict[str, Source]:
+def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], data: Path | None) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``."""
     path = Path(config.file).expanduser()
     if not path.is_file():

@@ -15,13 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.sources.datasets.records import (
-    DatasetError,
-    camera_to_world,
-    errors_at,
-    read_array,
-    read_json,
-)
+from camera_node.sources.datasets.records import DatasetError, camera_to_world, errors_at, read_array, read_json
 from freshfield.geometry import Pinhole, Pose
 
 

@@ -24,14 +24,11 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
 
     with errors_of(f"{scenario.path}: source.effects"):
         effects = load_effects(
-            config.effects,
-            lambda name: scenario.rng(f"effect {name}", camera),
-            held_out=camera in scenario.held_out,
+            config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out=camera in scenario.held_out
         )
     if config.kind != "world" and (effects.world or effects.lens or effects.exposure):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need "
-            "source kind world"
+            f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need source kind world"
         )
     return effects
 

@@ -42,9 +42,7 @@ def measure_ms(*calls: Callable[[int], object], frames: int, within_s: float = n
     return [median(row) for row in _times_ms(*calls, frames=frames, within_s=within_s)]
 
 
-def added_ms(
-    base: Callable[[int], object], full: Callable[[int], object], frames: int, within_s: float
-) -> float:
+def added_ms(base: Callable[[int], object], full: Callable[[int], object], frames: int, within_s: float) -> float:
     """Median extra time of full(k) over base(k), frame by frame, because frames differ."""
     rows = _times_ms(base, full, frames=frames, within_s=within_s)
     return median(b - a for a, b in zip(*rows))
@@ -163,13 +161,15 @@ def _size(word: str) -> Size:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description="measure the cost of scenes and effects, in ms per frame (medians)"
-    )
+    parser = argparse.ArgumentParser(description="measure the cost of scenes and effects, in ms per frame (medians)")
     parser.add_argument(
-        "--size", type=_size, nargs="+", default=[(128, 128), (640, 480)], metavar="WxH",
+        "--size",
+        type=_size,
+        nargs="+",
+        default=[(128, 128), (640, 480)],
+        metavar="WxH",
         help="image sizes [128x128 640x480]",
-    )  # fmt: skip
+    )
     parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames per median [%(default)s]")
     parser.add_argument(
         "--within",

@@ -89,11 +89,7 @@ class ShadowModel(Protocol):
     """Shadows of moving parts."""
 
     def blocked_light(
-        self,
-        surface: SurfacePoints,
-        light: Light,
-        moving: Sequence[PlacedParts],
-        specular: SpecularReflection | None,
+        self, surface: SurfacePoints, light: Light, moving: Sequence[PlacedParts], specular: SpecularReflection | None
     ) -> Array:
         """Light (3, N) that moving parts take away from the surface points' colors."""
         ...
@@ -111,9 +107,7 @@ class Switch(Protocol):
         ...
 
 
-def shade_diffuse(
-    light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None
-) -> Array:
+def shade_diffuse(light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None) -> Array:
     """Colors (3, N) of surface points under ambient light and Lambert's law.
 
     albedo, points, normals: (3, N).
@@ -129,9 +123,7 @@ def shade_diffuse(
     return albedo * (ambient + np.array(light.tint)[:, None] * (light.strength / len(sources)) * direct)
 
 
-def direct_light(
-    surface: SurfacePoints, light: Light, source: Array, specular: SpecularReflection | None
-) -> Array:
+def direct_light(surface: SurfacePoints, light: Light, source: Array, specular: SpecularReflection | None) -> Array:
     """Colors (3, N) that one of the light's points (3,) adds to surface points that see it."""
     diffuse = surface.albedo * _lambert(source, light.falloff_m, surface.points, surface.normals)
     if specular is None:
@@ -147,9 +139,7 @@ def specular_light(light: Light, specular: SpecularReflection, surface: SurfaceP
     return light.point_color * total
 
 
-def _reflected(
-    specular: SpecularReflection, source: Array, falloff_m: float, surface: SurfacePoints
-) -> Array:
+def _reflected(specular: SpecularReflection, source: Array, falloff_m: float, surface: SurfacePoints) -> Array:
     to = source[:, None] - surface.points
     distance2 = np.maximum((to * to).sum(axis=0), 1e-12)
     share = specular.reflectance(to / np.sqrt(distance2), surface.normals, surface.rays)

@@ -127,9 +127,14 @@ _SCALES = {
 }
 # Spheres that shade the floor: part and radius (m).
 _CONTACT = {
-    "foot_l": 0.10, "foot_r": 0.10, "shin_l": 0.08, "shin_r": 0.08,
-    "thigh_l": 0.10, "thigh_r": 0.10, "pelvis": 0.14,
-}  # fmt: skip
+    "foot_l": 0.10,
+    "foot_r": 0.10,
+    "shin_l": 0.08,
+    "shin_r": 0.08,
+    "thigh_l": 0.10,
+    "thigh_r": 0.10,
+    "pelvis": 0.14,
+}
 
 
 def _direction(*terms: tuple[float, Vector]) -> Vector:
@@ -268,9 +273,7 @@ def make_walk(
     return walk
 
 
-def _draw_walk(
-    center: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int
-) -> Walk:
+def _draw_walk(center: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int) -> Walk:
     rng = np.random.default_rng(seed)
     dx, dy = rng.uniform(-_SHIFT_M, _SHIFT_M, 2).tolist()
     wide, deep = rng.uniform(*_RADIUS_FACTORS, 2).tolist()

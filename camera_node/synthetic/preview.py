@@ -45,9 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("scene", choices=SCENES)
     parser.add_argument("--out", type=out_file, required=True, help="PNG file to write")
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="instant in seconds [%(default)g]")
-    parser.add_argument(
-        "--size", type=int, default=256, metavar="PX", help="side of each image [%(default)s]"
-    )
+    parser.add_argument("--size", type=int, default=256, metavar="PX", help="side of each image [%(default)s]")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="scene parameter; may be repeated"
     )

@@ -59,9 +59,7 @@ class World:
     switch: Switch | None = None
 
 
-def cast_rays(
-    origin: Array, directions: Array, placed: PlacedParts, limit: Array
-) -> tuple[Array, NDArray[np.int16]]:
+def cast_rays(origin: Array, directions: Array, placed: PlacedParts, limit: Array) -> tuple[Array, NDArray[np.int16]]:
     """Nearest hits of unit rays from one origin (3,) along directions (3, N) within distances ``limit`` (N,).
 
     Returns distances (N,) and part indices (N,); a ray without a hit has its ``limit`` and -1. Each part is
@@ -230,9 +228,7 @@ class CameraRenderer:
         near, left = contact_shadow(body, placed, self._floor_points[:, part])
         colors[self._floor[part][near] - low] *= left[:, None]
 
-    def _shadow_static(
-        self, shadows: ShadowModel, moving: Sequence[PlacedParts], colors: Colors, low: int
-    ) -> None:
+    def _shadow_static(self, shadows: ShadowModel, moving: Sequence[PlacedParts], colors: Colors, low: int) -> None:
         part = slice(*np.searchsorted(self._hit, (low, low + len(colors))))
         surface = self._static_surface.select(part)
         lost = shadows.blocked_light(surface, self.world.light, moving, self.world.specular)
@@ -284,9 +280,7 @@ class CameraRenderer:
         if world.specular is not None:
             colors += specular_light(light, world.specular, surface)
         if world.shadows is not None:
-            colors = np.maximum(
-                colors - world.shadows.blocked_light(surface, light, moving, world.specular), 0.0
-            )
+            colors = np.maximum(colors - world.shadows.blocked_light(surface, light, moving, world.specular), 0.0)
         return colors
 
     def _through_medium(self, colors: Colors, transmittance: NDArray[np.float32] | None) -> Colors:

@@ -106,9 +106,7 @@ class Scene:
             if camera_id not in self.cameras:
                 known = ", ".join(self.cameras)
                 raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
-            self._renderers[camera_id] = self._shared_renderer(camera_id) or self.view(
-                *self.cameras[camera_id]
-            )
+            self._renderers[camera_id] = self._shared_renderer(camera_id) or self.view(*self.cameras[camera_id])
         return self._renderers[camera_id]
 
     def _shared_renderer(self, camera_id: str) -> CameraRenderer | None:
@@ -139,9 +137,7 @@ class Scene:
         """The same cameras in another world, as effects need it. period_s, moving: None keeps them."""
         period_s = self.period_s if period_s is None else period_s
         moving = self.moving if moving is None else moving
-        return dataclasses.replace(
-            self, world=world, period_s=period_s, moving=moving, static_key=None, _renderers={}
-        )
+        return dataclasses.replace(self, world=world, period_s=period_s, moving=moving, static_key=None, _renderers={})
 
     def with_cameras(self, cameras: PosedCameras) -> Scene:
         """The same world with other cameras, as effects on lenses need it."""

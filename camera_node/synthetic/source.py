@@ -38,11 +38,7 @@ class WorldSource(Source):
     """
 
     def __init__(
-        self,
-        camera: str,
-        frames: FrameCache,
-        effects: Effects,
-        render_in_subprocess: Callable[[Stopped], None],
+        self, camera: str, frames: FrameCache, effects: Effects, render_in_subprocess: Callable[[Stopped], None]
     ) -> None:
         self.camera = camera
         self.fps, self.phase_ns = frames.fps, frames.phase_ns
@@ -93,10 +89,7 @@ def open_sources(
         carried = open_hand_cameras(scenario, config.arm, on_hand, effects)
     return carried | {
         camera: WorldSource(
-            camera,
-            each,
-            effects.get(camera) or NO_EFFECTS,
-            partial(render_in_subprocess, scenario, config, camera),
+            camera, each, effects.get(camera) or NO_EFFECTS, partial(render_in_subprocess, scenario, config, camera)
         )
         for camera, each in frames.items()
     }

@@ -162,8 +162,7 @@ class Planks:
         )
         weight = np.clip(0.75 * tone + 0.25 * grain, 0, 1)
         line = np.maximum(
-            soft_line(uv[0], self.width, self.seam, self.soft),
-            soft_line(v, self.length, self.seam, self.soft),
+            soft_line(uv[0], self.width, self.seam, self.soft), soft_line(v, self.length, self.seam, self.soft)
         )
         wood = mix(_rgb(self.light), _rgb(self.dark), weight)
         return wood * (1.0 - 0.45 * line)

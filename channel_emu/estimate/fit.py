@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 
 from channel_emu.estimate import hmm
 from channel_emu.estimate.hmm import Z_95, Estimate, Timeline
-from channel_emu.estimate.recording import (
-    MAX_DELAY_MS,
-    Camera,
-    Recording,
-    RecordingError,
-    read_recording,
-    timelines,
-)
+from channel_emu.estimate.recording import MAX_DELAY_MS, Camera, Recording, RecordingError, read_recording, timelines
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import EventKind
 from freshfield.scenario import ScenarioError
@@ -159,8 +152,19 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scop
         raise RecordingError(
             f"{path}: delays and arrivals do not determine a channel of two states ({error}): --states 1"
         ) from None
-    return Fit(recording, 1 if estimate is None else 2, chosen_by, kind, parameters, bic, bursts, channel,
-               warnings, estimate, lines)  # fmt: skip
+    return Fit(
+        recording,
+        1 if estimate is None else 2,
+        chosen_by,
+        kind,
+        parameters,
+        bic,
+        bursts,
+        channel,
+        warnings,
+        estimate,
+        lines,
+    )
 
 
 def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
@@ -258,8 +262,10 @@ def _data_warnings(recording: Recording, constant: bool, poisson: bool, states: 
         what = "states are told apart by arrivals alone" if poisson else "there is nothing to tell states by"
         notes.append(f"the delays hardly vary: {what}")
         if states == "2" and not poisson:
-            raise RecordingError(f"{recording.path}: --states 2: the delays hardly vary and the arrivals are "
-                                "periodic: there is nothing to tell states by")  # fmt: skip
+            raise RecordingError(
+                f"{recording.path}: --states 2: the delays hardly vary and the arrivals are "
+                "periodic: there is nothing to tell states by"
+            )
     return notes
 
 
@@ -292,24 +298,16 @@ def _loss_statistics(cameras: list[Camera]) -> dict[str, IntervalEstimate]:
     """Shares of dropped and lost frames, lengths of runs of undelivered and of delivered frames, gaps between
     deliveries. Skipped frames and those still inside the link are not counted."""
     found: dict[str, IntervalEstimate] = {}
-    kept = [
-        camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras
-    ]
+    kept = [camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras]
     gone = [np.isin(outcome, _DROPPED + _LOST) for outcome in kept]
-    found["dropped_share"] = _batch_share(
-        [np.isin(o, _DROPPED) for o in kept], [np.ones(len(o), bool) for o in kept]
-    )
-    found["lost_share"] = _batch_share(
-        [np.isin(o, _LOST) for o in kept], [~np.isin(o, _DROPPED) for o in kept]
-    )
+    found["dropped_share"] = _batch_share([np.isin(o, _DROPPED) for o in kept], [np.ones(len(o), bool) for o in kept])
+    found["lost_share"] = _batch_share([np.isin(o, _LOST) for o in kept], [~np.isin(o, _DROPPED) for o in kept])
     for name, values in (("run_of_missing", gone), ("run_of_delivered", [~g for g in gone])):
         runs = np.concatenate([_runs(value) for value in values])
         if len(runs):
             found[f"{name}_frames"] = _batch_mean(runs)
             found[f"longest_{name}_frames"] = IntervalEstimate(float(runs.max()), None)
-    gaps = [
-        np.diff(np.sort((c.started_ms + c.delay_ms)[c.delivered() & ~np.isnan(c.delay_ms)])) for c in cameras
-    ]
+    gaps = [np.diff(np.sort((c.started_ms + c.delay_ms)[c.delivered() & ~np.isnan(c.delay_ms)])) for c in cameras]
     together = np.concatenate(gaps)
     if len(together):
         found["gap_ms"] = _batch_mean(together)

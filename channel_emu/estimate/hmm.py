@@ -58,8 +58,9 @@ class Timeline:
 
     def head(self, events: int) -> Timeline:
         """The first ``events`` events."""
-        return Timeline(self.span_ms[:events], self.waiting[:events], self.arrived[:events],
-                        self.delay_ms[:events], self.origin_ms)  # fmt: skip
+        return Timeline(
+            self.span_ms[:events], self.waiting[:events], self.arrived[:events], self.delay_ms[:events], self.origin_ms
+        )
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,7 @@ class TwoStateModel:
         key = self.mean_ms if self.mean_ms is not None else self.rate_per_ms
         if key is None or key[0] <= key[1]:
             return self
-        flipped = [
-            None if p is None else p[::-1] for p in (self.leave_per_ms, self.mean_ms, self.rate_per_ms)
-        ]
+        flipped = [None if p is None else p[::-1] for p in (self.leave_per_ms, self.mean_ms, self.rate_per_ms)]
         assert flipped[0] is not None
         return TwoStateModel(flipped[0], flipped[1], flipped[2])
 
@@ -147,9 +146,12 @@ def _propagators(model: TwoStateModel, line: Timeline) -> Array:
 
     each = [_Propagator(model, waiting) for waiting in range(int(line.waiting.max(initial=0)) + 1)]
     return hmm_kernels.propagate(
-        np.array([(p.slow, p.fast, p.root) for p in each]), np.array([p.p_slow for p in each]),
-        np.array([p.p_fast for p in each]), line.span_ms, line.waiting,
-    )  # fmt: skip
+        np.array([(p.slow, p.fast, p.root) for p in each]),
+        np.array([p.p_slow for p in each]),
+        np.array([p.p_fast for p in each]),
+        line.span_ms,
+        line.waiting,
+    )
 
 
 def _emissions(model: TwoStateModel, line: Timeline) -> tuple[Array, float]:
@@ -181,9 +183,7 @@ def state_probabilities(model: TwoStateModel, lines: Sequence[Timeline]) -> list
     """Probability of each state at each event given all observations, one array (N, 2) a timeline."""
     from channel_emu.estimate import hmm_kernels
 
-    return [
-        hmm_kernels.smooth(_UNIFORM, _propagators(model, line), _emissions(model, line)[0]) for line in lines
-    ]
+    return [hmm_kernels.smooth(_UNIFORM, _propagators(model, line), _emissions(model, line)[0]) for line in lines]
 
 
 def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> TwoStateModel:
@@ -201,8 +201,14 @@ def maximize(model: TwoStateModel, lines: Sequence[Timeline], steps: int) -> Two
 
     begin = model.log_parameters()
     tolerance = _TOLERANCE / max(abs(log_likelihood(model, lines)), 1.0)
-    found = minimize(lost, begin, jac=True, method="L-BFGS-B", bounds=[(-_MAX_LOG, _MAX_LOG)] * len(begin),
-                     options={"maxiter": steps, "ftol": tolerance, "gtol": 0.0})  # fmt: skip
+    found = minimize(
+        lost,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(-_MAX_LOG, _MAX_LOG)] * len(begin),
+        options={"maxiter": steps, "ftol": tolerance, "gtol": 0.0},
+    )
     return model.with_logs(found.x)
 
 
@@ -222,8 +228,11 @@ def initial_models(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> l
     for frames in (5, 50, 500):
         leave = np.full(2, 1 / (frames * max(between, 1e-9)))
         for apart in ((0.6, 1.6), (1.6, 0.6)) if delays and arrivals else ((0.6, 1.6),):
-            out.append(TwoStateModel(leave, mean * np.array([0.6, 1.6]) if delays else None,
-                                 rate * np.array(apart) if arrivals else None))  # fmt: skip
+            out.append(
+                TwoStateModel(
+                    leave, mean * np.array([0.6, 1.6]) if delays else None, rate * np.array(apart) if arrivals else None
+                )
+            )
     return out
 
 

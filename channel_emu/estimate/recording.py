@@ -233,9 +233,7 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     arrived: list[NDArray[np.bool_]] = []
     delay: list[NDArray[np.float64]] = []
 
-    def add(
-        at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None
-    ) -> None:
+    def add(at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None) -> None:
         n = len(at_ms)
         at.append(at_ms)
         change.append(np.full(n, by))
@@ -263,6 +261,9 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
     when = when[order]
     waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order
     return Timeline(
-        np.diff(when, prepend=when[:1]), waiting.astype(np.int64), np.concatenate(arrived)[order],
-        np.concatenate(delay)[order], float(when[0]) if len(when) else 0.0,
-    )  # fmt: skip
+        np.diff(when, prepend=when[:1]),
+        waiting.astype(np.int64),
+        np.concatenate(arrived)[order],
+        np.concatenate(delay)[order],
+        float(when[0]) if len(when) else 0.0,
+    )

@@ -43,9 +43,7 @@ def format_fit(fit: Fit) -> str:
 def scenario_text(fit: Fit) -> str:
     """Text of a scenario file with the fitted channel, for ``simulate --scenario``; it has no source."""
     cameras = [camera.name for camera in fit.recording.cameras]
-    head = (
-        f"# Fitted to {fit.recording.path.name}: {fit.recording.frames} frames, states by {fit.chosen_by}\n"
-    )
+    head = f"# Fitted to {fit.recording.path.name}: {fit.recording.frames} frames, states by {fit.chosen_by}\n"
     document = {"name": "fitted", "seed": 0, "cameras": {"count": len(cameras)}, "channel": fit.channel}
     return head + _yaml(document)
 

@@ -125,10 +125,13 @@ def bench(
 def show(result: dict[str, Any]) -> str:
     """The result of ``bench`` as text, with the histogram of the delay error."""
     late = [
-        {"ms": name.removesuffix("_ms").replace("_", " "),
-         **{k: "-" if figures[k] is None else figures[k] for k in ("p50", "p95", "p99", "max")}}
-        for name, figures in result.items() if isinstance(figures, dict)
-    ]  # fmt: skip
+        {
+            "ms": name.removesuffix("_ms").replace("_", " "),
+            **{k: "-" if figures[k] is None else figures[k] for k in ("p50", "p95", "p99", "max")},
+        }
+        for name, figures in result.items()
+        if isinstance(figures, dict)
+    ]
     plain = [{"what": name, "value": value} for name, value in result.items() if not isinstance(value, dict)]
     shape = result["delay_error_ms"]["histogram"]
     most = max(shape["counts"], default=0)
@@ -141,9 +144,7 @@ def show(result: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _emulator(
-    out: Path, cameras: int, listen: str, to: str, priority: bool
-) -> Iterator[subprocess.Popen[bytes]]:
+def _emulator(out: Path, cameras: int, listen: str, to: str, priority: bool) -> Iterator[subprocess.Popen[bytes]]:
     scenario = out / "bench.yaml"
     scenario.write_text(json.dumps({"name": "bench", "cameras": {"count": cameras}, "channel": _CHANNEL}))
     words = [sys.executable, "-m", "channel_emu.cli", "run", str(scenario), "--listen", listen, "--to", to]
@@ -200,24 +201,22 @@ async def _serve_sink(pipe: Connection, file: Path) -> None:
     await server.stop(None)
 
 
-def _source(
-    pipe: Connection, address: str, cameras: int, rate_hz: float, frame_bytes: int, seconds: float
-) -> None:
+def _source(pipe: Connection, address: str, cameras: int, rate_hz: float, frame_bytes: int, seconds: float) -> None:
     pipe.send(asyncio.run(_send_all(address, cameras, rate_hz, frame_bytes, seconds)))
 
 
-async def _send_all(
-    address: str, cameras: int, rate_hz: float, frame_bytes: int, seconds: float
-) -> dict[str, Any]:
+async def _send_all(address: str, cameras: int, rate_hz: float, frame_bytes: int, seconds: float) -> dict[str, Any]:
     channel = Transport().aio_channel(address)
     await channel.channel_ready()
     totals: dict[str, Any] = {"sent": 0, "behind": 0, "answer_ms": []}
     payload = np.random.default_rng(0).bytes(frame_bytes)
     begun = time.perf_counter()
-    await asyncio.gather(*(
-        _camera(channel, number, begun + number / cameras / rate_hz, rate_hz, seconds, payload, totals)
-        for number in range(cameras)
-    ))  # fmt: skip
+    await asyncio.gather(
+        *(
+            _camera(channel, number, begun + number / cameras / rate_hz, rate_hz, seconds, payload, totals)
+            for number in range(cameras)
+        )
+    )
     totals["seconds"] = time.perf_counter() - begun
     await channel.close()
     return totals
@@ -239,9 +238,15 @@ async def _camera(
     while frame < seconds * rate_hz:
         await asyncio.sleep(max(0.0, first_s + frame / rate_hz - time.perf_counter()))
         header = pb.FrameHeader(
-            camera_id=f"cam{number:02d}", session_id="bench", sequence=frame, generated_ns=clock.now_ns(),
-            role=pb.ROLE_TRAIN, codec=pb.CODEC_JPEG, width=1, height=1,
-        )  # fmt: skip
+            camera_id=f"cam{number:02d}",
+            session_id="bench",
+            sequence=frame,
+            generated_ns=clock.now_ns(),
+            role=pb.ROLE_TRAIN,
+            codec=pb.CODEC_JPEG,
+            width=1,
+            height=1,
+        )
         begun = time.perf_counter()
         await call.write(pb.PushRequest(header=header, payload=payload).SerializeToString())
         await call.read()
@@ -290,8 +295,11 @@ def _arrival_errors(out: Path) -> np.ndarray:
     origin_ns = int(ledger.stem.rsplit("-", 1)[1])
     due = {(int(r.camera[3:]), r.sequence): r.due_ns for r in trace.read(out / "trace.jsonl").records}
     arrivals = np.load(out / "arrivals.npy")
-    late = [at - origin_ns - due_ns for camera, sequence, at in arrivals.tolist()
-            if (due_ns := due.get((camera, sequence))) is not None]  # fmt: skip
+    late = [
+        at - origin_ns - due_ns
+        for camera, sequence, at in arrivals.tolist()
+        if (due_ns := due.get((camera, sequence))) is not None
+    ]
     return np.array(late) / 1e6
 
 

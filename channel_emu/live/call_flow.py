@@ -31,9 +31,7 @@ class CallFlow:
     now_ns: the channel's clock.
     """
 
-    def __init__(
-        self, number: int, call: ServedCall, link: LiveLink | None, now_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, number: int, call: ServedCall, link: LiveLink | None, now_ns: Callable[[], int]) -> None:
         self._number = number
         self._call = call
         self._link = link

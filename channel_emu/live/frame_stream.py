@@ -75,9 +75,14 @@ class FrameStream:
         for camera in self.cameras:
             jitter = np.random.default_rng(stream_key(proxy.channel.seed, camera, "channel.backoff"))
             self.flows[camera] = CameraFlow(
-                proxy.link(camera, damage_payload), proxy.clock, proxy.origin_ns, self._ledger,
-                proxy.service_channel, proxy.options.transport.metadata(), jitter,
-            )  # fmt: skip
+                proxy.link(camera, damage_payload),
+                proxy.clock,
+                proxy.origin_ns,
+                self._ledger,
+                proxy.service_channel,
+                proxy.options.transport.metadata(),
+                jitter,
+            )
         return {
             PUSH: grpc.stream_stream_rpc_method_handler(self._push),
             _EXCHANGE: grpc.unary_unary_rpc_method_handler(self._pass_exchange),
@@ -102,8 +107,9 @@ class FrameStream:
         if self._warn_at_ns and self._proxy.clock.now_ns() > self._warn_at_ns:
             self._warn_at_ns = 0
             if not any(flow.upstream.connected for flow in self.flows.values()):
-                log.warning("no answer from the edge at %s yet; frames are broken until it is there",
-                            self._proxy.options.to)  # fmt: skip
+                log.warning(
+                    "no answer from the edge at %s yet; frames are broken until it is there", self._proxy.options.to
+                )
         await asyncio.to_thread(self._write_status, self._snapshot())
 
     def close(self) -> None:
@@ -193,9 +199,14 @@ class FrameStream:
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
         return snapshot(
-            self._proxy.channel, list(self.flows.values()), self._proxy.stats, self.rejected,
-            self._proxy.events.now_ns(), self._priority, final,
-        )  # fmt: skip
+            self._proxy.channel,
+            list(self.flows.values()),
+            self._proxy.stats,
+            self.rejected,
+            self._proxy.events.now_ns(),
+            self._priority,
+            final,
+        )
 
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:

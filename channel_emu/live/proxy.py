@@ -48,9 +48,7 @@ _REFRESH_EVERY_S = 0.5
 # How much of the chain's past path is kept; no event is processed later than this.
 _KEEP_PATH_NS = 60 * 10**9
 # Any other service has not agreed to the project's keepalive pings, and would close the connection.
-_CLIENT_OPTIONS = [
-    (key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key
-]
+_CLIENT_OPTIONS = [(key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key]
 
 
 class EmulatorFailed(RuntimeError):
@@ -113,9 +111,7 @@ class Proxy(grpc.GenericRpcHandler):
     Raises OSError if the trace or a file of the hook cannot be created, and TransportError.
     """
 
-    def __init__(
-        self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None
-    ) -> None:
+    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None) -> None:
         self.options = options
         self.clock = WallClock()
         self.origin_ns = self.clock.now_ns()
@@ -215,8 +211,13 @@ class Proxy(grpc.GenericRpcHandler):
         """Outcomes, ages and delays so far."""
         found = {name: figures_of([link], link.stats) for name, link in self.links.items()}
         total = asdict(figures_of(list(self.links.values()), self.stats))
-        return Report(**total, seed=self.channel.seed, direction=self.options.direction,
-                      seconds=self.events.now_ns() / 1e9, by_method=found)  # fmt: skip
+        return Report(
+            **total,
+            seed=self.channel.seed,
+            direction=self.options.direction,
+            seconds=self.events.now_ns() / 1e9,
+            by_method=found,
+        )
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run ``work`` in the background until the proxy stops; an exception in it ends the proxy."""
@@ -234,9 +235,8 @@ class Proxy(grpc.GenericRpcHandler):
         elif self.options.replay is not None:
             log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
-            name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace,
-            self._room,
-        )  # fmt: skip
+            name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace, self._room
+        )
         # A fault may act before the first message.
         self.events.schedule(link)
         return link
@@ -272,9 +272,7 @@ class Proxy(grpc.GenericRpcHandler):
             await parts[1]
             code, trailers = await call.code(), _passed_on(await call.trailing_metadata())
             if code is grpc.StatusCode.OK and down.lost_its_only_message:
-                await context.abort(
-                    grpc.StatusCode.UNAVAILABLE, self._dropped("answer", "down", method), trailers
-                )
+                await context.abort(grpc.StatusCode.UNAVAILABLE, self._dropped("answer", "down", method), trailers)
             if code is not grpc.StatusCode.OK:
                 await context.abort(code, await call.details() or "", trailers)
             context.set_trailing_metadata(trailers)
@@ -307,8 +305,7 @@ class Proxy(grpc.GenericRpcHandler):
         if self._hook is not None:
             return self._hook.pending
         return sum(
-            link.model.counts[EventKind.DELIVERED] - link.forwarded - link.cancelled
-            for link in self.links.values()
+            link.model.counts[EventKind.DELIVERED] - link.forwarded - link.cancelled for link in self.links.values()
         )
 
     def _ended(self, task: asyncio.Task[None]) -> None:
@@ -327,18 +324,14 @@ class Proxy(grpc.GenericRpcHandler):
             await asyncio.sleep(_REFRESH_EVERY_S)
 
 
-async def _carry_up(
-    flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall
-) -> None:
+async def _carry_up(flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall) -> None:
     with contextlib.suppress(*STREAM_ENDED):  # the service ended the call; its status is passed on
         await flow.carry(context.read, call.write)
         if not flow.lost_its_only_message:
             await call.done_writing()
 
 
-async def _carry_down(
-    flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall
-) -> None:
+async def _carry_down(flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall) -> None:
     await context.send_initial_metadata(_passed_on(await call.initial_metadata()))
     await flow.carry(call.read, context.write)
 

@@ -45,11 +45,7 @@ def snapshot(
         counts = _counts(flow)
         totals.update(counts)
         edge_rejected.update(flow.upstream.rejected)
-        entry: dict[str, Any] = {
-            **counts,
-            "connected": flow.upstream.connected,
-            "streams": len(flow.link.calls),
-        }
+        entry: dict[str, Any] = {**counts, "connected": flow.upstream.connected, "streams": len(flow.link.calls)}
         if channel.chain is None and flow.link.model.chain is not None:
             entry["state"] = names[flow.link.model.chain.state(now)]
         by_camera[flow.camera] = entry
@@ -94,8 +90,7 @@ def _shares(channel: Channel, flows: Sequence[CameraFlow], now_ns: int) -> dict[
     if not shares:
         return {}
     return {
-        name: round(sum(s[i] for s in shares) / len(shares), 6)
-        for i, name in enumerate(channel.config.state_names)
+        name: round(sum(s[i] for s in shares) / len(shares), 6) for i, name in enumerate(channel.config.state_names)
     }
 
 

@@ -181,17 +181,22 @@ METRICS = {
     "query": Metric("age at periodic queries, query:100ms", (span_ms,), query_age_ms),
     "shown": Metric(
         "age of what a screen shows, by computing time and refresh interval, shown:20ms:16.7ms",
-        (span_ms, span_ms), shown_age_ms,
+        (span_ms, span_ms),
+        shown_age_ms,
     ),
     "incorrect": Metric(
         "age of incorrect information about a two-state source, by transition rates, incorrect:1/2s:1/2s",
-        (rate_per_ms, rate_per_ms), _incorrect, drawn=True,
+        (rate_per_ms, rate_per_ms),
+        _incorrect,
+        drawn=True,
     ),
     "urgency": Metric(
         "age, weighted while urgent, by weight and rates of onset and end, urgency:5:1/3s:1/1s",
-        (_weight, rate_per_ms, rate_per_ms), _urgency, drawn=True,
+        (_weight, rate_per_ms, rate_per_ms),
+        _urgency,
+        drawn=True,
     ),
-}  # fmt: skip
+}
 
 
 def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:

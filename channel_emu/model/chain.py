@@ -112,8 +112,10 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
         reach |= np.outer(reach[:, k], reach[k])
     closed = {tuple(np.flatnonzero(reach[i])) for i in range(len(q)) if (reach[i] <= reach[:, i]).all()}
     if len(closed) != 1:
-        raise ChainError("the chain ends in different states, so it has no single long-run distribution: "
-                         "name the state it starts in (initial)")  # fmt: skip
+        raise ChainError(
+            "the chain ends in different states, so it has no single long-run distribution: "
+            "name the state it starts in (initial)"
+        )
     return [int(state) for state in closed.pop()]
 
 

@@ -15,10 +15,7 @@ from channel_emu.model.chain import check_generator, transition_matrix
 
 
 def drop_new_age_ms(
-    generator_per_ms: NDArray[np.float64],
-    means_ms: NDArray[np.float64],
-    period_ms: float,
-    slot_ms: float | None = None,
+    generator_per_ms: NDArray[np.float64], means_ms: NDArray[np.float64], period_ms: float, slot_ms: float | None = None
 ) -> float:
     """Time average of the age in ms: exponential service modulated by the chain, one frame every period.
 
@@ -43,9 +40,7 @@ def drop_new_age_ms(
     else:
         slots = round(period_ms / slot_ms)
         if slots < 1 or abs(slots * slot_ms - period_ms) > 1e-9 * period_ms:
-            raise ValueError(
-                f"slot_ms: expected a whole number of slots in {period_ms:g} ms, got {slot_ms:g}"
-            )
+            raise ValueError(f"slot_ms: expected a whole number of slots in {period_ms:g} ms, got {slot_ms:g}")
         step = transition_matrix(q, slot_ms)
         through = np.exp(-rates * slot_ms)[:, None] * step
         unfinished = np.linalg.matrix_power(through, slots)

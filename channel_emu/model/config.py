@@ -206,10 +206,12 @@ class ChannelConfig:
         if not 1 <= self.queue_limit <= 10**6:
             raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
         states = 1 if self.chain is None else len(self.chain.names())
-        chances = {f"faults.{name}.probability": getattr(p, "probability", None)
-                   for name, p in self.faults.items()}  # fmt: skip
-        by_state = {"arrivals.rate_per_ms": self.arrivals.rate_per_ms,
-                    "service.mean_ms": self.service.mean_ms, **chances}  # fmt: skip
+        chances = {f"faults.{name}.probability": getattr(p, "probability", None) for name, p in self.faults.items()}
+        by_state = {
+            "arrivals.rate_per_ms": self.arrivals.rate_per_ms,
+            "service.mean_ms": self.service.mean_ms,
+            **chances,
+        }
         for key, value in by_state.items():
             if isinstance(value, list) and len(value) != states:
                 what = "there is no chain" if self.chain is None else f"the chain has {states} states"

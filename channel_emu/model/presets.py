@@ -37,9 +37,7 @@ PRESETS = {
     "ch6-high": Preset(
         "thesis 6.5.1: high traffic only", {**_CH6, "arrivals": "poisson:1/60ms", "service": "exp:60ms"}
     ),
-    "ch6-low": Preset(
-        "thesis 6.5.1: low traffic only", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}
-    ),
+    "ch6-low": Preset("thesis 6.5.1: low traffic only", {**_CH6, "arrivals": "poisson:1/120ms", "service": "exp:30ms"}),
     "ch6-slow": Preset(
         "as ch6, but a state lasts 3 s: longer than a decision, so a policy can exploit it",
         {**_CH6, "chain": _two_states(3000)},
@@ -53,15 +51,20 @@ PRESETS = {
     ),
     "gilbert-elliott": Preset(
         "losses in bursts: a good state of 1 s loses 1 % of the frames, a bad one of 100 ms loses half",
-        {"arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel",
-         "chain": "mu1=1/1000,mu2=1/100,states=good/bad", "faults": {"loss": [0.01, 0.5]}},
+        {
+            "arrivals": "periodic:30ms",
+            "service": "det:20ms",
+            "discipline": "parallel",
+            "chain": "mu1=1/1000,mu2=1/100,states=good/bad",
+            "faults": {"loss": [0.01, 0.5]},
+        },
     ),
-}  # fmt: skip
+}
 
 FROM_FILES = {
     "mahimahi:FILE": "a Mahimahi trace: a line for each instant, in ms, at which 1500 bytes may leave",
     "errant:FILE:OPERATOR/COUNTRY/RAT/QUALITY": "of ERRANT's profiles.csv: half its latency, its upload rate",
-}  # fmt: skip
+}
 """Presets that are read from files of other tools."""
 
 
@@ -101,9 +104,7 @@ def _errant(path: Path, profile: str) -> dict[str, Any]:
         service = {"law": "gamma", "mean_ms": mean_ms, "shape": (mean_ms / deviation_ms) ** 2}
         upload_kbps = float(row["upload_kbps"])
         if not 0.0 < upload_kbps <= _MOST_KBPS:
-            raise SpellingError(
-                f"{path}: {profile}: upload_kbps is {upload_kbps:g}, expected up to {_MOST_KBPS:g}"
-            )
+            raise SpellingError(f"{path}: {profile}: upload_kbps is {upload_kbps:g}, expected up to {_MOST_KBPS:g}")
         packets_per_s = upload_kbps / 12  # of 1500 bytes
         span_s = 1 + int(1000 / packets_per_s)  # 1000 packets or more, so rounding to a whole one is harmless
         count = max(1, round(packets_per_s * span_s))
@@ -112,8 +113,4 @@ def _errant(path: Path, profile: str) -> dict[str, Any]:
     except (csv.Error, KeyError, TypeError, ArithmeticError, ValueError) as error:
         raise SpellingError(f"{path}: not profiles of ERRANT: {error}") from None
     times_ms = [-(-(i + 1) * span_s * 1000 // count) for i in range(count)]
-    return {
-        "service": service,
-        "discipline": "parallel",
-        "faults": {"mahimahi": {"opportunities_ms": times_ms}},
-    }
+    return {"service": service, "discipline": "parallel", "faults": {"mahimahi": {"opportunities_ms": times_ms}}}

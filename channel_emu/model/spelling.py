@@ -12,8 +12,14 @@ from typing import Any
 from freshfield.untrusted import UntrustedError, read_json, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
-_LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
-         "trace": "trace", "none": "none"}  # fmt: skip
+_LAWS = {
+    "exp": "exponential",
+    "det": "deterministic",
+    "gamma": "gamma",
+    "lognormal": "lognormal",
+    "trace": "trace",
+    "none": "none",
+}
 _MAX_CHARS = 2**26  # in a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
@@ -63,9 +69,7 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
         except UntrustedError:
             found = None
         if not isinstance(found, dict):
-            raise SpellingError(
-                f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}"
-            )
+            raise SpellingError(f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
         return found
     if key == "service":
         return service(text, folder)
@@ -81,9 +85,7 @@ def fault(text: str) -> dict[str, Any]:
     try:
         return {name: read_yaml(value) if colon else {}}
     except UntrustedError:
-        raise SpellingError(
-            f"fault {text[:200]!r}: expected something like loss:0.1 or loss:[0.01, 0.3]"
-        ) from None
+        raise SpellingError(f"fault {text[:200]!r}: expected something like loss:0.1 or loss:[0.01, 0.3]") from None
 
 
 def arrivals(text: str) -> dict[str, Any]:
@@ -99,9 +101,7 @@ def arrivals(text: str) -> dict[str, Any]:
     if kind in ("poisson", "mmpp") and rest:
         rates = [rate_per_ms(word) for word in rest.split(",")]
         return {"process": "poisson", "rate_per_ms": rates if len(rates) > 1 else rates[0]}
-    raise SpellingError(
-        f"{text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or mmpp:1/120ms,1/30ms"
-    )
+    raise SpellingError(f"{text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or mmpp:1/120ms,1/30ms")
 
 
 def service(text: str, folder: Path) -> dict[str, Any]:
@@ -131,9 +131,7 @@ def service(text: str, folder: Path) -> dict[str, Any]:
             return {"law": law, "mean_ms": span_ms(words[0]), _PARAMETER[law]: float(words[1])}
         except ValueError:
             pass
-    raise SpellingError(
-        f"{text!r}: expected exp:60ms, det:10ms, gamma:60ms:2, lognormal:60ms:0.5, trace:FILE or none"
-    )
+    raise SpellingError(f"{text!r}: expected exp:60ms, det:10ms, gamma:60ms:2, lognormal:60ms:0.5, trace:FILE or none")
 
 
 def chain(text: str) -> dict[str, Any]:
@@ -187,11 +185,8 @@ def delays_ms(path: Path) -> list[float]:
     names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}
     try:
         rows = list(csv.reader(lines))
-        columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ())
-                   if word.strip() in names]  # fmt: skip
+        columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ()) if word.strip() in names]
         column, unit_ms = columns[0] if columns else (0, 1.0)
         return [float(row[column]) * unit_ms for row in rows[bool(columns) :]]
     except (csv.Error, ValueError, IndexError) as error:
-        raise SpellingError(
-            f"{path}: expected a column delay_ms, or one delay in ms a line: {error}"
-        ) from None
+        raise SpellingError(f"{path}: expected a column delay_ms, or one delay in ms a line: {error}") from None

@@ -97,14 +97,26 @@ class TraceWriter:
         duplicated: bool = False,
     ) -> None:
         """Write the line of one message; the module describes its fields."""
-        self._line({
-            "camera": camera, "session": session, "sequence": sequence, "number": transit.number,
-            "bytes": transit.size_bytes, "offered_ns": transit.offered_ns, "arrived_ns": transit.arrived_ns,
-            "outcome": None if transit.outcome is None else str(transit.outcome), "state": transit.state,
-            "started_ns": transit.started_ns, "drawn_ns": transit.drawn_ns, "due_ns": transit.due_ns,
-            "ended_ns": transit.ended_ns, "actual_ns": actual_ns, "duplicated": duplicated,
-            "flips": transit.flips,
-        })  # fmt: skip
+        self._line(
+            {
+                "camera": camera,
+                "session": session,
+                "sequence": sequence,
+                "number": transit.number,
+                "bytes": transit.size_bytes,
+                "offered_ns": transit.offered_ns,
+                "arrived_ns": transit.arrived_ns,
+                "outcome": None if transit.outcome is None else str(transit.outcome),
+                "state": transit.state,
+                "started_ns": transit.started_ns,
+                "drawn_ns": transit.drawn_ns,
+                "due_ns": transit.due_ns,
+                "ended_ns": transit.ended_ns,
+                "actual_ns": actual_ns,
+                "duplicated": duplicated,
+                "flips": transit.flips,
+            }
+        )
 
     def close(self) -> None:
         self._file.close()

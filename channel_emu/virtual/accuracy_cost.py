@@ -55,11 +55,16 @@ def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
     while seconds <= longest_s:
         begun = time.perf_counter()
         found = np.array([_age(config, CAMERAS, seconds, seed + k) for k in range(repeats)])
-        rows.append({
-            "seconds": seconds, "cameras": CAMERAS, "repeats": repeats, "exact_ms": exact,
-            "rms_error_pct": 100 * float(np.sqrt(np.mean((found / exact - 1) ** 2))),
-            "wall_ms": (time.perf_counter() - begun) / repeats * 1e3,
-        })  # fmt: skip
+        rows.append(
+            {
+                "seconds": seconds,
+                "cameras": CAMERAS,
+                "repeats": repeats,
+                "exact_ms": exact,
+                "rms_error_pct": 100 * float(np.sqrt(np.mean((found / exact - 1) ** 2))),
+                "wall_ms": (time.perf_counter() - begun) / repeats * 1e3,
+            }
+        )
         seconds *= 10**0.5
     return rows
 
@@ -76,22 +81,29 @@ def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
         exact = drop_new_age_ms(generator, np.array(means_ms), period_ms)
         for slot_ms in (0.0, *slots_ms):
             more = {"sampled": "slots", "slot_ms": slot_ms} if slot_ms else {}
-            config = channel_from_mapping({
-                "arrivals": {"process": "periodic", "period_ms": period_ms}, "service_state": "modulated",
-                "service": {"law": "exponential", "mean_ms": list(means_ms)},
-                "chain": {"mu1_per_ms": mu1, "mu2_per_ms": mu2, **more},
-            })  # fmt: skip
+            config = channel_from_mapping(
+                {
+                    "arrivals": {"process": "periodic", "period_ms": period_ms},
+                    "service_state": "modulated",
+                    "service": {"law": "exponential", "mean_ms": list(means_ms)},
+                    "chain": {"mu1_per_ms": mu1, "mu2_per_ms": mu2, **more},
+                }
+            )
             seconds = frames * period_ms / 1e3
             begun = time.perf_counter()
             found = np.array([_age(config, 1, seconds, seed + k) for k in range(repeats)])
             predicted = drop_new_age_ms(generator, np.array(means_ms), period_ms, slot_ms or None)
-            rows.append({
-                "what": f"chain {name}", "slot_ms": slot_ms, "period_ms": period_ms,
-                "bias_exact_pct": 100 * (predicted / exact - 1),
-                "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
-                "half_width_pct": 100 * _half_width(found) / exact,
-                "camera_s_per_wall_s": repeats * seconds / (time.perf_counter() - begun),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "what": f"chain {name}",
+                    "slot_ms": slot_ms,
+                    "period_ms": period_ms,
+                    "bias_exact_pct": 100 * (predicted / exact - 1),
+                    "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
+                    "half_width_pct": 100 * _half_width(found) / exact,
+                    "camera_s_per_wall_s": repeats * seconds / (time.perf_counter() - begun),
+                }
+            )
     return rows
 
 
@@ -128,9 +140,13 @@ def _draw(tables: dict[str, Rows], left: Any, right: Any) -> None:
         slots = [r["slot_ms"] / r["period_ms"] for r in rows]
         (line,) = right.plot(slots, [r["bias_exact_pct"] for r in rows], "-", label=f"{what}, exact")
         right.errorbar(
-            slots, [r["bias_measured_pct"] for r in rows], [r["half_width_pct"] for r in rows], fmt="o",
-            color=line.get_color(), label=f"{what}, measured",
-        )  # fmt: skip
+            slots,
+            [r["bias_measured_pct"] for r in rows],
+            [r["half_width_pct"] for r in rows],
+            fmt="o",
+            color=line.get_color(),
+            label=f"{what}, measured",
+        )
     right.set(xscale="log", xlabel="slot / period", ylabel="bias of the mean age (%)", title="Slot grids")
     right.set_yscale("symlog", linthresh=0.1)
     right.legend(fontsize="small")

@@ -18,10 +18,14 @@ from channel_emu.virtual.simulate import simulate
 
 _CHANCE = {"probability": 0.1}
 FAULTS: dict[str, dict[str, Any]] = {
-    "loss": _CHANCE, "duplication": _CHANCE, "corruption": _CHANCE,
-    "blackout": {"every_ms": 1000.0, "for_ms": 50.0}, "reset": {"mean_interval_ms": 1000.0},
-    "bandwidth": {"megabits_per_s": 1000.0}, "mahimahi": {"opportunities_ms": [1] * 20},
-}  # fmt: skip
+    "loss": _CHANCE,
+    "duplication": _CHANCE,
+    "corruption": _CHANCE,
+    "blackout": {"every_ms": 1000.0, "for_ms": 50.0},
+    "reset": {"mean_interval_ms": 1000.0},
+    "bandwidth": {"megabits_per_s": 1000.0},
+    "mahimahi": {"opportunities_ms": [1] * 20},
+}
 _PERIOD_NS = 10**6
 PERIOD_MS, MEAN_MS = 30.0, 60.0  # period of captures and mean delay in the thesis's chapter 5
 
@@ -77,12 +81,16 @@ def bench_simulate(
         loop.append(cameras * loop_seconds * 1e3 / (time.perf_counter() - begun))
     speeds = {"decisions": decide, "decisions_and_ages": with_ages, "plain_loop": loop}
     return {
-        "preset": "ch5", "cameras": cameras, "seconds": seconds, "loop_seconds": loop_seconds,
+        "preset": "ch5",
+        "cameras": cameras,
+        "seconds": seconds,
+        "loop_seconds": loop_seconds,
         "rounds": rounds,
         **{f"{name}_million_link_slots_per_s": statistics.median(v) / 1e6 for name, v in speeds.items()},
         "times_the_loop": statistics.median(with_ages) / statistics.median(loop),
-        "mean_age_ms": statistics.fmean(found), "loop_mean_age_ms": statistics.fmean(stepped),
-    }  # fmt: skip
+        "mean_age_ms": statistics.fmean(found),
+        "loop_mean_age_ms": statistics.fmean(stepped),
+    }
 
 
 def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:

@@ -86,10 +86,7 @@ def _prepare(
     period_ms = camera_period_ms(config, frame_period_ms)
     phase_ns = round(phase * period_ms * 1e6) if config.arrivals.spread else 0
     offered = np.arange(phase_ns, end_ns + 1, round(period_ms * 1e6), dtype=np.int64)
-    return camera_path, (
-        offered,
-        chain_path.sample_newest(offered, rates, *camera_path, key) if poisson else offered,
-    )
+    return camera_path, (offered, chain_path.sample_newest(offered, rates, *camera_path, key) if poisson else offered)
 
 
 def _serve_alone(
@@ -97,10 +94,17 @@ def _serve_alone(
 ) -> LinkRun:
     path, (offered, arrive) = prepare()
     outcome, started, due = _serve(
-        arrive, np.zeros(len(arrive), np.int64), DISCIPLINES.index(config.discipline), config.queue_limit,
-        _work(config, channel, name, len(arrive)), *_service_means(config), *path,
-        np.zeros(1, np.int64), np.array([len(path[0])]), end_ns,
-    )  # fmt: skip
+        arrive,
+        np.zeros(len(arrive), np.int64),
+        DISCIPLINES.index(config.discipline),
+        config.queue_limit,
+        _work(config, channel, name, len(arrive)),
+        *_service_means(config),
+        *path,
+        np.zeros(1, np.int64),
+        np.array([len(path[0])]),
+        end_ns,
+    )
     return _run_of(config, channel, name, path, (offered, outcome, started, due), end_ns)
 
 
@@ -125,10 +129,18 @@ def _serve_together(
     outcome = np.full(len(arrive), service.SKIPPED, np.int8)
     started, due = np.full(len(arrive), -1, np.int64), np.full(len(arrive), -1, np.int64)
     outcome[order], started[order], due[order] = _serve(
-        arrive[order], camera[order], DISCIPLINES.index(config.discipline), config.queue_limit, drawn[order],
-        *_service_means(config), np.concatenate([p[0] for p in kept]),
-        np.concatenate([np.append(p[1], 0) for p in kept]), (ends - lengths)[pick], ends[pick], end_ns,
-    )  # fmt: skip
+        arrive[order],
+        camera[order],
+        DISCIPLINES.index(config.discipline),
+        config.queue_limit,
+        drawn[order],
+        *_service_means(config),
+        np.concatenate([p[0] for p in kept]),
+        np.concatenate([np.append(p[1], 0) for p in kept]),
+        (ends - lengths)[pick],
+        ends[pick],
+        end_ns,
+    )
     runs: dict[int, LinkRun] = {}
     for rank, i in enumerate(by_rank):
         mine = camera == rank

@@ -13,9 +13,18 @@ from channel_emu.model.link import EventKind
 
 OUTCOMES = (
     "in_flight",
-    *map(str, (EventKind.DELIVERED, EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED,
-               EventKind.LOST, EventKind.BROKEN)),
-)  # fmt: skip
+    *map(
+        str,
+        (
+            EventKind.DELIVERED,
+            EventKind.DROPPED_BUSY,
+            EventKind.SUPERSEDED,
+            EventKind.SKIPPED,
+            EventKind.LOST,
+            EventKind.BROKEN,
+        ),
+    ),
+)
 OUTCOME_CODES = {name: code for code, name in enumerate(OUTCOMES)}
 DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 

@@ -20,9 +20,7 @@ def offer_all(
     """
     links = {camera: channel.link(camera, sampled=sampled) for camera in offers}
     transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
-    for at_ns, camera, size in sorted(
-        (at, name, size) for name, given in offers.items() for at, size in given
-    ):
+    for at_ns, camera, size in sorted((at, name, size) for name, given in offers.items() for at, size in given):
         transits[camera].append(links[camera].offer(at_ns, None, size)[0])
     for link in links.values():
         link.advance(end_ns)
@@ -50,8 +48,4 @@ def compare(trace: Trace) -> dict[str, Any]:
             if not same:
                 then = f"recorded {record.outcome} due {record.due_ns}"
                 different.append(f"{camera} {record.sequence}: {then}, now {outcome} due {transit.due_ns}")
-    return {
-        "frames": len(trace.records),
-        "equal": len(trace.records) - len(different),
-        "different": different[:20],
-    }
+    return {"frames": len(trace.records), "equal": len(trace.records) - len(different), "different": different[:20]}

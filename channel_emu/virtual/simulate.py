@@ -73,8 +73,12 @@ class Simulation:
             "mean_age_ms": ages.mean_of_known([ages.mean_age_ms(s) for s in saws]),
             "mean_age_slotted_ms": ages.mean_of_known([ages.query_age_ms(s, self.slot_ms) for s in saws]),
             "peak_age_ms": ages.mean_of_known([ages.peak_age_ms(s) for s in saws]),
-            "metrics_ms": {text: ages.mean_of_known([ages.measure(text, saw, self.seed, run.camera)
-                                        for saw, run in zip(saws, self.runs)]) for text in metrics},
+            "metrics_ms": {
+                text: ages.mean_of_known(
+                    [ages.measure(text, saw, self.seed, run.camera) for saw, run in zip(saws, self.runs)]
+                )
+                for text in metrics
+            },
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
             "dropped": sum(count for name, count in counts.items() if name != "in_flight"),
@@ -87,9 +91,11 @@ class Simulation:
             "slot_ms": self.slot_ms,
             "seed": self.seed,
             "engine": self.engine,
-            "by_camera": {r.camera: {"mean_age_ms": ages.mean_age_ms(s), "delivered": r.count("delivered")}
-                          for r, s in zip(self.runs, saws)},
-        }  # fmt: skip
+            "by_camera": {
+                r.camera: {"mean_age_ms": ages.mean_age_ms(s), "delivered": r.count("delivered")}
+                for r, s in zip(self.runs, saws)
+            },
+        }
 
 
 def _mean_and_percentiles(values: NDArray[np.float64]) -> dict[str, float | None]:

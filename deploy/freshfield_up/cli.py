@@ -111,26 +111,19 @@ def _parser() -> argparse.ArgumentParser:
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
     add(
-        "--learn", nargs="?", const="", metavar="REWARD[:moving]",
+        "--learn",
+        nargs="?",
+        const="",
+        metavar="REWARD[:moving]",
         help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
         "[edge.learn, else as trained]",
-    )  # fmt: skip
+    )
     add(
         "--fallback",
         metavar="NAME[:VALUE]",
         help="policy that takes over if the learning one does worse [edge.learn, else the best fixed one]",
     )
-    add(
-        "--restart", action="store_true", help="start a process again when it dies, instead of ending the run"
-    )
-    add(
-        "--no-table",
-        action="store_true",
-        help="print plain lines instead of a live table, even on a terminal",
-    )
-    add(
-        "--process-per-camera",
-        action="store_true",
-        help="one camera-node process for each camera [one for all]",
-    )
+    add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
+    add("--no-table", action="store_true", help="print plain lines instead of a live table, even on a terminal")
+    add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
     return parser

@@ -83,14 +83,32 @@ def process_set(
         return Child(name, role, words, out / f"log-{name}.txt", limits)
 
     edge = child(
-        "edge", "the edge server", "edge-server", "run", "--listen", edge_address,
-        "--page-host", LOOPBACK, "--page-port", str(page_port), *common, *recorded, *edge_options,
-    )  # fmt: skip
+        "edge",
+        "the edge server",
+        "edge-server",
+        "run",
+        "--listen",
+        edge_address,
+        "--page-host",
+        LOOPBACK,
+        "--page-port",
+        str(page_port),
+        *common,
+        *recorded,
+        *edge_options,
+    )
     edge.environment = thread_limits.all_cores()
     emulator = child(
-        "emulator", "the channel emulator", "channel-emu", "run", "--listen", emulator_address,
-        "--to", edge_address, *common,
-    )  # fmt: skip
+        "emulator",
+        "the channel emulator",
+        "channel-emu",
+        "run",
+        "--listen",
+        emulator_address,
+        "--to",
+        edge_address,
+        *common,
+    )
 
     def node(name: str, role: str, *cameras: str) -> Child:
         arguments = (*cameras, "--to", emulator_address, *common, *recorded)

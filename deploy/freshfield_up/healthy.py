@@ -30,12 +30,8 @@ def is_fresh(folder: Path, camera: str | None) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument(
-        "--serving", metavar="HOST:PORT", help="check that the gRPC health service here is SERVING"
-    )
-    which.add_argument(
-        "--node", type=Path, metavar="DIR", help="check the status file of camera node $CAMERA in DIR"
-    )
+    which.add_argument("--serving", metavar="HOST:PORT", help="check that the gRPC health service here is SERVING")
+    which.add_argument("--node", type=Path, metavar="DIR", help="check the status file of camera node $CAMERA in DIR")
     add_arguments(parser)
     args = parser.parse_args()
     healthy = (

@@ -149,9 +149,7 @@ class Launcher:
             self._page_announced = True
             here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
             self._display.message(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
-            self._display.message(
-                f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE"
-            )
+            self._display.message(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
         waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
@@ -255,9 +253,7 @@ class Launcher:
         if not any(out.glob("ledger-*.tsv")):
             self._display.message("no report: no process has written about a frame")
             return
-        report = Child(
-            "report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt"
-        )
+        report = Child("report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt")
         report.start()
         assert report.process is not None
         try:

@@ -85,9 +85,7 @@ class Soak:
         tmpfs = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "freshfield", str(self.out)]
         self.has_disk = subprocess.run(tmpfs, capture_output=True).returncode == 0
         found = process_set(scenario, self.out, free_ports(1)[0])
-        self.children: dict[str, Child] = dict(
-            zip(ROLES, (found.nodes[0], found.emulator, found.edge), strict=True)
-        )
+        self.children: dict[str, Child] = dict(zip(ROLES, (found.nodes[0], found.emulator, found.edge), strict=True))
         self.wires = {hop: Wire(to) for hop, to in zip(HOPS, (found.emulator_address, found.edge_address))}
         for child, wire in zip((found.nodes[0], found.emulator), self.wires.values()):
             child.command = [*child.command, "--to", wire.address]  # the last one counts
@@ -240,9 +238,7 @@ def memory(samples: Sequence[tuple[float, dict[str, tuple[int, float]]]]) -> dic
     for name in ROLES:
         last = samples[-1][1].get(name, (0, 0.0))[0]
         life = [(t, use[name]) for t, use in samples if name in use and use[name][0] == last]
-        quarters = [
-            [mb for _, (_, mb) in life[k * len(life) // 4 : (k + 1) * len(life) // 4]] for k in (1, 3)
-        ]
+        quarters = [[mb for _, (_, mb) in life[k * len(life) // 4 : (k + 1) * len(life) // 4]] for k in (1, 3)]
         if all(quarters):
             early, late = map(statistics.median, quarters)
             minutes = (life[-1][0] - life[0][0]) / 60.0
@@ -255,9 +251,7 @@ def problems(result: dict[str, Any]) -> list[str]:
     found = []
     for fault in result["faults"]:
         if fault["recovery_s"] is None or fault["recovery_s"] > RECOVERY_S:
-            found.append(
-                f"{fault['kind']}, {fault['target']}, at {fault['at_s']:.0f} s: {fault['recovery_s']} s"
-            )
+            found.append(f"{fault['kind']}, {fault['target']}, at {fault['at_s']:.0f} s: {fault['recovery_s']} s")
     for name, use in result["memory"].items():
         if use["minutes"] >= WATCHED_MIN and use["late_mb"] > (1.0 + GROWTH) * use["early_mb"]:
             found.append(f"{name} grew from {use['early_mb']} to {use['late_mb']} MB")
@@ -267,9 +261,7 @@ def problems(result: dict[str, Any]) -> list[str]:
     return found
 
 
-def soak(
-    scenario: str | Path, planned: Sequence[tuple[str, str]], every_s: float, work: Path
-) -> dict[str, Any]:
+def soak(scenario: str | Path, planned: Sequence[tuple[str, str]], every_s: float, work: Path) -> dict[str, Any]:
     """Run the ``planned`` faults in the folder ``work``. Returns the contents of docs/results/soak.json."""
     loaded = scenarios.load(scenario)
     run = Soak(loaded, work)
@@ -296,12 +288,8 @@ def main() -> int:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--minutes", type=float, help="duration; kills in the first minutes only")
     what.add_argument("--kills", type=int, metavar="N", help="kill each process N times instead")
-    parser.add_argument(
-        "--every", type=float, default=60.0, metavar="S", help="seconds between faults [%(default)s]"
-    )
-    parser.add_argument(
-        "--scenario", default="ideal", help="scenario file, or the name of a shipped one [%(default)s]"
-    )
+    parser.add_argument("--every", type=float, default=60.0, metavar="S", help="seconds between faults [%(default)s]")
+    parser.add_argument("--scenario", default="ideal", help="scenario file, or the name of a shipped one [%(default)s]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result to FILE")
     args = parser.parse_args()
     if args.kills:

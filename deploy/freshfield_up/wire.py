@@ -69,9 +69,7 @@ class Wire:
             far.transport.abort()
         self._pairs.remove((near, far))
 
-    async def _pump(
-        self, reader: asyncio.StreamReader, to: asyncio.StreamWriter, near: asyncio.StreamWriter
-    ) -> None:
+    async def _pump(self, reader: asyncio.StreamReader, to: asyncio.StreamWriter, near: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
             while data := await reader.read(_CHUNK):
                 await self._passes.wait()

@@ -87,8 +87,7 @@ def make_embedder(section: EmbeddingConfig) -> Embedder:
         if error.name is None or error.name.split(".")[0] not in ("onnx", "onnxruntime"):
             raise
         raise EmbeddingError(
-            f"embedding needs {error.name.split('.')[0]}, which is not installed: "
-            "pip install 'freshfield[embed]'"
+            f"embedding needs {error.name.split('.')[0]}, which is not installed: pip install 'freshfield[embed]'"
         ) from None
     backbone = load_backbone(model_path(section.model), section.tap, section.size)
     return Embedder(backbone, section.dim, section.provider, section.threads)

@@ -45,14 +45,55 @@ _CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
 # loops) are missing: a few bytes could request any amount of memory.
 _KNOWN = frozenset(
     {
-        "Abs", "Add", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat", "Constant", "Conv",
-        "ConvInteger", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Elu", "Exp", "Flatten",
-        "Gather", "GlobalAveragePool", "HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "MatMul",
-        "MatMulInteger", "MaxPool", "Mish", "Mul", "PRelu", "Pow", "QLinearConv", "QuantizeLinear",
-        "ReduceMean", "ReduceMax", "Relu", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Softplus",
-        "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+        "Abs",
+        "Add",
+        "AveragePool",
+        "BatchNormalization",
+        "Cast",
+        "Clip",
+        "Concat",
+        "Constant",
+        "Conv",
+        "ConvInteger",
+        "DequantizeLinear",
+        "Div",
+        "DynamicQuantizeLinear",
+        "Elu",
+        "Exp",
+        "Flatten",
+        "Gather",
+        "GlobalAveragePool",
+        "HardSigmoid",
+        "HardSwish",
+        "Identity",
+        "LeakyRelu",
+        "MatMul",
+        "MatMulInteger",
+        "MaxPool",
+        "Mish",
+        "Mul",
+        "PRelu",
+        "Pow",
+        "QLinearConv",
+        "QuantizeLinear",
+        "ReduceMean",
+        "ReduceMax",
+        "Relu",
+        "Reshape",
+        "Shape",
+        "Sigmoid",
+        "Slice",
+        "Softmax",
+        "Softplus",
+        "Split",
+        "Sqrt",
+        "Squeeze",
+        "Sub",
+        "Tanh",
+        "Transpose",
+        "Unsqueeze",
     }
-)  # fmt: skip
+)
 _TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorProto.FLOAT16: np.float16}
 
 
@@ -236,8 +277,7 @@ def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: 
         )
     if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node for tap in taps):
         raise EmbeddingError(
-            f"{path}: tap: {', '.join(taps)} is quantised with another scale for every image; name the "
-            "tensor before it"
+            f"{path}: tap: {', '.join(taps)} is quantised with another scale for every image; name the tensor before it"
         )
     if not any(node.op_type in _CONVOLVE for node in cut.graph.node):
         raise EmbeddingError(f"{path}: no convolution lies between the images and {', '.join(taps)}")

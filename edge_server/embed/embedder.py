@@ -40,9 +40,7 @@ class Embedder:
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
-        self.name = (
-            f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
-        )
+        self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
         self._session, self.provider = open_session(backbone.model, provider, threads, backbone.name)
         self.step = backbone.batch or _BATCH[self.provider]
         """Images per run."""

@@ -36,9 +36,7 @@ def checked(image: NDArray, number: int) -> NDArray[np.uint8]:
     """``image`` as uint8 (H, W, 3), straight alpha composited over gray. Raises EmbeddingError."""
     array = np.asarray(image)
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (3, 4) or 0 in array.shape:
-        raise EmbeddingError(
-            f"image {number}: expected uint8 (height, width, 3 or 4), got {array.dtype} {array.shape}"
-        )
+        raise EmbeddingError(f"image {number}: expected uint8 (height, width, 3 or 4), got {array.dtype} {array.shape}")
     if array.shape[2] == 3:
         return array
     alpha = array[..., 3:].astype(np.float32) / 255.0

@@ -92,10 +92,7 @@ def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
 
 
 def _cameras_text(lenses: list[Pinhole]) -> str:
-    lines = [
-        "# Camera list with one line of data per camera:",
-        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-    ]
+    lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for k, lens in enumerate(lenses):
         model, params = _model(lens)
         lines.append(f"{k + 1} {_NAMES[model]} {lens.width} {lens.height} {_numbers(params)}")

@@ -68,31 +68,25 @@ def _parser() -> argparse.ArgumentParser:
     add("--transforms", type=out_folder, metavar="DIR", help="transforms.json with images and points")
     add("--trajectory", type=out_file, metavar="FILE", help="camera poses, TUM format")
     add(
-        "--count",
-        type=int,
-        default=20000,
-        metavar="N",
-        help="points in --points, --colmap, --transforms [%(default)s]",
+        "--count", type=int, default=20000, metavar="N", help="points in --points, --colmap, --transforms [%(default)s]"
     )
     mesh = parser.add_argument_group("for --mesh").add_argument
+    mesh("--voxel", type=float, metavar="MM", help="voxel size in millimeters [the width of a pixel at the surface]")
     mesh(
-        "--voxel",
+        "--bounds",
         type=float,
-        metavar="MM",
-        help="voxel size in millimeters [the width of a pixel at the surface]",
-    )
-    mesh(
-        "--bounds", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box to mesh: lower and upper corner, meters [what the cameras see]",
-    )  # fmt: skip
-    mesh("--watertight", action="store_true", help="close the surface where no camera looked")
-    mesh(
-        "--method",
-        default="tsdf",
-        help="tsdf, or sdf: a distance function fitted with an eikonal term [tsdf]",
     )
-    mesh("--no-sharpen", action="store_true", help="use the field's depth as it is, without refining it by "
-         "multi-view consistency: faster, works for moving scenes, less accurate")  # fmt: skip
+    mesh("--watertight", action="store_true", help="close the surface where no camera looked")
+    mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function fitted with an eikonal term [tsdf]")
+    mesh(
+        "--no-sharpen",
+        action="store_true",
+        help="use the field's depth as it is, without refining it by "
+        "multi-view consistency: faster, works for moving scenes, less accurate",
+    )
     mesh(
         "--min-weight",
         type=float,
@@ -100,10 +94,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="W",
         help="minimum fused weight of a voxel; a view at normal incidence counts 1 [%(default)g]",
     )
-    mesh("--measure", metavar="SCENARIO", help="scenario of the run; if its scene is synthetic and static, "
-         "print the mesh's distance to the true surface")  # fmt: skip
-    mesh("--json", type=out_file, metavar="FILE",
-         help="write size, seconds of each stage and distances of --measure to FILE as JSON")  # fmt: skip
+    mesh(
+        "--measure",
+        metavar="SCENARIO",
+        help="scenario of the run; if its scene is synthetic and static, print the mesh's distance to the true surface",
+    )
+    mesh(
+        "--json",
+        type=out_file,
+        metavar="FILE",
+        help="write size, seconds of each stage and distances of --measure to FILE as JSON",
+    )
     return parser
 
 
@@ -130,9 +131,7 @@ class Export:
         """Depth maps, rendered at the cameras."""
         from edge_server.surface.reconstruct import make_depth_maps
 
-        return make_depth_maps(
-            self.source.field.snapshot(), self.source.views, self._settings(), self._progress
-        )
+        return make_depth_maps(self.source.field.snapshot(), self.source.views, self._settings(), self._progress)
 
     @cached_property
     def cloud(self):
@@ -181,10 +180,13 @@ class Export:
         if box is not None and not all(low < high for low, high in zip(*box)):
             raise ExportError("--bounds: each lower corner must be below its upper one")
         return MeshSettings(
-            method=a.method, sharpen=not a.no_sharpen,
-            voxel_m=None if a.voxel is None else 1e-3 * a.voxel, bounds=box, watertight=a.watertight,
+            method=a.method,
+            sharpen=not a.no_sharpen,
+            voxel_m=None if a.voxel is None else 1e-3 * a.voxel,
+            bounds=box,
+            watertight=a.watertight,
             min_weight=a.min_weight,
-        )  # fmt: skip
+        )
 
     def _mesh(self, path: Path) -> None:
         from edge_server.surface.reconstruct import mesh_from_depth_maps
@@ -207,11 +209,15 @@ class Export:
         if self.args.json is None:
             return
         about = {
-            "file": path.name, "triangles": len(mesh.faces), "vertices": len(mesh.vertices),
-            "watertight": mesh.watertight, "cameras": len(self.source.views), "seconds": round(spent_s, 3),
+            "file": path.name,
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "watertight": mesh.watertight,
+            "cameras": len(self.source.views),
+            "seconds": round(spent_s, 3),
             "stages_s": {name: round(end - start, 3) for name, (start, end) in self._stages.items()},
             "measured": found,
-        }  # fmt: skip
+        }
         write_json(self.args.json, about, indent=1)
 
     def _points(self, path: Path) -> None:
@@ -226,9 +232,7 @@ class Export:
 
         snapshot = self.source.field.snapshot()
         if not hasattr(snapshot, "gaussians"):
-            raise ExportError(
-                f"--splats: {self.source.name} has no Gaussians: use a run or fit of field splat"
-            )
+            raise ExportError(f"--splats: {self.source.name} has no Gaussians: use a run or fit of field splat")
         path.parent.mkdir(parents=True, exist_ok=True)
         print(f"{path}: {write_splats(path, snapshot.shown, snapshot.box)} Gaussians", flush=True)
 

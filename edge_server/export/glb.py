@@ -14,9 +14,7 @@ from freshfield.files import write_bytes
 _UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def write_mesh(
-    path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
-) -> None:
+def write_mesh(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> None:
     """Write vertices (V, 3) in meters, uint8 color (V, 3) and faces (F, 3). The scene is turned so that our z
     is glTF's y, up. ExportError: trimesh is missing."""
     try:

@@ -12,9 +12,7 @@ from freshfield.files import write_bytes
 _TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
-def write_mesh(
-    path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
-) -> None:
+def write_mesh(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> None:
     """Write vertices (V, 3) in meters, color (V, 3) and faces (F, 3)."""
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
     rows["count"], rows["corner"] = 3, faces
@@ -46,7 +44,5 @@ def _colored(points: NDArray[np.float32], color: NDArray[np.uint8]) -> NDArray[n
 def _header(table: NDArray[np.void], more: str = "") -> bytes:
     assert table.dtype.names is not None
     properties = "".join(f"property {_TYPES[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names)
-    head = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}{more}end_header\n"
-    )
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}{more}end_header\n"
     return head.encode()

@@ -20,12 +20,22 @@ def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | No
     for shot in shots:
         lens = shot.intrinsics
         k1, k2, p1, p2 = lens.distortion
-        frames.append({
-            "file_path": f"images/{shot.name}.png",
-            "w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy,
-            "k1": k1, "k2": k2, "p1": p1, "p2": p2,
-            "transform_matrix": (shot.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
-        })  # fmt: skip
+        frames.append(
+            {
+                "file_path": f"images/{shot.name}.png",
+                "w": lens.width,
+                "h": lens.height,
+                "fl_x": lens.fx,
+                "fl_y": lens.fy,
+                "cx": lens.cx,
+                "cy": lens.cy,
+                "k1": k1,
+                "k2": k2,
+                "p1": p1,
+                "p2": p2,
+                "transform_matrix": (shot.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
+            }
+        )
     more = {} if points is None else {"ply_file_path": points}
     path = folder / "transforms.json"
     write_json(path, {"camera_model": "OPENCV", **more, "frames": frames}, indent=1)

@@ -22,9 +22,7 @@ class Baseline:
     nearest_view_db: float | None
 
 
-def baseline(
-    views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Color = BLACK
-) -> Baseline:
+def baseline(views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Color = BLACK) -> Baseline:
     """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4)."""
     if not views:
         return Baseline(None, None)

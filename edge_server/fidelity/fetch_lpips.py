@@ -63,15 +63,11 @@ def _fetch(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         lins = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError) as error:
-        raise FetchError(
-            f"{file}: the package lpips has no such weights ({error}): install lpips 0.1.4"
-        ) from None
+        raise FetchError(f"{file}: the package lpips has no such weights ({error}): install lpips 0.1.4") from None
     try:
         backbone = getattr(torchvision.models, _BACKBONES[network])(weights="IMAGENET1K_V1")
     except (OSError, RuntimeError) as error:  # no network, or a download that was cut short
-        raise FetchError(
-            f"torchvision cannot fetch {_BACKBONES[network]}: {error}; is there a network?"
-        ) from None
+        raise FetchError(f"torchvision cannot fetch {_BACKBONES[network]}: {error}; is there a network?") from None
     return backbone.features.state_dict(), lins
 
 

@@ -27,13 +27,17 @@ MINIMUM_SIDE = {"alex": 31, "squeeze": 17}
 SLICES = {"alex": (64, 192, 384, 256, 256), "squeeze": (64, 128, 256, 384, 384, 512, 512)}
 # Convolutions: channels out and in, and side of the kernel. Of SqueezeNet 1.1 each fire:
 # squeezed, in, expanded.
-_ALEX = {
-    "0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3),
-}  # fmt: skip
+_ALEX = {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3)}
 _FIRES = {
-    "3": (16, 64, 64), "4": (16, 128, 64), "6": (32, 128, 128), "7": (32, 256, 128), "9": (48, 256, 192),
-    "10": (48, 384, 192), "11": (64, 384, 256), "12": (64, 512, 256),
-}  # fmt: skip
+    "3": (16, 64, 64),
+    "4": (16, 128, 64),
+    "6": (32, 128, 128),
+    "7": (32, 256, 128),
+    "9": (48, 256, 192),
+    "10": (48, 384, 192),
+    "11": (64, 384, 256),
+    "12": (64, 512, 256),
+}
 
 
 class Lpips:
@@ -46,9 +50,7 @@ class Lpips:
         """
         self.network = network
         self.minimum_side = MINIMUM_SIDE[network]
-        self._parameters = {
-            name.removeprefix("features."): array for name, array in _arrays(features).items()
-        }
+        self._parameters = {name.removeprefix("features."): array for name, array in _arrays(features).items()}
         lins = _arrays(lin)
         self._lin = [lins[f"lin{i}"].reshape(-1) for i in range(len(lins))]
         self._check()
@@ -93,9 +95,7 @@ class Lpips:
         """Find missing and misshapen arrays before the first score."""
         for name, shape in _shapes(self.network).items():
             if self._parameters[name].shape != shape:
-                raise ValueError(
-                    f"{name} has shape {self._parameters[name].shape}, the network needs {shape}"
-                )
+                raise ValueError(f"{name} has shape {self._parameters[name].shape}, the network needs {shape}")
         widths, expected = [len(lin) for lin in self._lin], list(SLICES[self.network])
         if widths != expected:
             raise ValueError(f"learned weights have widths {widths}, the network's slices {expected}")

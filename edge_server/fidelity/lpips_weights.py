@@ -35,9 +35,7 @@ def weights_folder(given: Path | None = None, data: Path | None = None) -> Path 
     return base / "lpips" if base is not None and (base / "lpips").is_dir() else None
 
 
-def open_lpips(
-    folder: str | Path | None = None, network: Network = "alex"
-) -> tuple[Lpips | None, str | None]:
+def open_lpips(folder: str | Path | None = None, network: Network = "alex") -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, reason) where the weights are missing or unusable.
 
     folder: folder with the weights; None takes that of ``weights_folder``.

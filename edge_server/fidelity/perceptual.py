@@ -106,9 +106,7 @@ def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | Non
         return None, f"perceptual: the files in {folder} cannot be used ({error})"
 
 
-def save_coefficients(
-    path: Path, taps: tuple[str, ...], weights: list[NDArray[np.float64]], power: float
-) -> None:
+def save_coefficients(path: Path, taps: tuple[str, ...], weights: list[NDArray[np.float64]], power: float) -> None:
     """Write the coefficients that ``open_perceptual`` reads."""
     arrays: dict[str, NDArray] = {f"w{k}": w.astype(np.float32) for k, w in enumerate(weights)}
     arrays |= {"taps": np.array(taps), "power": np.array(power)}

@@ -189,9 +189,7 @@ class Scorer:
             state.frames.popleft()
         return self._score_ready(camera)
 
-    def newest(
-        self, camera: str, rendering: Callable[[int], NDArray], psnr_only: bool = False
-    ) -> Score | None:
+    def newest(self, camera: str, rendering: Callable[[int], NDArray], psnr_only: bool = False) -> Score | None:
         """Score what was shown when the newest held-out frame of ``camera`` was taken; None if the camera's
         period is not known yet, or its frame cannot be decoded.
 
@@ -247,9 +245,7 @@ class Scorer:
             moving_share=float(moving.mean()),
         )
 
-    def score_selected(
-        self, renderings: Sequence[tuple[str, NDArray, NDArray]], published_ns: int
-    ) -> Score | None:
+    def score_selected(self, renderings: Sequence[tuple[str, NDArray, NDArray]], published_ns: int) -> Score | None:
         """Mean score, metric by metric, over (camera, rendering, selected image) (6.22); None for no
         renderings."""
         scores = [self.score(c, r, published_ns, image, published_ns) for c, r, image in renderings]
@@ -288,9 +284,14 @@ class Scorer:
         return done
 
     def _against_nearest(
-        self, camera: str, state: _Camera, period_ms: float, published_ns: int, rendering: Render,
+        self,
+        camera: str,
+        state: _Camera,
+        period_ms: float,
+        published_ns: int,
+        rendering: Render,
         psnr_only: bool = False,
-    ) -> Score | None:  # fmt: skip
+    ) -> Score | None:
         frames = list(state.frames)
         times = [f.generated_ns for f in frames]
         nearest = min(range(len(times)), key=lambda i: abs(times[i] - published_ns))

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 _FORMAT = "freshfield-{kind}-1"
 # RuntimeError: a zip file of a later version, encrypted, or packed in another way.
-_UNREADABLE = (
-    OSError, ValueError, TypeError, EOFError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
+_UNREADABLE = (OSError, ValueError, TypeError, EOFError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile)
 
 
 class CheckpointError(ValueError):
@@ -72,9 +70,7 @@ def load(
             with zipfile.ZipFile(path) as packed:
                 size = sum(entry.file_size for entry in packed.infolist())
             if size > most_bytes:
-                raise CheckpointError(
-                    f"{path}: unpacked it has {size} bytes, which no {kind}'s checkpoint has"
-                )
+                raise CheckpointError(f"{path}: unpacked it has {size} bytes, which no {kind}'s checkpoint has")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         facts = json.loads(str(arrays.pop("__facts__")))

@@ -72,9 +72,12 @@ class ForegroundConfig:
             if not all(0.0 <= v <= 1.0 for v in box):
                 raise ValueError(f"{name}: expected left, top, right, bottom within 0 to 1, got {list(box)}")
         ranges = {
-            "confidence": (0.0, 1.0), "margin": (0.0, 1.0), "iterations": (1, 50), "side": (16, 4096),
+            "confidence": (0.0, 1.0),
+            "margin": (0.0, 1.0),
+            "iterations": (1, 50),
+            "side": (16, 4096),
             "doubt": (0.0, 1.0),
-        }  # fmt: skip
+        }
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name)}")

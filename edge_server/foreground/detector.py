@@ -69,9 +69,7 @@ class Detector:
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
         if self.gives_masks and len(prototypes[0]) != 1:
-            raise ForegroundError(
-                f"{self.name}: gives {prototypes[0].shape}, not masks (1, n, height, width)"
-            )
+            raise ForegroundError(f"{self.name}: gives {prototypes[0].shape}, not masks (1, n, height, width)")
         coefficients = prototypes[0].shape[1] if self.gives_masks else 0
         rows = decode(out, confidence, self.name, coefficients)
         h, w = whole.shape[:2]
@@ -129,9 +127,7 @@ def decode(
     centre, size = table[best, :2], table[best, 2:4]
     low = centre - size / 2
     rectangles = np.concatenate([low, size], axis=1)
-    kept = cv2.dnn.NMSBoxesBatched(
-        rectangles.tolist(), scores[best].tolist(), kinds[best].tolist(), 0.0, NMS_IOU
-    )
+    kept = cv2.dnn.NMSBoxesBatched(rectangles.tolist(), scores[best].tolist(), kinds[best].tolist(), 0.0, NMS_IOU)
     columns = (low, low + size, scores[best, None], kinds[best, None], table[best, end:])
     rows = np.concatenate(columns, axis=1)
     return [tuple(float(v) for v in rows[k]) for k in sorted(int(i) for i in kept)]
@@ -146,9 +142,7 @@ def open_model(file: Path) -> Any:
         parse_model(data, file)
         return open_session(data, "auto", 1, str(file))[0]
     except OSError as error:
-        raise ForegroundError(
-            f"{file}: cannot be read: {error.strerror}; name a model in ONNX format"
-        ) from None
+        raise ForegroundError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     except EmbeddingError as error:
         raise ForegroundError(str(error)) from None
 

@@ -34,9 +34,7 @@ class ClockService(clock_pb2_grpc.ClockServiceServicer):
     ) -> clock_pb2.ExchangeResponse:
         received_ns = self._clock.now_ns()
         return clock_pb2.ExchangeResponse(
-            client_sent_ns=request.client_sent_ns,
-            server_received_ns=received_ns,
-            server_sent_ns=self._clock.now_ns(),
+            client_sent_ns=request.client_sent_ns, server_received_ns=received_ns, server_sent_ns=self._clock.now_ns()
         )
 
 
@@ -56,11 +54,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             uptime_s=state.now_s(),
             cameras=[
                 edge_pb2.CameraStatus(
-                    camera_id=c.camera,
-                    age_ms=c.age_ms,
-                    delivered=c.delivered,
-                    rejected=c.rejected,
-                    held_out=c.held_out,
+                    camera_id=c.camera, age_ms=c.age_ms, delivered=c.delivered, rejected=c.rejected, held_out=c.held_out
                 )
                 for c in state.cameras()
             ],
@@ -70,9 +64,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             last=to_decision(last) if last is not None else None,
         )
 
-    async def WatchDecisions(
-        self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext
-    ) -> None:
+    async def WatchDecisions(self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext) -> None:
         last = self._state.newest()
         seen = -1 if last is None else last.number
         async with self._watchers.open(context) as call:
@@ -141,9 +133,14 @@ class GrpcThread:
     """
 
     def __init__(
-        self, transport: Transport, address: str, ingest: Ingest, clock: Clock, state: EdgeState,
+        self,
+        transport: Transport,
+        address: str,
+        ingest: Ingest,
+        clock: Clock,
+        state: EdgeState,
         stopping: threading.Event,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._transport, self._address = transport, address
         self._ingest, self._clock, self._state = ingest, clock, state
         self._stopping = stopping
@@ -174,11 +171,14 @@ class GrpcThread:
         self._ingest.add_to_server(server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
         edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
-        checks = await serve_health(server, [
-            service.full_name
-            for module in (frames_pb2, clock_pb2, edge_pb2)
-            for service in module.DESCRIPTOR.services_by_name.values()
-        ])  # fmt: skip
+        checks = await serve_health(
+            server,
+            [
+                service.full_name
+                for module in (frames_pb2, clock_pb2, edge_pb2)
+                for service in module.DESCRIPTOR.services_by_name.values()
+            ],
+        )
         port = self._transport.bind(server, self._address)
         await server.start()
         log.info("listening on port %d", port)

@@ -82,15 +82,9 @@ class FrameAdmission:
             raise FrameRejected("replayed_sequence", f"{frame.sequence} after {session.sequence}")
         if frame.generated_ns <= session.generated_ns:
             raise FrameRejected("time_reversed", "captured before the frame that came before it")
-        ahead = (
-            frame.generated_edge_ns
-            - now_ns
-            - min(frame.clock_uncertainty_ns, limits.MAX_CLOCK_UNCERTAINTY_NS)
-        )
+        ahead = frame.generated_edge_ns - now_ns - min(frame.clock_uncertainty_ns, limits.MAX_CLOCK_UNCERTAINTY_NS)
         if ahead > limits.MAX_CAPTURE_AHEAD_NS:
-            raise FrameRejected(
-                "from_future", f"captured {ahead / 1e6:.0f} ms from now: clock offset unknown?"
-            )
+            raise FrameRejected("from_future", f"captured {ahead / 1e6:.0f} ms from now: clock offset unknown?")
         if -ahead > limits.MAX_CAPTURE_AGE_NS:
             raise FrameRejected("too_old", f"captured {-ahead / 6e10:.0f} minutes ago: a wrong clock?")
         # Only an admitted frame changes the session: a refused one does not affect the next.
@@ -114,8 +108,9 @@ class FrameAdmission:
             if frame.camera not in self.doubled:
                 log.warning(
                     "%s: two nodes send as this camera, each in a session of its own: give one another id "
-                    "(cameras.ids)", frame.camera,
-                )  # fmt: skip
+                    "(cameras.ids)",
+                    frame.camera,
+                )
             self.doubled[frame.camera] += 1
 
 

@@ -27,19 +27,21 @@ _HERE = ("localhost", "127.0.0.1", "::1")
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = argparse.ArgumentParser(
-        "edge-server keys", description="Make a development certificate authority (CA), and a folder with "
+        "edge-server keys",
+        description="Make a development certificate authority (CA), and a folder with "
         "certificate, key and CA for each process of a scenario: edge, emulator, every camera, operator and "
         "viewer. The edge's folder also holds tokens.txt, with which people log in to the page.",
-    )  # fmt: skip
-    parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    parser.add_argument(
-        "--out", type=out_folder, required=True, metavar="DIR", help="folder to write; must not exist"
     )
+    parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write; must not exist")
     for process in ("edge", "emulator"):
         parser.add_argument(
-            f"--{process}", action="append", default=[], metavar="HOST",
+            f"--{process}",
+            action="append",
+            default=[],
+            metavar="HOST",
             help=f"name or address under which the {process} is reached, besides localhost; may be repeated",
-        )  # fmt: skip
+        )
     args = parser.parse_args(argv)
     make_keys(args.out, load(args.scenario).cameras, args.edge, args.emulator)
     print(f"{args.out}: copy each folder to the machine of its process, and keep the rest to yourself")
@@ -93,11 +95,27 @@ def _certify(folder: Path, name: str, extensions: Sequence[str], authority: Path
         config.write("[req]\ndistinguished_name=name\n[name]\n")
         config.flush()
         command: list[str | Path] = [
-            "openssl", "req", "-x509", "-config", config.name, "-days", str(_DAYS), "-noenc",
-            "-subj", f"/CN={name}", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", *signed,
+            "openssl",
+            "req",
+            "-x509",
+            "-config",
+            config.name,
+            "-days",
+            str(_DAYS),
+            "-noenc",
+            "-subj",
+            f"/CN={name}",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+            *signed,
             *(word for extension in extensions for word in ("-addext", extension)),
-            "-keyout", folder / "key.pem", "-out", folder / "cert.pem",
-        ]  # fmt: skip
+            "-keyout",
+            folder / "key.pem",
+            "-out",
+            folder / "cert.pem",
+        ]
         try:
             done = subprocess.run(command, capture_output=True, text=True)
         except FileNotFoundError:

@@ -189,8 +189,9 @@ class UpdateLoop:
             log.warning(
                 "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send "
                 "fewer or smaller ones, or give updates more (edge.update_ms)",
-                buffer.shed - shed, buffer.arrivals - arrived,
-            )  # fmt: skip
+                buffer.shed - shed,
+                buffer.arrivals - arrived,
+            )
         self._warned_of = (buffer.shed, buffer.arrivals, now_s)
 
     def _write_checkpoints(self) -> None:

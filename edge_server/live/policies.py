@@ -35,9 +35,7 @@ class ServerPolicies:
     def make(self, name: str, value: float | None) -> Policy:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
         if name not in self.offered and len(name) > MAX_POLICY_CHARS:
-            raise ValueError(
-                f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}"
-            )
+            raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
         if name.startswith(BANDIT) and name not in self.offered:
             raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
         policy = self._make(name, value)
@@ -65,11 +63,17 @@ class ServerPolicies:
         from edge_server.scheduler.online.online_trainer import open_online_trainer
 
         trainer = open_online_trainer(
-            Path(name.removeprefix(BANDIT)), learn.reward, learn.fallback, self._scenario.rng("lessons"),
-            lpips_missing, out,
-        )  # fmt: skip
+            Path(name.removeprefix(BANDIT)),
+            learn.reward,
+            learn.fallback,
+            self._scenario.rng("lessons"),
+            lpips_missing,
+            out,
+        )
         reward = trainer.reward
         if reward.distance and reward.distance_is == "perceptual" and "perceptual" not in config.metrics:
-            raise ValueError("the policy was trained by the stand-in distance, which nothing measures here: "
-                             "list it in the scenario, edge.metrics: [perceptual]")  # fmt: skip
+            raise ValueError(
+                "the policy was trained by the stand-in distance, which nothing measures here: "
+                "list it in the scenario, edge.metrics: [perceptual]"
+            )
         return trainer

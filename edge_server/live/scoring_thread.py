@@ -190,9 +190,7 @@ class ScoringThread:
             render = self._render_later(camera, renderer, publication.published_ns)
             self._finish(self._scorer.publish(camera, render, publication.published_ns))
 
-    def _render_later(
-        self, camera: str, renderer: Snapshot, published_ns: int
-    ) -> Callable[[int], NDArray[np.float32]]:
+    def _render_later(self, camera: str, renderer: Snapshot, published_ns: int) -> Callable[[int], NDArray[np.float32]]:
         def render(generated_ns: int) -> NDArray[np.float32]:
             frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
             image = renderer.render(frame.pose.matrix(), frame.intrinsics).color
@@ -205,9 +203,7 @@ class ScoringThread:
 
     def _score_with(self, frame: Frame) -> None:
         self._frames[frame.camera].append(frame)
-        scores = self._scorer.held_out(
-            frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose
-        )
+        scores = self._scorer.held_out(frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose)
         self._finish(scores)
         self._score_shown(frame)
 
@@ -222,9 +218,7 @@ class ScoringThread:
     def _finish(self, scores: Sequence[Score]) -> None:
         for score in scores:
             image = self._rendered.pop((score.camera, score.published_ns), None)
-            entry = next(
-                (o for o in self._open.values() if o.publication.published_ns == score.published_ns), None
-            )
+            entry = next((o for o in self._open.values() if o.publication.published_ns == score.published_ns), None)
             if entry is None:
                 continue
             entry.scores.append(score)
@@ -251,9 +245,7 @@ class ScoringThread:
             if any(isinstance(i, tuple) for i in self._inbox):
                 return  # a newer publication is waiting: this one stays unscored
         whole = [(v if v.whole is None else v.whole() or v) for v in views]
-        renderings = [
-            (v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in whole
-        ]
+        renderings = [(v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in whole]
         score = self._scorer.score_selected(renderings, publication.published_ns)
         if score is None:
             return

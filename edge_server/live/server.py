@@ -143,9 +143,7 @@ class EdgeServer:
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         self.trainer, policy = self.policies.trainer, self.policies.first
-        self.updater = open_updater(
-            scenario, config, policy, field, self.start_ns, resumed=options.resume is not None
-        )
+        self.updater = open_updater(scenario, config, policy, field, self.start_ns, resumed=options.resume is not None)
         self.updater.number = resumed_updates
         self.buffer = self.updater.buffer
         self.recorder: Recorder | None = None
@@ -155,9 +153,14 @@ class EdgeServer:
             self.recorder = Recorder(options.record, scenario.name)
             log.info("recording to %s", self.recorder.file)
         self.ingest = Ingest(
-            self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
-            None if self.recorder is None else self.recorder.frame, scenario.max_side_px,
-        )  # fmt: skip
+            self.clock,
+            self.buffer,
+            scenario.held_out,
+            self.ledger,
+            self.scoring.held_out_frame,
+            None if self.recorder is None else self.recorder.frame,
+            scenario.max_side_px,
+        )
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
         self.loop = UpdateLoop(
             self.updater,
@@ -213,9 +216,8 @@ class EdgeServer:
                 from edge_server.live.output.prometheus import serve_metrics
 
                 serve_metrics(
-                    self.state, self.ingest, self.options.page_host, self.options.metrics_port,
-                    self.options.transport,
-                )  # fmt: skip
+                    self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
+                )
             self.scoring.start()
             if self.trainer is not None:
                 self.trainer.start()
@@ -387,9 +389,7 @@ class EdgeServer:
             "value": self.state.controls.value,
             "paused": self.state.controls.paused,
             "doing": self.state.status_line,
-            "cameras": [
-                _values(c, "camera", "held_out", "age_ms", "delivered", "rejected") for c in self._cameras()
-            ],
+            "cameras": [_values(c, "camera", "held_out", "age_ms", "delivered", "rejected") for c in self._cameras()],
             "rejected": dict(self.ingest.rejected),
             "streams_ended": self.ingest.streams.ended,
             "two_nodes": dict(self.ingest.admission.doubled),
@@ -417,15 +417,16 @@ class EdgeServer:
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),
-            "last": None if last is None else {
-                **_values(last, "t_s", "aaoi_ms", "update_ms", "omega_ms", "steps"),
-                "selected": len(last.selected),
-            },
-            "scores": None if scored is None else {
+            "last": None
+            if last is None
+            else {**_values(last, "t_s", "aaoi_ms", "update_ms", "omega_ms", "steps"), "selected": len(last.selected)},
+            "scores": None
+            if scored is None
+            else {
                 **_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips", "perceptual"),
                 "on": scored.scored_on,
             },
-        }  # fmt: skip
+        }
 
     def _write_final(self) -> None:
         try:

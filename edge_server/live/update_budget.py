@@ -214,9 +214,14 @@ def options_for(frontier: Frontier, config: EdgeConfig) -> dict[str, Any]:
         return config.field_options
     log.info(
         "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB %s, %.1f moving)",
-        config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
-        point.measured, point.psnr_moving_db,
-    )  # fmt: skip
+        config.deadline_ms,
+        point.effort,
+        point.update_ms,
+        point.speed_m_per_s,
+        point.psnr_db,
+        point.measured,
+        point.psnr_moving_db,
+    )
     if point.update_ms > config.deadline_ms:
         log.warning("no measured update is as short as that: updates do what fits")
     return {**point.options, **config.field_options}

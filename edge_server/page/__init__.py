@@ -57,9 +57,7 @@ class Page:
         _quietly(self._server.stop)
 
 
-def start_page(
-    state: EdgeState, host: str = "127.0.0.1", port: int = 8080, transport: Transport | None = None
-) -> Page:
+def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, transport: Transport | None = None) -> Page:
     """Serve the page of ``state``. Port 0 takes a free one. Raises PageError if the port is not available,
     TransportError if it would be open to others (see ``Transport.guard``)."""
     _check_port(host, port)

@@ -47,16 +47,21 @@ class ControlPanel:
         self.effort: Any = None
         if state.efforts:
             self.effort = gui.add_dropdown(
-                "effort", state.efforts, initial_value=state.controls.effort,
+                "effort",
+                state.efforts,
+                initial_value=state.controls.effort,
                 hint="How fine the field is, and what a step takes. A change begins the scene anew.",
-            )  # fmt: skip
+            )
             self.effort.on_update(lambda event: self._effort_chosen(event))
         self.deadline: Any = None
         if state.set_deadline is not None:
             self.deadline = gui.add_number(
-                "deadline, ms", _finite_or_zero(state.controls.deadline_ms), min=0.0, step=10.0,
+                "deadline, ms",
+                _finite_or_zero(state.controls.deadline_ms),
+                min=0.0,
+                step=10.0,
                 hint="An update's time from decision to publication; 0: none, the scenario's update_ms.",
-            )  # fmt: skip
+            )
             self.deadline.on_update(lambda event: self._deadline_entered(event))
         self.frontier = gui.add_html("", visible=state.frontier is not None)
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
@@ -112,9 +117,7 @@ class ControlPanel:
         if event.client is None or entered == _finite_or_zero(self._state.controls.value):
             return
         # The value comes from a browser: an empty input must end as a notification too.
-        self._attempt(
-            event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered))
-        )
+        self._attempt(event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered)))
 
     def _effort_chosen(self, event: Any) -> None:
         effort, choose = event.target.value, self._state.set_effort

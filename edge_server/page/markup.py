@@ -13,17 +13,7 @@ from typing import TYPE_CHECKING, Any
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView
 from edge_server.live.update_budget import Frontier
-from edge_server.page.colors import (
-    AGAINST,
-    FOR,
-    FRESH_MS,
-    HELD_OUT,
-    RGB,
-    STALE_MS,
-    age_color,
-    css,
-    scale_color,
-)
+from edge_server.page.colors import AGAINST, FOR, FRESH_MS, HELD_OUT, RGB, STALE_MS, age_color, css, scale_color
 from freshfield.scenario import NOTHING_HELD_OUT
 
 if TYPE_CHECKING:  # loaded only with a learned policy
@@ -255,9 +245,7 @@ def decision_explanation(e: Explanation) -> str:
 
 def _bar(name: str, share: float, widest: float) -> str:
     percent = 100.0 * abs(share) / widest if widest > 0 else 0.0
-    bar = (
-        f"width:{percent:.0f}%;height:.7em;border-radius:2px;background:{css(FOR if share >= 0 else AGAINST)}"
-    )
+    bar = f"width:{percent:.0f}%;height:.7em;border-radius:2px;background:{css(FOR if share >= 0 else AGAINST)}"
     grid = "display:grid;grid-template-columns:6.5em 1fr 3.5em;gap:.4em;align-items:center"
     return (
         f'<div style="{grid}"><span style="overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
@@ -276,9 +264,7 @@ def channel_state(channel: dict[str, Any] | None) -> str:
     for k, name in enumerate(states):
         look = f"border-left:3px solid {css(scale_color(k / (len(states) - 1)))};font-weight:600"
         look = look if name == state else f"{_DIM};opacity:.6"
-        cells += (
-            f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{look}">{escape(str(name))}</span>'
-        )
+        cells += f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{look}">{escape(str(name))}</span>'
     since = ""
     with suppress(KeyError, TypeError, ValueError, IndexError):  # of an emulator of another version
         since = f"for {float(channel['uptime_s']) - float(series[-1][0]):.1f} s"  # type: ignore[index]

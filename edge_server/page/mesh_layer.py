@@ -46,9 +46,7 @@ class MeshLayer:
                 self.button.label = "show mesh"
                 return
             self.button.label, self.button.disabled = "making the mesh ...", True
-            self._thread = threading.Thread(
-                target=self._make, args=(event.client,), name="page-mesh", daemon=True
-            )
+            self._thread = threading.Thread(target=self._make, args=(event.client,), name="page-mesh", daemon=True)
             self._thread.start()
 
     def _make(self, client: Any) -> None:
@@ -68,12 +66,7 @@ class MeshLayer:
 
         from edge_server.fields.common.threads.thread_pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
-        from edge_server.surface.reconstruct import (
-            MeshSettings,
-            grid_for,
-            make_depth_maps,
-            mesh_from_depth_maps,
-        )
+        from edge_server.surface.reconstruct import MeshSettings, grid_for, make_depth_maps, mesh_from_depth_maps
 
         renderer = self._state.renderer
         views = getattr(renderer, "cameras", ())
@@ -85,9 +78,11 @@ class MeshLayer:
         grid = grid_for(maps, settings)
         span = float(np.subtract(grid.upper, grid.lower).max())
         settings = MeshSettings(
-            sharpen=False, memory_mb=MEMORY_MB, voxel_m=max(grid.voxel_m, span / VOXELS),
+            sharpen=False,
+            memory_mb=MEMORY_MB,
+            voxel_m=max(grid.voxel_m, span / VOXELS),
             bounds=(grid.lower, grid.upper),
-        )  # fmt: skip
+        )
         mesh = mesh_from_depth_maps(maps, settings, pool=pool)
         return self._server.scene.add_mesh_trimesh(
             NODE, trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.color, process=False)

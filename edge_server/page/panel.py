@@ -89,9 +89,7 @@ class Panel:
             held_out = any(c.held_out for c in cameras if c.camera == comparison.camera)
             self._show_comparison(comparison, publications, held_out)
 
-    def _show_comparison(
-        self, comparison: Comparison, publications: list[Publication], held_out: bool
-    ) -> None:
+    def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number
         scored = next((p for p in reversed(publications) if p.number == comparison.number), None)
         self._caption.content = markup.comparison_caption(
@@ -142,9 +140,11 @@ def age_parts_ms(publications: Sequence[Publication]) -> dict[str, float]:
     gap_ms = 1e3 * np.diff([p.t_s for p in publications])
     network, computing, age = np.mean(known, axis=0)
     parts = {
-        "network": network, "waiting": age - network - computing, "computing": computing,
+        "network": network,
+        "waiting": age - network - computing,
+        "computing": computing,
         "display": np.sum(gap_ms**2) / max(2.0 * np.sum(gap_ms), 1e-3),
-    }  # fmt: skip
+    }
     return {name: max(float(ms), 0.0) for name, ms in parts.items()}
 
 

@@ -24,12 +24,24 @@ from freshfield.transport import Transport
 # Of a file of answers: thousands of them.
 MAX_BODY_BYTES = 2**20
 _HEADERS = [
-    ("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"), ("Referrer-Policy", "no-referrer"),
-    ("Content-Security-Policy", "default-src 'none'; img-src 'self'; connect-src 'self'; style-src "
-     "'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"),
-]  # fmt: skip
-_REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 409: "Conflict",
-            413: "Too Large", 507: "Not Kept"}  # fmt: skip
+    ("Cache-Control", "no-store"),
+    ("X-Content-Type-Options", "nosniff"),
+    ("Referrer-Policy", "no-referrer"),
+    (
+        "Content-Security-Policy",
+        "default-src 'none'; img-src 'self'; connect-src 'self'; style-src "
+        "'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'",
+    ),
+]
+_REASONS = {
+    200: "OK",
+    400: "Bad Request",
+    403: "Forbidden",
+    404: "Not Found",
+    409: "Conflict",
+    413: "Too Large",
+    507: "Not Kept",
+}
 
 
 class _Refused(Exception):
@@ -47,9 +59,13 @@ class PreferencePage:
     """
 
     def __init__(
-        self, session: PreferenceSession, sprites: Sequence[bytes], frames: int, columns: int,
+        self,
+        session: PreferenceSession,
+        sprites: Sequence[bytes],
+        frames: int,
+        columns: int,
         keep: Callable[[PreferenceSession], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.session = session
         self.finished = threading.Event()
         self.seen = threading.Event()  # whether somebody looked at the plan
@@ -59,9 +75,7 @@ class PreferencePage:
         self._lock = threading.Lock()
         self._turn = secrets.token_hex(8)  # names the present state of the session; says nothing of the pair
 
-    def serve(
-        self, host: str, port: int, transport: Transport | None = None
-    ) -> tuple[str, Callable[[], None]]:
+    def serve(self, host: str, port: int, transport: Transport | None = None) -> tuple[str, Callable[[], None]]:
         """Serve on a thread; returns the address and a function that closes the page. Raises PageError if the
         port is not available, TransportError if the page would be open to others."""
         try:
@@ -116,11 +130,17 @@ class PreferencePage:
         """What the page knows."""
         agreed, repeated = session.agreement
         return {
-            "turn": self._turn, "answered": len(session.answers), "wanted": session.wanted,
-            "open": session.question is not None, "agreed": agreed, "repeated": repeated,
-            "says": session.model.says(), "finished": self.finished.is_set(),
-            "plan": None if self._plan is None else self._plan[0], **self._layout,
-        }  # fmt: skip
+            "turn": self._turn,
+            "answered": len(session.answers),
+            "wanted": session.wanted,
+            "open": session.question is not None,
+            "agreed": agreed,
+            "repeated": repeated,
+            "says": session.model.says(),
+            "finished": self.finished.is_set(),
+            "plan": None if self._plan is None else self._plan[0],
+            **self._layout,
+        }
 
     def show_plan(self, lines: list[str], png: bytes) -> None:
         """Show the plan that the answers led to: what was chosen and why, and the candidates by value."""

@@ -224,9 +224,8 @@ class RenderLoop:
         if visitor.client.client_id not in self._visitors:  # has left meanwhile
             return
         visitor.client.scene.set_background_image(
-            color, format="jpeg", jpeg_quality=85,
-            depth=depth if self.occlude else None,
-        )  # fmt: skip
+            color, format="jpeg", jpeg_quality=85, depth=depth if self.occlude else None
+        )
         visitor.sent += 1
         with self._wake:
             if visitor.serial == serial:
@@ -247,13 +246,7 @@ class RenderLoop:
         self._rows[number] = float(np.clip(self._rows[number] * change, level.min_rows, level.max_rows))
 
     def _render(
-        self,
-        renderer: Snapshot,
-        pose: NDArray,
-        camera: Pinhole,
-        visitor: ClientState,
-        serial: int,
-        level: int,
+        self, renderer: Snapshot, pose: NDArray, camera: Pinhole, visitor: ClientState, serial: int, level: int
     ) -> Rendering | None:
         """The image, rendered in bands; None if the visitor has moved meanwhile."""
         bands = max(1, round(LEVELS[level].budget_s / BAND_S)) if level else 1

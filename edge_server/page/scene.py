@@ -79,9 +79,14 @@ class Scene:
             return
         radius = self._viewpoint.radius_m if self._viewpoint else 1.0
         self._points = self._server.scene.add_point_cloud(
-            "/field/points", points, colors, point_size=radius * 0.006, point_shape="circle",
-            precision="float32", point_shading="flat",
-        )  # fmt: skip
+            "/field/points",
+            points,
+            colors,
+            point_size=radius * 0.006,
+            point_shape="circle",
+            precision="float32",
+            point_shading="flat",
+        )
 
     # --- frustums -------------------------------------------------------------------------------
 
@@ -122,9 +127,12 @@ class Scene:
             _, height, depth = handle.compute_canonical_frustum_size()
             above = (0.0, -0.75 * height * size, depth * size)
             self._server.scene.add_label(
-                f"/cameras/{camera.camera}/label", "held out: ground truth", anchor="bottom-center",
-                position=above, font_screen_scale=0.85,
-            )  # fmt: skip
+                f"/cameras/{camera.camera}/label",
+                "held out: ground truth",
+                anchor="bottom-center",
+                position=above,
+                font_screen_scale=0.85,
+            )
         return _CameraNode(handle, frame.pose, color)
 
     def _look_through(self, client: Any, camera: str) -> None:

@@ -74,8 +74,9 @@ class Timelines:
     """Three charts in the current GUI container. ``refresh`` is called about once a second."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        self._age = _Chart(gui, "Age of the newest frames, ms",
-                           (("mean", FRESH), ("worst", STALE), ("omega", UNKNOWN)), zero=True)  # fmt: skip
+        self._age = _Chart(
+            gui, "Age of the newest frames, ms", (("mean", FRESH), ("worst", STALE), ("omega", UNKNOWN)), zero=True
+        )
         self._psnr = _Chart(gui, "", (("PSNR", HELD_OUT), ("moving", MIDDLE)))
         self._channel = _Chart(gui, "Channel", (("state", MIDDLE),), zero=True, stepped=True)
 
@@ -89,8 +90,11 @@ class Timelines:
         scored = [p for p in recent if p.psnr_db is not None]
         where = fidelity_title(p.scored_on for p in scored)
         self._psnr.title = f"{where}, dB"
-        self._psnr.draw(_column(p.t_s for p in scored), _column(p.psnr_db for p in scored),
-                        _column(p.psnr_moving_db for p in scored))  # fmt: skip
+        self._psnr.draw(
+            _column(p.t_s for p in scored),
+            _column(p.psnr_db for p in scored),
+            _column(p.psnr_moving_db for p in scored),
+        )
         names = ", ".join(f"{i} {name}" for i, name in enumerate(history.state_names))
         self._channel.draw(t, state, remark=names)
 
@@ -103,9 +107,8 @@ class _Chart:
     """
 
     def __init__(
-        self, gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, RGB]],
-        zero: bool = False, stepped: bool = False,
-    ) -> None:  # fmt: skip
+        self, gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, RGB]], zero: bool = False, stepped: bool = False
+    ) -> None:
         self._gui, self.title, self._lines = gui, title, lines
         self._zero, self._stepped = zero, stepped
         self._caption = gui.add_html("", visible=False)
@@ -145,10 +148,14 @@ class _Chart:
         if self._zero:
             scales["y"] = {"range": (0.0, None)}
         return self._gui.add_uplot(
-            data=data, series=tuple(series), height=HEIGHT, scales=scales,
+            data=data,
+            series=tuple(series),
+            height=HEIGHT,
+            scales=scales,
             axes=cast(Any, ({"size": 22} | axis, {"size": 38, "space": 22} | axis)),
-            legend={"show": False}, padding=(6, 10, 0, 0),
-        )  # fmt: skip
+            legend={"show": False},
+            padding=(6, 10, 0, 0),
+        )
 
 
 def _column(values: Any) -> NDArray:

@@ -42,9 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--camera", metavar="NAME", help="camera whose image regions to explain [that with the largest share]"
     )
-    parser.add_argument(
-        "--json", type=out_file, metavar="FILE", help="also write the figures to FILE as JSON"
-    )
+    parser.add_argument("--json", type=out_file, metavar="FILE", help="also write the figures to FILE as JSON")
     args = parser.parse_args(argv)
     try:
         found = read_decision(args.run, args.decision)
@@ -102,9 +100,7 @@ def _embedder(found: RecordedDecision) -> EmbedImages:
     return make_embedder(config).embed
 
 
-def as_text(
-    found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None
-) -> str:
+def as_text(found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None) -> str:
     """The explanation as lines of text."""
     p = np.exp(found.decision.logp)
     lines = [
@@ -129,11 +125,7 @@ def as_text(
 
 
 def draw(
-    e: Explanation,
-    path: Path,
-    camera: str | None,
-    image: NDArray[np.uint8] | None,
-    regions: NDArray[np.float64] | None,
+    e: Explanation, path: Path, camera: str | None, image: NDArray[np.uint8] | None, regions: NDArray[np.float64] | None
 ) -> None:
     """Draw bars by part and by camera, and the image with the shares of its regions."""
     columns = 3 if image is not None and regions is not None else 2

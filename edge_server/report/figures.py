@@ -12,18 +12,7 @@ from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.report.run_files import Row, RunFiles
-from edge_server.report.style import (
-    BLUE,
-    GRAY,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    figure,
-    label_lines,
-)
+from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = dict[str, Any]

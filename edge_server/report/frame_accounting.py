@@ -186,8 +186,9 @@ class _History:
         last = (file, number) if number >= self.last_role else (self.last_file, self.last_role)
         counts = {name: getattr(self, name) for name in _ROLES}
         counts[role] = counts[role] + Counter([event])
-        return _History(**counts, incomplete=self.incomplete | (set() if complete else {role}),
-                        last_file=last[0], last_role=last[1])  # fmt: skip
+        return _History(
+            **counts, incomplete=self.incomplete | (set() if complete else {role}), last_file=last[0], last_role=last[1]
+        )
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -277,9 +278,7 @@ def account_frames(out: Path) -> FrameAccounting:
                     contradictions = [*contradictions, "arrived, but its node wrote nothing about it"]
             open_at["in_flight"][history.last_file] += counts.in_flight * count
             if contradictions:
-                contradicting |= dict.fromkeys(
-                    (s for s, other in frames.items() if other == number), contradictions
-                )
+                contradicting |= dict.fromkeys((s for s, other in frames.items() if other == number), contradictions)
             unsent, copies = counts.without_end
             if unsent <= 0 and copies <= 0:
                 continue
@@ -431,9 +430,7 @@ def _evaluate(history: _History) -> tuple[FrameCounts, list[str]]:
         contradictions.append(f"received {emulator['received']} times but sent {handed} times")
     ends = {e: n for e, n in emulator.items() if _is_end(e)}
     if forwarded + sum(ends.values()) > copies:
-        contradictions.append(
-            f"{copies} copies, but {forwarded} forwarded and {sum(ends.values())} ended before"
-        )
+        contradictions.append(f"{copies} copies, but {forwarded} forwarded and {sum(ends.values())} ended before")
     for end, count in [*edge.items(), *ends.items()]:
         counts.count_end(end, count)
     for answer, count in answers.items():

@@ -88,10 +88,7 @@ def _head(report: Report) -> str:
 def _tiles(report: Report) -> str:
     final, age, frames = report["fidelity"]["final"], report["age_ms"], report["frames"]
     network = report["fidelity"]["lpips_network"]
-    similarity = [
-        (_n(final["ssim"], 3), "SSIM"),
-        (_n(final["lpips"], 3), f"LPIPS-{network}" if network else "LPIPS"),
-    ]
+    similarity = [(_n(final["ssim"], 3), "SSIM"), (_n(final["lpips"], 3), f"LPIPS-{network}" if network else "LPIPS")]
     if final["perceptual"] is not None:
         similarity.append((_n(final["perceptual"], 3), "perceptual (not LPIPS)"))
     if report["kind"] == "fit":
@@ -99,15 +96,19 @@ def _tiles(report: Report) -> str:
         return _tile_row([(_n(final["psnr_db"], 1, " dB"), what), *similarity])
     shown = report["fidelity"]["shown"]
     tiles = [(shown, "PSNR of what was shown")] if shown["psnr_db"] is not None else []
-    return _tile_row([
-        *((_n(found[key], 1, " dB"), f"{what}{where}, last fifth of the run")
-          for found, what in [*tiles, (final, f"PSNR at publication, of {_views(report)}")]
-          for key, where in (("psnr_db", ""), ("psnr_moving_db", " where the scene moves"))),
-        *similarity,
-        (_n(age["mean"], 0, " ms"), f"mean age (95 %: {_n(age['p95'], 0)} ms)"),
-        (_n(report["updates"]["ms_p50"], 0, " ms"), f"median of {report['updates']['count']} updates"),
-        (f"{frames['delivered']:,}", f"frames delivered of {frames['captured']:,} captured"),
-    ])  # fmt: skip
+    return _tile_row(
+        [
+            *(
+                (_n(found[key], 1, " dB"), f"{what}{where}, last fifth of the run")
+                for found, what in [*tiles, (final, f"PSNR at publication, of {_views(report)}")]
+                for key, where in (("psnr_db", ""), ("psnr_moving_db", " where the scene moves"))
+            ),
+            *similarity,
+            (_n(age["mean"], 0, " ms"), f"mean age (95 %: {_n(age['p95'], 0)} ms)"),
+            (_n(report["updates"]["ms_p50"], 0, " ms"), f"median of {report['updates']['count']} updates"),
+            (f"{frames['delivered']:,}", f"frames delivered of {frames['captured']:,} captured"),
+        ]
+    )
 
 
 def _tile_row(tiles: list[tuple[str, str]]) -> str:
@@ -251,8 +252,19 @@ def _frames_table(report: Report) -> str:
 
 
 def _frames_by_camera(report: Report) -> str:
-    names = ("captured", "replaced", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
-             "delivered", "in_flight", "cut_off")  # fmt: skip
+    names = (
+        "captured",
+        "replaced",
+        "sent",
+        "skipped",
+        "dropped_busy",
+        "superseded",
+        "lost",
+        "broken",
+        "delivered",
+        "in_flight",
+        "cut_off",
+    )
     rows = [["camera", *(n.replace("_", " ") for n in names), "rejected"]]
     by_camera = report["frames"]["by_camera"] if report["frames"] is not None else {}
     for camera, f in by_camera.items():

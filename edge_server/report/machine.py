@@ -52,9 +52,7 @@ def machine(proc: Path = _PROC) -> dict[str, Any]:
         "system": platform.system(),
         "kernel": platform.release(),
         "gpus": [
-            name
-            for path in sorted(proc.glob("driver/nvidia/gpus/*/information"))
-            if (name := _field(path, "Model"))
+            name for path in sorted(proc.glob("driver/nvidia/gpus/*/information")) if (name := _field(path, "Model"))
         ],
     }
 

@@ -68,9 +68,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "updates": updates(series, edge.get("updates") or {}),
         "foreground": edge.get("foreground"),
         "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
-        "channel": {
-            name: files.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
-        },
+        "channel": {name: files.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")},
         "notes": notes + accounting.notes,
     }
     if files.mesh:

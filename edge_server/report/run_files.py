@@ -115,19 +115,34 @@ class _Ages(TypedDict, total=False):
 
 # What a report takes from the files, and its types: of JSON files key by key, of JSON lines row by row.
 _EDGE: dict[str, Any] = {
-    "kind": str, "scenario": str | None, "seed": int | None, "field": str | None, "policy": str | None,
-    "value": Number | None, "seconds": Number, "uptime_s": Number, "lines_lost": Number,
-    "updates": _Updates | None, "foreground": Numbers | None, "baseline": Numbers | None,
-    "data": _Data | None, "lpips_missing": str | None, "lpips_network": str | None,
-}  # fmt: skip
+    "kind": str,
+    "scenario": str | None,
+    "seed": int | None,
+    "field": str | None,
+    "policy": str | None,
+    "value": Number | None,
+    "seconds": Number,
+    "uptime_s": Number,
+    "lines_lost": Number,
+    "updates": _Updates | None,
+    "foreground": Numbers | None,
+    "baseline": Numbers | None,
+    "data": _Data | None,
+    "lpips_missing": str | None,
+    "lpips_network": str | None,
+}
 _CHANNEL: dict[str, Any] = {
-    "state_share": dict[str, Number] | None, "drawn_delay_ms": _Delays | None,
+    "state_share": dict[str, Number] | None,
+    "drawn_delay_ms": _Delays | None,
     "delay_error_ms": _Delays | None,
-}  # fmt: skip
+}
 _FRONTIER: dict[str, Any] = {"points": list[_FrontierPoint], "about": str}
 _ROWS: dict[str, Any] = {
-    "series": _Publication, "ages": _Ages, "shown": _Shown, "processes": dict[str, Number | Numbers | None],
-}  # fmt: skip
+    "series": _Publication,
+    "ages": _Ages,
+    "shown": _Shown,
+    "processes": dict[str, Number | Numbers | None],
+}
 
 
 @dataclass

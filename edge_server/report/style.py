@@ -63,9 +63,7 @@ def figure(
     axes: array (rows, columns). height_inch: height of a row. kwargs go to ``plt.subplots``.
     """
     with plt.rc_context(_RC):
-        fig, axes = plt.subplots(
-            rows, columns, figsize=(WIDTH_INCH, height_inch * rows), squeeze=False, **kwargs
-        )
+        fig, axes = plt.subplots(rows, columns, figsize=(WIDTH_INCH, height_inch * rows), squeeze=False, **kwargs)
         try:
             yield fig, axes
             drawn = io.BytesIO()

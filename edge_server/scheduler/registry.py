@@ -48,9 +48,10 @@ BANDIT = "bandit:"
 VIRTUAL_ONLY = ("wait-flush",)
 # The choices shown to people; any other combination may be typed.
 OFFERED: tuple[str, ...] = (
-    *(policy for policy in POLICIES if policy not in VIRTUAL_ONLY), *TREATMENTS,
+    *(policy for policy in POLICIES if policy not in VIRTUAL_ONLY),
+    *TREATMENTS,
     *(f"{policy}+{treatment}" for policy in ("threshold", "wait", "freshest-k") for treatment in TREATMENTS),
-)  # fmt: skip
+)
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -80,8 +81,7 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
         return policy
     if treatment not in TREATMENTS:
         raise ValueError(
-            f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of "
-            f"{', '.join(TREATMENTS)}"
+            f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of {', '.join(TREATMENTS)}"
         )
     module, cls, _ = TREATMENTS[treatment]
     policy.name = name

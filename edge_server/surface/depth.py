@@ -107,9 +107,7 @@ def _slope(points: NDArray[np.float64], known: NDArray[np.bool_], axis: int) -> 
     """Difference of points (H, W, 3) along an axis, from both neighbors, or one at the border; 0 if a
     neighbor is unknown."""
     step = np.diff(points, axis=axis)
-    both = np.take(known, range(1, known.shape[axis]), axis) & np.take(
-        known, range(known.shape[axis] - 1), axis
-    )
+    both = np.take(known, range(1, known.shape[axis]), axis) & np.take(known, range(known.shape[axis] - 1), axis)
     out = np.zeros_like(points)
     count = np.zeros(known.shape)
     after = [slice(None)] * 2
@@ -127,10 +125,7 @@ def _slope(points: NDArray[np.float64], known: NDArray[np.bool_], axis: int) -> 
 
 
 def render_depth_maps(
-    renderer: Renderer,
-    cameras: Sequence[Camera],
-    solid: float = SOLID,
-    on_map: Callable[[int], None] | None = None,
+    renderer: Renderer, cameras: Sequence[Camera], solid: float = SOLID, on_map: Callable[[int], None] | None = None
 ) -> Iterator[DepthMap]:
     """Render depth maps for ``cameras``, one at a time. For a ``planar`` renderer, ``render_surface`` gives
     unbiased depth.

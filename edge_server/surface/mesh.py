@@ -50,10 +50,7 @@ class Mesh:
 
 
 def extract_mesh(
-    volume: Volume,
-    min_weight: float = 0.0,
-    watertight: bool = False,
-    on_slab: Callable[[float], None] | None = None,
+    volume: Volume, min_weight: float = 0.0, watertight: bool = False, on_slab: Callable[[float], None] | None = None
 ) -> Mesh:
     """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant).
 
@@ -217,9 +214,7 @@ class _Dense:
 def remove_degenerate(mesh: Mesh) -> Mesh:
     """Remove faces of zero area and unused vertices."""
     corners = mesh.faces
-    apart = (
-        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    )
+    apart = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
     return _select_faces(mesh, apart & (mesh.areas_m2() > 0.0))
 
 

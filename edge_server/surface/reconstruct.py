@@ -56,11 +56,7 @@ def silent(what: str, share: float) -> None:
 
 
 def make_depth_maps(
-    renderer: Renderer,
-    views: Sequence[View],
-    settings: MeshSettings,
-    say: Say = silent,
-    pool: Pool | None = None,
+    renderer: Renderer, views: Sequence[View], settings: MeshSettings, say: Say = silent, pool: Pool | None = None
 ) -> list[DepthMap]:
     """Make the depth maps that ``mesh_from_depth_maps`` fuses.
 
@@ -110,11 +106,7 @@ def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
 
 def pixel_m(maps: Sequence[DepthMap]) -> float:
     """Size of a pixel at the surface, meters, median over the maps. SurfaceError: no surface."""
-    spans = [
-        float(np.median(m.depth[m.seen])) / min(m.intrinsics.fx, m.intrinsics.fy)
-        for m in maps
-        if m.seen.any()
-    ]
+    spans = [float(np.median(m.depth[m.seen])) / min(m.intrinsics.fx, m.intrinsics.fy) for m in maps if m.seen.any()]
     if not spans:
         raise SurfaceError("no camera sees anything solid: fit the field longer")
     return float(np.median(spans))

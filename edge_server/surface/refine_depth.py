@@ -193,9 +193,7 @@ def _view(k: int, found: DepthMap, gray: NDArray[np.float32]) -> View:
     return View(k, rays, gray, np.full((*gray.shape, SOURCES), -1, np.int16))
 
 
-def _images(
-    maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], planes: Sequence[Planes]
-) -> Images:
+def _images(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], planes: Sequence[Planes]) -> Images:
     size = np.array([[m.intrinsics.width, m.intrinsics.height] for m in maps], np.int64).reshape(-1, 2)
     return Images(
         lens=np.array([lens_row(m.intrinsics) for m in maps], dtype=np.float64).reshape(-1, 8),
@@ -208,18 +206,18 @@ def _images(
     )
 
 
-def _offers(
-    images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool
-) -> list[Planes]:
+def _offers(images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool) -> list[Planes]:
     """For every map, planes of other maps to try, see ``Phase``."""
     none = [Planes(np.zeros_like(p.depth), p.normal, p.cost) for p in planes]
     sure = [(p.depth > 0) & (p.cost < OFFERED) for p in planes]
     if not which or not any(s.any() for s in sure):
         return none
-    points = np.concatenate([
-        (images.origin[v.index] + v.rays[s] * p.depth[s, None]).astype(np.float32)
-        for v, p, s in zip(views, planes, sure)
-    ])  # fmt: skip
+    points = np.concatenate(
+        [
+            (images.origin[v.index] + v.rays[s] * p.depth[s, None]).astype(np.float32)
+            for v, p, s in zip(views, planes, sure)
+        ]
+    )
     normals = np.concatenate([p.normal[s] for p, s in zip(planes, sure)])
     costs = np.concatenate([p.cost[s] for p, s in zip(planes, sure)])
     owners = np.repeat(np.arange(len(planes), dtype=np.int32), [int(s.sum()) for s in sure])

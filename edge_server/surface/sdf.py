@@ -128,12 +128,10 @@ def _optimize(
         optimiser = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
         for step in range(s.steps):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
-            drawn = torch.searchsorted(
-                chances, torch.rand(s.points, generator=generator, dtype=torch.float64)
-            ).clamp_(max=len(chances) - 1)
-            loss = _loss(
-                values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], s, generator
+            drawn = torch.searchsorted(chances, torch.rand(s.points, generator=generator, dtype=torch.float64)).clamp_(
+                max=len(chances) - 1
             )
+            loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], s, generator)
             optimiser.param_groups[0]["lr"] = s.rate * voxel * 0.1 ** (step / s.steps)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -167,9 +165,7 @@ def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
     )
     sides = torch.relu(0.5 * along[:, 0] - front).mean() + torch.relu(0.5 * along[:, 0] + back).mean()
     sides = sides + (torch.relu(0.5 * band - clear) * inside).mean()
-    domain = torch.cat([points, before, behind])[
-        torch.randperm(3 * len(points), generator=generator)[: len(points)]
-    ]
+    domain = torch.cat([points, before, behind])[torch.randperm(3 * len(points), generator=generator)[: len(points)]]
     steep = gradient_norm(values, domain, extent, voxel)
     eikonal = ((steep - 1.0) ** 2).mean()
     return on.abs().mean() / voxel + s.sides * sides / voxel + s.eikonal * eikonal
@@ -179,9 +175,7 @@ def sample_grid(values, points, extent):
     """Interpolate grid values (1, 1, X, Y, Z) at points (N, 3), meters from the grid's corner: (N,)."""
     from torch.nn.functional import grid_sample
 
-    where = (
-        (2.0 * points / extent - 1.0).flip(-1).view(1, -1, 1, 1, 3)
-    )  # grid_sample wants the last axis first
+    where = (2.0 * points / extent - 1.0).flip(-1).view(1, -1, 1, 1, 3)  # grid_sample wants the last axis first
     return grid_sample(values, where, mode="bilinear", padding_mode="border", align_corners=True).view(-1)
 
 

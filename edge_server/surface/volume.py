@@ -43,8 +43,7 @@ class Grid:
             raise SurfaceError(f"voxel size must be more than 0, not {1e3 * self.voxel_m:g} mm")
         if self.band_m < self.voxel_m:
             raise SurfaceError(
-                f"truncation must be at least one voxel ({1e3 * self.voxel_m:g} mm), "
-                f"not {1e3 * self.band_m:g} mm"
+                f"truncation must be at least one voxel ({1e3 * self.voxel_m:g} mm), not {1e3 * self.band_m:g} mm"
             )
         if not all(low < high for low, high in zip(self.lower, self.upper)):
             raise SurfaceError(f"bounds: each lower corner must be below its upper one: {self.describe()}")

@@ -74,9 +74,7 @@ class AgedView:
     young_ms: float
 
 
-def with_ages(
-    views: Sequence[View], earlier: Mapping[str, View], now_ns: int, young: float
-) -> list[AgedView]:
+def with_ages(views: Sequence[View], earlier: Mapping[str, View], now_ns: int, young: float) -> list[AgedView]:
     """The views in their order, with their ages at ``now_ns``. young: share of them, youngest first, that
     count as young."""
     ages_ms = [(now_ns - view.generated_ns) / 1e6 for view in views]

@@ -78,9 +78,7 @@ class FlowWarp:
         return dataclasses.replace(view, image=image, weight=weight, carried_to_ns=carried_to_ns)
 
 
-def warp_forward(
-    image: NDArray[np.uint8], motion: Motion, by_ms: float
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def warp_forward(image: NDArray[np.uint8], motion: Motion, by_ms: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Warp an image by ``by_ms`` of motion.
 
     image: uint8 (H, W, C).
@@ -114,9 +112,7 @@ def warp_forward(
     return shown, landed
 
 
-def _scatter_add(
-    at: NDArray[np.int64], values: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def _scatter_add(at: NDArray[np.int64], values: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """float64 (H, W): sums of the values (N,) at flat pixel indices (N,)."""
     sums: NDArray[np.float64] = np.asarray(np.bincount(at, values, shape[0] * shape[1]), np.float64)
     return sums.reshape(shape)

@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.treatments.change_detection import (
-    AgedView,
-    Changes,
-    blurred,
-    compare,
-    difference,
-    dilated,
-    with_ages,
-)
+from edge_server.treatments.change_detection import AgedView, Changes, blurred, compare, difference, dilated, with_ages
 
 _LEAST_GRADIENT = 0.02  # of the blurred image, per pixel: flatter pixels say nothing about speed
 _MAX_REACH = 0.25  # largest dilation, as a share of the image's longer side

@@ -71,10 +71,11 @@ def _flows(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[NDArray[np.float
     scale = min(_MAX_UPSAMPLING, max(1.0, _UPSAMPLED_PX / max(h, w)))
     size = (max(round(w * scale), 16), max(round(h * scale), 16))
     gray = [
-        cv2.resize(cv2.cvtColor(np.ascontiguousarray(x[..., :3]), cv2.COLOR_RGB2GRAY), size,
-                   interpolation=cv2.INTER_CUBIC)
+        cv2.resize(
+            cv2.cvtColor(np.ascontiguousarray(x[..., :3]), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_CUBIC
+        )
         for x in (a, b)
-    ]  # fmt: skip
+    ]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     # DIS searches one stripe a thread, and each stripe starts afresh: with one thread the result is the same
     # on every machine.

@@ -62,10 +62,14 @@ class Candidates:
 
 
 def half_hemisphere(
-    target: ArrayLike, radius_m: float, lens: Pinhole, count: int,
-    elevations_deg: tuple[float, float] = (12.0, 80.0), azimuths_deg: tuple[float, float] = (-90.0, 90.0),
+    target: ArrayLike,
+    radius_m: float,
+    lens: Pinhole,
+    count: int,
+    elevations_deg: tuple[float, float] = (12.0, 80.0),
+    azimuths_deg: tuple[float, float] = (-90.0, 90.0),
     offset: float = 0.5,
-) -> Candidates:  # fmt: skip
+) -> Candidates:
     """``count`` viewpoints that cover a sector of a sphere evenly and look at its centre.
 
     target: (3,) centre of the sphere, meters. lens: intrinsics of the camera.
@@ -84,17 +88,12 @@ def half_hemisphere(
     elevation = np.arcsin(low + (high - low) * (k + 0.5) / count)  # equal areas
     first, last = np.deg2rad(azimuths_deg)
     azimuth = first + (last - first) * ((offset + _GOLDEN * k) % 1.0)
-    away = np.stack(
-        [np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], -1
-    )
+    away = np.stack([np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], -1)
     return from_poses([look_at(target + radius_m * a, target) for a in away], lens, target)
 
 
 def from_poses(
-    poses: Sequence[ArrayLike],
-    lens: Pinhole,
-    target: ArrayLike | None = None,
-    bounds: ArrayLike | None = None,
+    poses: Sequence[ArrayLike], lens: Pinhole, target: ArrayLike | None = None, bounds: ArrayLike | None = None
 ) -> Candidates:
     """Candidates at any poses (4, 4), all reachable.
 

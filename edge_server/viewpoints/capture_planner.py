@@ -80,16 +80,27 @@ class Plan:
             for s in self.stops
         ]
         return {
-            "selector": self.selector, "views": len(self.stops), "path_m": self.path_m, "stops": stops,
-            "refused": list(self.refused), "candidates": len(candidates),
-            "unreachable": np.flatnonzero(~candidates.reachable).tolist(), "note": self.note,
-        }  # fmt: skip
+            "selector": self.selector,
+            "views": len(self.stops),
+            "path_m": self.path_m,
+            "stops": stops,
+            "refused": list(self.refused),
+            "candidates": len(candidates),
+            "unreachable": np.flatnonzero(~candidates.reachable).tolist(),
+            "note": self.note,
+        }
 
 
 def plan_capture(
-    candidates: Candidates, selector: Selector, budget: Budget, take: Take, *, seed: int = 0,
-    travel_weight: float = 0.0, fit: Callable[[list[View]], Field] | None = None,
-) -> Plan:  # fmt: skip
+    candidates: Candidates,
+    selector: Selector,
+    budget: Budget,
+    take: Take,
+    *,
+    seed: int = 0,
+    travel_weight: float = 0.0,
+    fit: Callable[[list[View]], Field] | None = None,
+) -> Plan:
     """Choose and take views one by one.
 
     take: takes the picture at a candidate; None: it was refused (the arm does not get there after all, the
@@ -163,8 +174,9 @@ def _choose(
     rank = int((values[state.open] > values[k]).sum()) + 1
     why = (
         f"all {int(state.open.sum())} are of equal value: the nearest"
-        if same else f"value {values[k]:.4g}, {rank}. of {int(state.open.sum())}; {travel[k]:.2f} m away"
-    )  # fmt: skip
+        if same
+        else f"value {values[k]:.4g}, {rank}. of {int(state.open.sum())}; {travel[k]:.2f} m away"
+    )
     shown = np.where(state.open, values, np.nan)
     return k, Stop(k, float(values[k]), float(travel[k]), 0.0, why, shown), same
 

@@ -17,8 +17,13 @@ Array = NDArray[np.float64]
 _WIDTHS_RAD = (0.25, 0.5, 1.0)
 GEOMETRY = (
     *(f"{n} within {w:g} rad" for w in _WIDTHS_RAD for n in ("first view", "second view")),
-    "way", "x", "y", "z", "x^2", "z^2",
-)  # fmt: skip
+    "way",
+    "x",
+    "y",
+    "z",
+    "x^2",
+    "z^2",
+)
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,20 @@ def information(
         raster.project_and_bin(cams, gaussians, [None] * len(cams))
         found = np.empty((len(cams), *gaussians.params.shape), np.float32)
         snapshot.pool.run(
-            fisher_information, cams, gaussians, raster.columns, raster.rows, raster.projected, raster.lists,
-            raster.sums, snapshot.background, raster.memory, raster.saved, moments, found,
-        )  # fmt: skip
+            fisher_information,
+            cams,
+            gaussians,
+            raster.columns,
+            raster.rows,
+            raster.projected,
+            raster.lists,
+            raster.sums,
+            snapshot.background,
+            raster.memory,
+            raster.saved,
+            moments,
+            found,
+        )
         yield from found
 
 
@@ -62,9 +73,7 @@ class FisherRF:
             raise ViewpointError("fisher: it needs a field of Gaussians: splat")
         poses, lens = state.candidates.poses, state.candidates.lens
         known = np.zeros(snapshot.gaussians.params.shape)
-        for row in information(
-            snapshot, [v.camera_to_world for v in state.views], [v.intrinsics for v in state.views]
-        ):
+        for row in information(snapshot, [v.camera_to_world for v in state.views], [v.intrinsics for v in state.views]):
             known += row
         known += PRIOR * np.maximum(known.mean(axis=0), 1e-12)
         scale = (1.0 / known).astype(np.float32)

@@ -87,9 +87,7 @@ class Rows:
         return self.layout.features(State(ages, self._poses, both.astype(np.float32), candidates.reachable))
 
 
-def layout_of(
-    steps: StepFeatures, embeddings: Array | None, views: int, rng: np.random.Generator
-) -> StateLayout:
+def layout_of(steps: StepFeatures, embeddings: Array | None, views: int, rng: np.random.Generator) -> StateLayout:
     """The layout with step features standardized over random captures of up to ``views`` views, and with
     ``embeddings`` (N, d) standardized over all candidates; None: without embeddings."""
     reachable = np.flatnonzero(steps.candidates.reachable)
@@ -147,9 +145,13 @@ class CandidatePolicy:
 
 
 def train_policy(
-    candidates: Candidates, reward: Callable[[Array], Array], config: PolicyConfig, seed: int = 0,
-    embeddings: Array | None = None, embed: Embed | None = None,
-) -> tuple[CandidatePolicy, list[float]]:  # fmt: skip
+    candidates: Candidates,
+    reward: Callable[[Array], Array],
+    config: PolicyConfig,
+    seed: int = 0,
+    embeddings: Array | None = None,
+    embed: Embed | None = None,
+) -> tuple[CandidatePolicy, list[float]]:
     """Train a policy. Returns it with the mean return of each update (figure 4.6).
 
     reward: maps step features (..., GEOMETRY) to rewards (...), such as ``RewardModel.reward``.
@@ -191,9 +193,15 @@ def train_policy(
 
 
 def _episodes(
-    rows: Rows, reward: Callable[[Array], Array], scale: float, config: PolicyConfig,
-    actor: dict[str, Any], critic: dict[str, Any], spec: Spec, rng: np.random.Generator,
-) -> dict[str, Any]:  # fmt: skip
+    rows: Rows,
+    reward: Callable[[Array], Array],
+    scale: float,
+    config: PolicyConfig,
+    actor: dict[str, Any],
+    critic: dict[str, Any],
+    spec: Spec,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
     """Episodes side by side: features, open candidates, actions, log-probabilities, returns and values of all
     steps but the first, whose view is drawn."""
     count, way = config.episodes, GEOMETRY.index("way")
@@ -219,16 +227,26 @@ def _episodes(
     for t in reversed(range(len(gained))):
         total = returns[t] = gained[t] + config.gamma * total
     return {
-        "features": features.reshape(-1, *features.shape[2:]), "closed": closed.reshape(-1, closed.shape[-1]),
-        "chosen": chosen.ravel(), "logps": logps.ravel(), "returns": returns.ravel(),
-        "values": values.ravel(), "mean": float(gained.sum(axis=0).mean()),
-    }  # fmt: skip
+        "features": features.reshape(-1, *features.shape[2:]),
+        "closed": closed.reshape(-1, closed.shape[-1]),
+        "chosen": chosen.ravel(),
+        "logps": logps.ravel(),
+        "returns": returns.ravel(),
+        "values": values.ravel(),
+        "mean": float(gained.sum(axis=0).mean()),
+    }
 
 
 def _improve(
-    batch: dict[str, Any], actor: dict[str, Any], critic: dict[str, Any], parameters: list[Any], adam: Any,
-    spec: Spec, config: PolicyConfig, rng: np.random.Generator,
-) -> None:  # fmt: skip
+    batch: dict[str, Any],
+    actor: dict[str, Any],
+    critic: dict[str, Any],
+    parameters: list[Any],
+    adam: Any,
+    spec: Spec,
+    config: PolicyConfig,
+    rng: np.random.Generator,
+) -> None:
     """Passes of PPO's clipped objective over a batch."""
     import torch
 

@@ -89,9 +89,7 @@ class RewardModel:
         mean, entropy = _expected(*self._difference(features, first, second))
         return _entropy(mean) - entropy
 
-    def _difference(
-        self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]
-    ) -> tuple[Array, Array]:
+    def _difference(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Array, Array]:
         """Mean and variance (M,) of the differences of rewards."""
         x = (features[first] - features[second]) / self.scale
         return x @ self.mean, np.einsum("md,de,me->m", x, self.covariance, x)
@@ -125,9 +123,7 @@ def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
     return RewardModel(scale, mean, covariance, float(np.exp(min(log_odds, 700.0))), len(answers))
 
 
-def next_pair(
-    model: RewardModel, features: Array, rng: np.random.Generator, pairs: int = 500
-) -> tuple[int, int]:
+def next_pair(model: RewardModel, features: Array, rng: np.random.Generator, pairs: int = 500) -> tuple[int, int]:
     """The most informative of ``pairs`` random pairs of trajectories. Every ``_UNBIASED``-th question takes a
     random pair instead: on doubtful pairs alone, honest answers look like contradictions."""
     first = rng.integers(len(features), size=1 if model.answers % _UNBIASED == 0 else pairs)

@@ -102,9 +102,7 @@ class PreferenceSession:
     def model(self) -> RewardModel:
         """The reward model of the answers. "neither" is half a vote for each side: y = 1/2 in (4.13)."""
         prefers_first = {"left": True, "right": False, "neither": None}
-        return fit_reward(
-            self.features, [Answer(a.left, a.right, prefers_first[a.choice]) for a in self.answers]
-        )
+        return fit_reward(self.features, [Answer(a.left, a.right, prefers_first[a.choice]) for a in self.answers])
 
     @cached_property
     def question(self) -> Question | None:
@@ -162,9 +160,7 @@ class PreferenceSession:
             if not (0 <= a.left < len(self.orders) and 0 <= a.right < len(self.orders)) or a.left == a.right:
                 raise ViewpointError(f"answer {n}: {a.left} and {a.right} are no pair of reconstructions")
             if a.by != self.by:
-                raise ViewpointError(
-                    f"answer {n} is by {a.by:.80}, the others by {self.by}: they are not mixed"
-                )
+                raise ViewpointError(f"answer {n} is by {a.by:.80}, the others by {self.by}: they are not mixed")
             if a.repeats is not None:
                 earlier = file.answers[a.repeats] if 0 <= a.repeats < n else None
                 if earlier is None or (earlier.left, earlier.right) != (a.right, a.left):

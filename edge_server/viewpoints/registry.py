@@ -18,17 +18,9 @@ SELECTORS: dict[str, tuple[str, str, str]] = {
     "random": ("geometric", "RandomOrder", "any candidate, uniformly at random"),
     "uniform": ("geometric", "UniformSpacing", "an evenly spaced set, as large as the budget"),
     "farthest": ("geometric", "FarthestPoint", "the candidate farthest from all earlier views"),
-    "coverage": (
-        "geometric",
-        "Coverage",
-        "sees most of the object's box that is still unseen; needs no images",
-    ),
+    "coverage": ("geometric", "Coverage", "sees most of the object's box that is still unseen; needs no images"),
     "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far (FisherRF)"),
-    "ppo": (
-        "policy",
-        "CandidatePolicy",
-        "ppo:FILE: a policy learned from preferences (--ask, study preferences)",
-    ),
+    "ppo": ("policy", "CandidatePolicy", "ppo:FILE: a policy learned from preferences (--ask, study preferences)"),
 }
 
 

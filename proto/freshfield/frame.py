@@ -101,11 +101,31 @@ def checksum(header: pb.FrameHeader, data: bytes) -> int:
     header because a flipped bit must not become a wrong pose."""
     p, k = header.pose, header.intrinsics
     packed = _PACKED.pack(
-        header.sequence, header.generated_ns, header.clock_offset_ns, header.clock_uncertainty_ns,
-        header.pose_gap_ns, header.codec & _UINT32, header.width, header.height, header.role & _UINT32,
-        p.qw, p.qx, p.qy, p.qz, p.tx_m, p.ty_m, p.tz_m,
-        k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2,
-    )  # fmt: skip
+        header.sequence,
+        header.generated_ns,
+        header.clock_offset_ns,
+        header.clock_uncertainty_ns,
+        header.pose_gap_ns,
+        header.codec & _UINT32,
+        header.width,
+        header.height,
+        header.role & _UINT32,
+        p.qw,
+        p.qx,
+        p.qy,
+        p.qz,
+        p.tx_m,
+        p.ty_m,
+        p.tz_m,
+        k.fx,
+        k.fy,
+        k.cx,
+        k.cy,
+        k.k1,
+        k.k2,
+        k.p1,
+        k.p2,
+    )
     crc = google_crc32c.value(header.camera_id.encode() + b"\0" + header.session_id.encode() + packed)
     return google_crc32c.extend(crc, data)
 
@@ -123,14 +143,20 @@ def to_request(frame: Frame) -> pb.PushRequest:
         pose=pb.Pose(qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=t[0], ty_m=t[1], tz_m=t[2]),
         pose_gap_ns=frame.pose_gap_ns,
         intrinsics=pb.Intrinsics(
-            fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy,
-            k1=k.distortion[0], k2=k.distortion[1], p1=k.distortion[2], p2=k.distortion[3],
+            fx=k.fx,
+            fy=k.fy,
+            cx=k.cx,
+            cy=k.cy,
+            k1=k.distortion[0],
+            k2=k.distortion[1],
+            p1=k.distortion[2],
+            p2=k.distortion[3],
         ),
         codec=_CODECS[frame.codec],
         width=k.width,
         height=k.height,
         role=pb.ROLE_HELD_OUT if frame.held_out else pb.ROLE_TRAIN,
-    )  # fmt: skip
+    )
     return pb.PushRequest(header=header, payload=frame.payload, crc32c=checksum(header, frame.payload))
 
 
@@ -209,16 +235,9 @@ def _intrinsics(h: pb.FrameHeader) -> Pinhole:
     if not all(math.isfinite(v) for v in values):
         raise FrameRejected("bad_intrinsics", "intrinsics are not finite")
     if not (0 < h.width <= limits.MAX_IMAGE_SIDE_PX and 0 < h.height <= limits.MAX_IMAGE_SIDE_PX):
-        raise FrameRejected(
-            "too_large", f"{h.width} x {h.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}"
-        )
-    if (
-        min(k.fx, k.fy) < max(h.width, h.height) * limits.MIN_FOCAL_PER_SIDE
-        or max(k.fx, k.fy) > limits.MAX_FOCAL_PX
-    ):
-        raise FrameRejected(
-            "bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size"
-        )
+        raise FrameRejected("too_large", f"{h.width} x {h.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}")
+    if min(k.fx, k.fy) < max(h.width, h.height) * limits.MIN_FOCAL_PER_SIDE or max(k.fx, k.fy) > limits.MAX_FOCAL_PX:
+        raise FrameRejected("bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size")
     if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > limits.MAX_DISTORTION:
         raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
     sides = limits.MAX_CENTER_OUTSIDE_SIDES

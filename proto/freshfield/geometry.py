@@ -317,9 +317,7 @@ def invertible(camera: Pinhole) -> bool:
     coefficients that no real lens has."""
     if not camera.distorted:
         return True
-    u, v = np.meshgrid(
-        np.linspace(0.0, camera.width, _RASTER_POINTS), np.linspace(0.0, camera.height, _RASTER_POINTS)
-    )
+    u, v = np.meshgrid(np.linspace(0.0, camera.width, _RASTER_POINTS), np.linspace(0.0, camera.height, _RASTER_POINTS))
     points = np.stack([u.ravel(), v.ravel()], axis=-1)
     with np.errstate(all="ignore"):
         rays = camera.rays(points)

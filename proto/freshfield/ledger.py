@@ -82,9 +82,7 @@ class Ledger:
         """Number of lines that could not be written so far."""
         return self._lines.lost
 
-    def write(
-        self, t_ns: int, camera: str, session: str, sequence: int, event: str, detail: str = ""
-    ) -> None:
+    def write(self, t_ns: int, camera: str, session: str, sequence: int, event: str, detail: str = "") -> None:
         written = self._lines.write(f"{t_ns}\t{camera}\t{session}\t{sequence}\t{event}\t{detail}")
         if written and self._lines.lost > self._lost_reported:
             self._report_lost(t_ns)
@@ -119,11 +117,7 @@ class LedgerReader:
             head = file.readline(_HEAD_BYTES)
             self._body = file.tell()
         fields = head.decode(errors="replace").rstrip("\n").split(" ")
-        if (
-            len(fields) != 5
-            or fields[:2] != ["#freshfield-ledger", str(VERSION)]
-            or not fields[4].isdecimal()
-        ):
+        if len(fields) != 5 or fields[:2] != ["#freshfield-ledger", str(VERSION)] or not fields[4].isdecimal():
             raise ValueError(f"{path}: not a freshfield ledger of version {VERSION}")
         self.role, self.name, self.pid = fields[2], fields[3], int(fields[4])
 

@@ -10,13 +10,7 @@ from __future__ import annotations
 import os
 import struct
 
-from freshfield.limits import (
-    MAX_IMAGE_SIDE_PX,
-    MAX_JPEG_SCANS,
-    MAX_JPEG_SEGMENTS,
-    MAX_PAYLOAD_BYTES,
-    MAX_PNG_CHUNKS,
-)
+from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES, MAX_PNG_CHUNKS
 
 # OpenCV reads this when it is first imported: a second barrier behind the header checks below.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
@@ -28,9 +22,7 @@ from numpy.typing import NDArray
 
 CODECS = ("jpeg", "png", "zstd")
 # Indexed by the number of halvings.
-_JPEG_FLAGS = (
-    cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8
-)  # fmt: skip
+_JPEG_FLAGS = (cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8)
 
 
 class PayloadError(ValueError):
@@ -52,15 +44,11 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise PayloadError("bad_image", f"expected uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")
     if max(image.shape[:2]) > MAX_IMAGE_SIDE_PX or min(image.shape[:2]) < 1:
-        raise PayloadError(
-            "too_large", f"{image.shape[1]} x {image.shape[0]} exceeds {MAX_IMAGE_SIDE_PX} a side"
-        )
+        raise PayloadError("too_large", f"{image.shape[1]} x {image.shape[0]} exceeds {MAX_IMAGE_SIDE_PX} a side")
     if codec == "zstd":
         return zstandard.ZstdCompressor(level=1).compress(np.ascontiguousarray(image[..., :3]).tobytes())
     if codec == "jpeg":
-        sampling = (
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if quality >= 90 else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
-        )
+        sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if quality >= 90 else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
         flags = [cv2.IMWRITE_JPEG_QUALITY, int(quality), cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
         ok, data = cv2.imencode(".jpg", cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2BGR), flags)
     elif codec == "png":
@@ -145,9 +133,7 @@ def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
     for _ in range(halvings):
         bottom, right = image.shape[0] % 2, image.shape[1] % 2
         even = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        image = np.asarray(
-            cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
-        )
+        image = np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
     return image
 
 

@@ -247,9 +247,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         if not isinstance(value, dict):
             raise ScenarioError(f"{where}: expected a mapping, got {value!r}")
         args = typing.get_args(hint)
-        return (
-            {str(k): _convert(v, args[1], f"{where}.{k}") for k, v in value.items()} if args else dict(value)
-        )
+        return {str(k): _convert(v, args[1], f"{where}.{k}") for k, v in value.items()} if args else dict(value)
     if dataclasses.is_dataclass(hint):
         return read_section(typing.cast(type, hint), value, where)
     if hint is float:

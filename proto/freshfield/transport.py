@@ -144,9 +144,7 @@ class Transport:
         try:
             return Access(self.tokens, certificates=self.ca is not None)
         except ValueError as error:
-            raise TransportError(
-                f"--token-file of a process that listens: a line is NAME TOKEN: {error}"
-            ) from None
+            raise TransportError(f"--token-file of a process that listens: a line is NAME TOKEN: {error}") from None
 
     def guard(self, host: str, what: str, http: bool = False) -> str:
         """Check that listening on ``host`` is secure: loopback, or encrypted and authenticated.
@@ -232,9 +230,7 @@ class Transport:
         if self.ca is not None:
             return grpc.ssl_channel_credentials(_pem(self.ca), _pem(self.key), _pem(self.cert))
         if self.tokens and not self.insecure and not is_loopback(target.rpartition(":")[0]):
-            raise TransportError(
-                f"the token would go to {target} in plain text: give --tls-ca, or say --insecure"
-            )
+            raise TransportError(f"the token would go to {target} in plain text: give --tls-ca, or say --insecure")
         return None
 
     def _server_credentials(self) -> grpc.ServerCredentials:
@@ -251,19 +247,25 @@ def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None
     group.add_argument("--tls-cert", type=Path, metavar="PEM", help="certificate of this process")
     group.add_argument("--tls-key", type=Path, metavar="PEM", help="private key of this process")
     group.add_argument(
-        "--tls-ca", type=Path, metavar="PEM",
+        "--tls-ca",
+        type=Path,
+        metavar="PEM",
         help="trusted CA certificate: a client then uses TLS, a server demands client certificates",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--token-file", type=Path, metavar="FILE",
+        "--token-file",
+        type=Path,
+        metavar="FILE",
         help="file of lines NAME TOKEN; NAME: operator, viewer, camera:ID[,ID] or camera:*. A client sends "
         "the first token (NAME may be left out), a server accepts all",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--insecure", action="store_true",
-        help="listen beyond this machine without TLS or without authentication" if listens
+        "--insecure",
+        action="store_true",
+        help="listen beyond this machine without TLS or without authentication"
+        if listens
         else "send the token to another machine without TLS",
-    )  # fmt: skip
+    )
 
 
 def from_arguments(args: argparse.Namespace) -> Transport:
@@ -297,9 +299,7 @@ def _tokens(path: Path) -> dict[str, str]:
         or len(set(tokens.values())) < len(tokens)
         or ("" in tokens and len(lines) > 1)
     ):
-        raise TransportError(
-            f"{path}: expected lines NAME TOKEN, names and tokens all different, or one token alone"
-        )
+        raise TransportError(f"{path}: expected lines NAME TOKEN, names and tokens all different, or one token alone")
     return tokens
 
 

@@ -30,9 +30,7 @@ def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
 @pytest.mark.parametrize(("megabytes", "all_cached"), [(1.0, True), (0.004, False), (0.0, False)])
 def test_preparing_fills_what_fits(tmp_path, megabytes, all_cached):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3)
-    cameras = build_cameras(
-        scenario, source_config(scenario), scenario.cameras, cache_bytes=int(megabytes * 2**20)
-    )
+    cameras = build_cameras(scenario, source_config(scenario), scenario.cameras, cache_bytes=int(megabytes * 2**20))
     prepare(cameras, lambda: False)
     for camera in cameras[1:]:
         assert all(camera.cached(k) is not None for k in range(40)) == all_cached
@@ -72,8 +70,11 @@ def test_an_outbox_that_closes_says_what_still_waits(tmp_path):
     asyncio.run(scene())
     (file,) = ledger.read_all(tmp_path)
     assert [(e.camera, e.sequence, e.event) for e in file.events] == [
-        ("a", 7, "captured"), ("a", 7, "waiting"), ("b", 7, "captured"), ("b", 7, "sent"),
-    ]  # fmt: skip
+        ("a", 7, "captured"),
+        ("a", 7, "waiting"),
+        ("b", 7, "captured"),
+        ("b", 7, "sent"),
+    ]
 
 
 def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):

@@ -18,18 +18,20 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     to = ("--to", "127.0.0.1:1")
     assert "shipped scenarios: " in fails(capsys, "run", "nope", "--all", *to)
-    assert "has no camera cam77; it has cam00, " in fails(
-        capsys, "run", "room", "--camera", "cam01,cam77", *to
-    )
+    assert "has no camera cam77; it has cam00, " in fails(capsys, "run", "room", "--camera", "cam01,cam77", *to)
     assert "FRESHFIELD_DATA" in fails(capsys, "run", "fox", "--all", *to)
     assert "does not exist" in fails(capsys, "run", "fox", "--all", "--data", str(tmp_path), *to)
     assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", "host")
     for wrong in ("host:0", "host:99999", "::1", "http://host:80"):
         assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", wrong)
     for option, wrong in (
-        ("--seconds", "-1"), ("--seconds", "nan"), ("--response-timeout", "nan"), ("--cache-mb", "-1"),
-        ("--cache-mb", "nan"), ("--cache-mb", "inf"),
-    ):  # fmt: skip
+        ("--seconds", "-1"),
+        ("--seconds", "nan"),
+        ("--response-timeout", "nan"),
+        ("--cache-mb", "-1"),
+        ("--cache-mb", "nan"),
+        ("--cache-mb", "inf"),
+    ):
         assert f"{option}: expected" in fails(capsys, "run", "room", "--all", option, wrong, *to)
     assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
     assert "seed" in fails(capsys, "run", "room", "--all", "--seed", "-4", *to)
@@ -44,14 +46,10 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
 def test_lists_say_what_there_is(capsys):
     assert main(["sources"]) == 0
     said = capsys.readouterr().out
-    assert all(
-        word in said for word in ("kind: world", "kind: transforms", "kind: video", "background", "fps")
-    )
+    assert all(word in said for word in ("kind: world", "kind: transforms", "kind: video", "background", "fps"))
     assert main(["effects"]) == 0
     said = capsys.readouterr().out
-    assert all(
-        word in said for word in ("sensor_noise", "motion_blur", "occluder", "clock_drift", "offset_ms")
-    )
+    assert all(word in said for word in ("sensor_noise", "motion_blur", "occluder", "clock_drift", "offset_ms"))
 
 
 def test_help_teaches_with_examples(capsys):

@@ -17,9 +17,7 @@ def config(**source):
 
 
 def test_what_is_given_reaches_the_scene():
-    world = config(
-        kind="world", scene="tile", width=64, params={"supersample": 1}, effects={"sensor_noise": None}
-    )
+    world = config(kind="world", scene="tile", width=64, params={"supersample": 1}, effects={"sensor_noise": None})
     assert isinstance(world, WorldConfig) and world.codec == "jpeg" and world.fps is None
     assert world.scene_parameters() == {"width": 64, "supersample": 1}
     assert world.effects == {"sensor_noise": None}
@@ -56,9 +54,7 @@ def test_errors_name_file_and_key(source, message):
     assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "compose"]
-)
+@pytest.mark.parametrize("name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "compose"])
 def test_shipped_scenarios_have_a_valid_source(name):
     source_config(load(name))
 

@@ -113,9 +113,7 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     _, parts = examined(capsys, file)
     camera.close()
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
-    assert parts["camera eye"][1].endswith(
-        "stamped by their arrival, less latency_ms; its lens as calibrated"
-    )
+    assert parts["camera eye"][1].endswith("stamped by their arrival, less latency_ms; its lens as calibrated")
     assert parts["calibration"] == (True, "calibration.json: 1 cameras")
     assert "network" in parts
     (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))

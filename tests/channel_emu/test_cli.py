@@ -37,27 +37,59 @@ def simulate(capsys, *words: str) -> dict:
 
 def test_simulate_takes_short_spellings(capsys) -> None:
     found = simulate(
-        capsys, "--arrivals", "periodic:30ms", "--service-by-state", "exp:30ms,exp:60ms", "--chain",
-        "mu1=1/30,mu2=1/30", "--service-state", "modulated", "--discipline", "drop-new", "--cameras", "3",
-        "--seconds", "120", "--seed", "4",
-    )  # fmt: skip
+        capsys,
+        "--arrivals",
+        "periodic:30ms",
+        "--service-by-state",
+        "exp:30ms,exp:60ms",
+        "--chain",
+        "mu1=1/30,mu2=1/30",
+        "--service-state",
+        "modulated",
+        "--discipline",
+        "drop-new",
+        "--cameras",
+        "3",
+        "--seconds",
+        "120",
+        "--seed",
+        "4",
+    )
     assert found["mean_age_ms"] == pytest.approx(84, abs=4)
     assert set(found) >= {"mean_age_ms", "mean_age_slotted_ms", "peak_age_ms"}
     assert found["offered"] == found["delivered"] + found["dropped"] + found["in_flight"]
     assert set(found["delay_ms"]) == {"mean", "p50", "p95"}
     assert sum(found["state_share"].values()) == pytest.approx(1)
     again = simulate(
-        capsys, "--preset", "ch6", "--arrivals", "periodic:30", "--service-state", "modulated",
-        "--discipline", "drop-new", "--cameras", "3", "--seconds", "120", "--seed", "4",
-    )  # fmt: skip
+        capsys,
+        "--preset",
+        "ch6",
+        "--arrivals",
+        "periodic:30",
+        "--service-state",
+        "modulated",
+        "--discipline",
+        "drop-new",
+        "--cameras",
+        "3",
+        "--seconds",
+        "120",
+        "--seed",
+        "4",
+    )
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel, spelled otherwise
 
 
 def test_a_chain_of_any_number_of_states(capsys) -> None:
     found = simulate(
-        capsys, "--service-by-state", "exp:5ms,exp:20ms,exp:80ms", "--seconds", "3000", "--chain",
+        capsys,
+        "--service-by-state",
+        "exp:5ms,exp:20ms,exp:80ms",
+        "--seconds",
+        "3000",
+        "--chain",
         "{generator_per_ms: [[-0.3, 0.2, 0.1], [0.05, -0.05, 0], [0.4, 0.4, -0.8]], initial: s2}",
-    )  # fmt: skip
+    )
     shares = [0.05 * 0.8, 0.3 * 0.8 - 0.1 * 0.4, 0.1 * 0.05]  # of the balance equations, by hand
     expected = [share / sum(shares) for share in shares]
     assert list(found["state_share"].values()) == pytest.approx(expected, abs=0.01)
@@ -84,10 +116,24 @@ def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
 def test_frames_metrics_and_a_picture_of_a_simulation(capsys, tmp_path: Path) -> None:
     frames, drawn = tmp_path / "new" / "frames.csv", tmp_path / "ages.png"
     found = simulate(
-        capsys, "--preset", "ch5", "--fault", "loss:0.1", "--fault", "duplication:{probability: 0.5}",
-        "--csv", str(frames), "--plot", str(drawn), "--metric", "peak", "--metric", "shown:9ms:1ms",
-        "--seconds", "60",
-    )  # fmt: skip
+        capsys,
+        "--preset",
+        "ch5",
+        "--fault",
+        "loss:0.1",
+        "--fault",
+        "duplication:{probability: 0.5}",
+        "--csv",
+        str(frames),
+        "--plot",
+        str(drawn),
+        "--metric",
+        "peak",
+        "--metric",
+        "shown:9ms:1ms",
+        "--seconds",
+        "60",
+    )
     assert found["lost"] > 0 and found["duplicated"] > 0
     assert found["metrics_ms"]["peak"] == found["peak_age_ms"]
     assert found["metrics_ms"]["shown:9ms:1ms"] == pytest.approx(found["mean_age_ms"] + 9.5, abs=0.5)
@@ -104,21 +150,27 @@ def test_frames_metrics_and_a_picture_of_a_simulation(capsys, tmp_path: Path) ->
 
 def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("# ms\n10\n20\n\n60\n")
-    found = simulate(capsys, "--service", f"trace:{tmp_path / 'delays.txt'}", "--seconds", "30",
-                     "--discipline", "parallel", "--arrivals", "periodic:100ms")  # fmt: skip
+    found = simulate(
+        capsys,
+        "--service",
+        f"trace:{tmp_path / 'delays.txt'}",
+        "--seconds",
+        "30",
+        "--discipline",
+        "parallel",
+        "--arrivals",
+        "periodic:100ms",
+    )
     assert found["delay_ms"]["mean"] == pytest.approx(30)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)]
-)
+@pytest.mark.parametrize(("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)])
 def test_spans(text: str, value: float) -> None:
     assert spelling.span_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
-    ("text", "value"),
-    [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)],
+    ("text", "value"), [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)]
 )
 def test_rates(text: str, value: float) -> None:
     assert spelling.rate_per_ms(text) == pytest.approx(value)
@@ -177,18 +229,13 @@ def test_a_peer_without_a_port_is_refused(capsys, command: list[str]) -> None:
     ("words", "why"),
     [(["--service", "trace:{}"], "one delay in ms a line"), (["--preset", "errant:{}:a/b/c/d"], "of ERRANT")],
 )
-def test_a_table_with_an_endless_field_is_one_line(
-    capsys, tmp_path: Path, words: list[str], why: str
-) -> None:
+def test_a_table_with_an_endless_field_is_one_line(capsys, tmp_path: Path, words: list[str], why: str) -> None:
     (tmp_path / "a.csv").write_text(f'delay_ms\n"{"5" * 140_000}"\n')
     test_mistakes_get_one_line(capsys, [word.format(tmp_path / "a.csv") for word in words], why)
 
 
 def test_a_slot_longer_than_the_run_has_no_boundary(capsys) -> None:
-    assert (
-        simulate(capsys, "--preset", "ch5", "--seconds", "1", "--slot-ms", "1e300")["mean_age_slotted_ms"]
-        is None
-    )
+    assert simulate(capsys, "--preset", "ch5", "--seconds", "1", "--slot-ms", "1e300")["mean_age_slotted_ms"] is None
 
 
 def test_replay_says_whether_decisions_agree(capsys, tmp_path: Path) -> None:
@@ -235,8 +282,18 @@ def test_a_killed_emulator_leaves_readable_books(scenario: Path, tmp_path: Path)
 
     async def live() -> None:
         edge = await Peer().start()
-        words = ["-m", "channel_emu.cli", "run", str(scenario), "--listen", f"127.0.0.1:{port}", "--to",
-                 edge.address, "--out", str(out)]  # fmt: skip
+        words = [
+            "-m",
+            "channel_emu.cli",
+            "run",
+            str(scenario),
+            "--listen",
+            f"127.0.0.1:{port}",
+            "--to",
+            edge.address,
+            "--out",
+            str(out),
+        ]
         process = await asyncio.create_subprocess_exec(sys.executable, *words, stderr=subprocess.DEVNULL)
         books = ledger.Ledger(out, "node", "n", 1)
         camera = Camera("cam00", port, Transport(), False, books)

@@ -19,8 +19,7 @@ from channel_emu.virtual.replay import compare
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
 
-HELLO, COUNT, COLLECT, ECHO, FAIL = (f"/greet.Greeter/{name}" for name in
-                                     ("Hello", "Count", "Collect", "Echo", "Fail"))  # fmt: skip
+HELLO, COUNT, COLLECT, ECHO, FAIL = (f"/greet.Greeter/{name}" for name in ("Hello", "Count", "Collect", "Echo", "Fail"))
 LOSSY = {"faults": {"loss": {"probability": 0.5}}}
 WAIT = {"service": {"law": "deterministic", "mean_ms": 40.0}}
 
@@ -40,9 +39,7 @@ class Greeter:
             "Echo": grpc.stream_stream_rpc_method_handler(self.echo),
             "Fail": grpc.unary_unary_rpc_method_handler(self.fail),
         }
-        self._server.add_generic_rpc_handlers(
-            (grpc.method_handlers_generic_handler("greet.Greeter", handlers),)
-        )
+        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("greet.Greeter", handlers),))
         self.address = f"127.0.0.1:{self._server.add_insecure_port('127.0.0.1:0')}"
         self._server.start()
 
@@ -208,8 +205,11 @@ def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client) ->
 
 
 def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, client) -> None:
-    link = channel({"service": {"law": "deterministic", "mean_ms": 5.0}, "discipline": "fcfs"},
-                   to=greeter.address, direction="down")  # fmt: skip
+    link = channel(
+        {"service": {"law": "deterministic", "mean_ms": 5.0}, "discipline": "fcfs"},
+        to=greeter.address,
+        direction="down",
+    )
     call = client(link).unary_stream(COUNT)(b"1000", timeout=30)
     assert [int(word) for word in itertools.islice(call, 3)] == [0, 1, 2]
     call.cancel()

@@ -134,8 +134,7 @@ def opened(at: str, method: str, count: int, most: int, *first: bytes) -> Run:
         async with Transport().aio_channel(to[at]) as channel:
             begun_s, took_ms = time.monotonic(), []
             calls: list[Any] = [
-                channel.unary_stream(method)(*first) if first else channel.stream_stream(method)()
-                for _ in range(count)
+                channel.unary_stream(method)(*first) if first else channel.stream_stream(method)() for _ in range(count)
             ]
             reading = [asyncio.create_task(read_to_the_end(call)) for call in calls]
             while time.monotonic() < begun_s + SECONDS:
@@ -267,67 +266,147 @@ _ONNX = "tests/edge_server/foreground/test_foreground.py::test_a_model_that_"
 # What is sent, to whom (file: to its reader), what sends it, and the test that holds it.
 ATTACKS: tuple[tuple[str, str, Run, str], ...] = (
     ("nothing", "edge", nothing, ""),
-    ("`annots.npy` with a crafted pickle", "file", read(crafted_pickle),
-           f"{_FORMATS}formats.py::test_a_crafted_pickle_is_refused"),
-    ("progressive JPEG of 40,000 scans", "edge",
-           pushed("edge", lambda: jpeg(PROGRESSIVE[:-2] + 40_000 * SCAN + PROGRESSIVE[-2:])),
-           f"{_OURS}payload.py::test_hostile_headers_are_refused_by_check_alone"),
-    ("JPEG with 8 MB of fill bytes", "edge",
-           pushed("edge", lambda: jpeg(JPEG[:2] + b"\xff" * (MAX_PAYLOAD_BYTES - len(JPEG)) + JPEG[2:])),
-           f"{_OURS}payload.py::test_eight_megabytes_that_keep_a_reader_busy"),
-    ("four million unknown protobuf fields", "emulator",
-           pushed("emulator", lambda: good(camera=MINE["emulator"]) + b"\x78\0" * (4 * 2**20 - 1000)),
-           f"{_OURS}frame.py::test_four_million_fields_are_read_at_once"),
-    ("`SetPolicy` with a name of 8 MB", "edge",
-           called("SetPolicy", edge_pb2.SetPolicyRequest(name="n" * 8_000_000)),
-           f"{_SERVER}a_name_of_eight_megabytes_is_no_policy"),
-    ("field number 0 under `corruption`", "emulator",
-           pushed("emulator", lambda: good(camera=MINE["emulator"]) + b"\0\0"),
-           f"{_EMULATOR}a_message_that_cannot_be_damaged_does_not_end_the_emulator"),
-    ("checkpoint that unpacks to 1 GB", "file", read(zip_bomb),
-           "tests/edge_server/export/test_command.py::"
-           "test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked"),
-    ("MCAP chunk that unpacks to 256 MB", "file", read(chunk_bomb),
-           f"{_OURS}session.py::test_a_chunk_bomb_is_left_out_and_said"),
-    ("YAML alias bomb", "file", read(yaml(LISTS)),
-           f"{_OURS}untrusted.py::test_an_alias_bomb_is_refused_at_once"),
-    ("YAML nested 20,000 deep", "file", read(yaml("a: " + "[a,\n" * 20_000)),
-           f"{_OURS}untrusted.py::test_nesting_costs_no_more_than_its_bound"),
-    ("ONNX that loops 2^62 times", "file", read(onnx(save_endless_loop)),
-           f"{_ONNX}loops_for_ever_is_refused"),
-    ("ONNX tensor of 400 TB", "file", read(onnx(lambda file: save_memory_bomb(file, "Expand"))),
-           f"{_ONNX}takes_terabytes_is_refused"),
-    ("`transforms` with `../`", "file", read(outside("../outside")),
-           f"{_FORMATS}transforms.py::test_images_outside_the_data_set_are_not_read"),
-    ("`transforms` with an absolute path", "file", read(outside("/etc/hostname")),
-           f"{_FORMATS}transforms.py::test_images_outside_the_data_set_are_not_read"),
-    ("30 silent streams", "edge", opened("edge", PUSH, 30, MOST_STREAMS),
-           f"{_OURS}streams.py::test_silent_streams_shut_nobody_out"),
-    ("30 silent streams", "emulator", opened("emulator", PUSH, 30, MOST_STREAMS),
-           f"{_EMULATOR}silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out"),
-    ("2,000 watchers", "edge", opened("edge", f"{EDGE}WatchDecisions", 2000, MAX_WATCHERS, b""),
-           f"{_SERVER}watchers_are_few_and_a_new_one_always_finds_a_place"),
-    ("snapshots in a loop", "edge", called("SaveSnapshot", edge_pb2.SaveSnapshotRequest()),
-           f"{_SERVER}snapshots_do_not_fill_the_disk"),
-    ("500 half requests for metrics", "edge", half_requests,
-           f"{_SERVER}metrics_hold_few_connections_and_answer_beside_half_requests"),
-    ("frames of 8 MB, faster than the link", "emulator",
-           pushed("emulator", lambda: good(camera=MINE["emulator"], payload=bytes(MAX_PAYLOAD_BYTES))),
-           f"{_EMULATOR}what_is_inside_the_links_is_bounded_in_bytes"),
-    ("`codec = -1`, `role = -7`, no message", "edge", pushed("edge", wrong_values),
-           f"{_INGEST}a_refusal_is_named_counted_and_loses_nothing_else"),
-    ("made-up cameras", "edge", pushed("edge", lambda: good(camera=f"made-up-{time.time_ns()}")),
-           f"{_INGEST}a_thousand_made_up_cameras_are_counted_as_one"),
-    ("ids with terminal commands", "edge",
-           pushed("edge", lambda: good(camera=MINE["edge"], session="\x1b[2J\nERROR all is lost")),
-           f"{_OURS}transport.py::test_what_a_peer_says_stays_on_one_line_of_a_log"),
-    ("the neighbor's session, spoofed", "edge",
-           pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="neighbor", sequence=2**63)),
-           f"{_INGEST}another_stream_cannot_use_up_the_numbers_of_a_session"),
-    ("a second node of the neighbor's camera", "edge",
-           pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="another")),
-           f"{_INGEST}two_nodes_of_one_name_are_told_apart_and_said"),
-)  # fmt: skip
+    (
+        "`annots.npy` with a crafted pickle",
+        "file",
+        read(crafted_pickle),
+        f"{_FORMATS}formats.py::test_a_crafted_pickle_is_refused",
+    ),
+    (
+        "progressive JPEG of 40,000 scans",
+        "edge",
+        pushed("edge", lambda: jpeg(PROGRESSIVE[:-2] + 40_000 * SCAN + PROGRESSIVE[-2:])),
+        f"{_OURS}payload.py::test_hostile_headers_are_refused_by_check_alone",
+    ),
+    (
+        "JPEG with 8 MB of fill bytes",
+        "edge",
+        pushed("edge", lambda: jpeg(JPEG[:2] + b"\xff" * (MAX_PAYLOAD_BYTES - len(JPEG)) + JPEG[2:])),
+        f"{_OURS}payload.py::test_eight_megabytes_that_keep_a_reader_busy",
+    ),
+    (
+        "four million unknown protobuf fields",
+        "emulator",
+        pushed("emulator", lambda: good(camera=MINE["emulator"]) + b"\x78\0" * (4 * 2**20 - 1000)),
+        f"{_OURS}frame.py::test_four_million_fields_are_read_at_once",
+    ),
+    (
+        "`SetPolicy` with a name of 8 MB",
+        "edge",
+        called("SetPolicy", edge_pb2.SetPolicyRequest(name="n" * 8_000_000)),
+        f"{_SERVER}a_name_of_eight_megabytes_is_no_policy",
+    ),
+    (
+        "field number 0 under `corruption`",
+        "emulator",
+        pushed("emulator", lambda: good(camera=MINE["emulator"]) + b"\0\0"),
+        f"{_EMULATOR}a_message_that_cannot_be_damaged_does_not_end_the_emulator",
+    ),
+    (
+        "checkpoint that unpacks to 1 GB",
+        "file",
+        read(zip_bomb),
+        "tests/edge_server/export/test_command.py::test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked",
+    ),
+    (
+        "MCAP chunk that unpacks to 256 MB",
+        "file",
+        read(chunk_bomb),
+        f"{_OURS}session.py::test_a_chunk_bomb_is_left_out_and_said",
+    ),
+    ("YAML alias bomb", "file", read(yaml(LISTS)), f"{_OURS}untrusted.py::test_an_alias_bomb_is_refused_at_once"),
+    (
+        "YAML nested 20,000 deep",
+        "file",
+        read(yaml("a: " + "[a,\n" * 20_000)),
+        f"{_OURS}untrusted.py::test_nesting_costs_no_more_than_its_bound",
+    ),
+    ("ONNX that loops 2^62 times", "file", read(onnx(save_endless_loop)), f"{_ONNX}loops_for_ever_is_refused"),
+    (
+        "ONNX tensor of 400 TB",
+        "file",
+        read(onnx(lambda file: save_memory_bomb(file, "Expand"))),
+        f"{_ONNX}takes_terabytes_is_refused",
+    ),
+    (
+        "`transforms` with `../`",
+        "file",
+        read(outside("../outside")),
+        f"{_FORMATS}transforms.py::test_images_outside_the_data_set_are_not_read",
+    ),
+    (
+        "`transforms` with an absolute path",
+        "file",
+        read(outside("/etc/hostname")),
+        f"{_FORMATS}transforms.py::test_images_outside_the_data_set_are_not_read",
+    ),
+    (
+        "30 silent streams",
+        "edge",
+        opened("edge", PUSH, 30, MOST_STREAMS),
+        f"{_OURS}streams.py::test_silent_streams_shut_nobody_out",
+    ),
+    (
+        "30 silent streams",
+        "emulator",
+        opened("emulator", PUSH, 30, MOST_STREAMS),
+        f"{_EMULATOR}silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out",
+    ),
+    (
+        "2,000 watchers",
+        "edge",
+        opened("edge", f"{EDGE}WatchDecisions", 2000, MAX_WATCHERS, b""),
+        f"{_SERVER}watchers_are_few_and_a_new_one_always_finds_a_place",
+    ),
+    (
+        "snapshots in a loop",
+        "edge",
+        called("SaveSnapshot", edge_pb2.SaveSnapshotRequest()),
+        f"{_SERVER}snapshots_do_not_fill_the_disk",
+    ),
+    (
+        "500 half requests for metrics",
+        "edge",
+        half_requests,
+        f"{_SERVER}metrics_hold_few_connections_and_answer_beside_half_requests",
+    ),
+    (
+        "frames of 8 MB, faster than the link",
+        "emulator",
+        pushed("emulator", lambda: good(camera=MINE["emulator"], payload=bytes(MAX_PAYLOAD_BYTES))),
+        f"{_EMULATOR}what_is_inside_the_links_is_bounded_in_bytes",
+    ),
+    (
+        "`codec = -1`, `role = -7`, no message",
+        "edge",
+        pushed("edge", wrong_values),
+        f"{_INGEST}a_refusal_is_named_counted_and_loses_nothing_else",
+    ),
+    (
+        "made-up cameras",
+        "edge",
+        pushed("edge", lambda: good(camera=f"made-up-{time.time_ns()}")),
+        f"{_INGEST}a_thousand_made_up_cameras_are_counted_as_one",
+    ),
+    (
+        "ids with terminal commands",
+        "edge",
+        pushed("edge", lambda: good(camera=MINE["edge"], session="\x1b[2J\nERROR all is lost")),
+        f"{_OURS}transport.py::test_what_a_peer_says_stays_on_one_line_of_a_log",
+    ),
+    (
+        "the neighbor's session, spoofed",
+        "edge",
+        pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="neighbor", sequence=2**63)),
+        f"{_INGEST}another_stream_cannot_use_up_the_numbers_of_a_session",
+    ),
+    (
+        "a second node of the neighbor's camera",
+        "edge",
+        pushed("edge", lambda: good(camera=NEIGHBORS["edge"][0], session="another")),
+        f"{_INGEST}two_nodes_of_one_name_are_told_apart_and_said",
+    ),
+)
 
 
 class Neighbor(threading.Thread):
@@ -392,8 +471,9 @@ def attacked(work: Path, only: str) -> dict[str, Any]:
             for each in neighbors.values():
                 each.start()
             status = out / "edge.json"
-            wait_until(lambda: ((read_json(status) or {}).get("updates") or {}).get("count", 0) > 20,
-                       "no updates", READY_S)  # fmt: skip
+            wait_until(
+                lambda: ((read_json(status) or {}).get("updates") or {}).get("count", 0) > 20, "no updates", READY_S
+            )
             for number, (sent, at, _, test) in enumerate(ATTACKS):
                 if only not in sent:
                     continue
@@ -411,12 +491,18 @@ def attacked(work: Path, only: str) -> dict[str, Any]:
                 while (after_mb := rss_mb(pid)) > 1.02 * before_mb and time.monotonic() < over_s + SETTLE_S:
                     time.sleep(0.25)
                 loads.append(os.getloadavg()[0])
-                rows.append({
-                    "sent": sent, "at": at, "test": test, "answer": answer,
-                    "times": len(times), "refused_ms": spread(times),
-                    "neighbors": {who: each.during(begun_s, over_s) for who, each in neighbors.items()},
-                    "memory_mb": [round(mb) for mb in (before_mb, most_mb, after_mb)],
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "sent": sent,
+                        "at": at,
+                        "test": test,
+                        "answer": answer,
+                        "times": len(times),
+                        "refused_ms": spread(times),
+                        "neighbors": {who: each.during(begun_s, over_s) for who, each in neighbors.items()},
+                        "memory_mb": [round(mb) for mb in (before_mb, most_mb, after_mb)],
+                    }
+                )
                 print(json.dumps(rows[-1]), flush=True)
             alive = {who: child.running for who, child in children.items()}
     finally:
@@ -424,10 +510,14 @@ def attacked(work: Path, only: str) -> dict[str, Any]:
             kill(child)
     logs = b"".join((out / f"log-{who}.txt").read_bytes() for who in children)
     return {
-        "cores": machine_load.usable_cores(), "load_average": round(float(np.median(loads)), 1),
-        "seconds": SECONDS, "alive": alive, "escapes_in_logs": logs.count(b"\x1b"),
-        "tracebacks_in_logs": logs.count(b"Traceback"), "attacks": rows,
-    }  # fmt: skip
+        "cores": machine_load.usable_cores(),
+        "load_average": round(float(np.median(loads)), 1),
+        "seconds": SECONDS,
+        "alive": alive,
+        "escapes_in_logs": logs.count(b"\x1b"),
+        "tracebacks_in_logs": logs.count(b"Traceback"),
+        "attacks": rows,
+    }
 
 
 def main() -> int:

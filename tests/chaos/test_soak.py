@@ -116,14 +116,11 @@ def test_a_run_is_judged_by_recoveries_memory_and_account() -> None:
     def samples(growth_mb: float) -> list:
         old = [(float(t), {"edge": (1, 900.0)}) for t in range(0, 60, 2)]
         return old + [
-            (60.0 + t, {"edge": (2, 400.0 + growth_mb * t / 600.0), "node": (3, 80.0)})
-            for t in range(0, 602, 2)
+            (60.0 + t, {"edge": (2, 400.0 + growth_mb * t / 600.0), "node": (3, 80.0)}) for t in range(0, 602, 2)
         ]
 
     fault = {"kind": "stop", "target": "edge", "at_s": 1.0, "recovery_s": 1.9}
-    good = {
-        "faults": [fault], "memory": soak.memory(samples(0.0)), "frames": {"closes": True, "doubts": []}
-    }  # fmt: skip
+    good = {"faults": [fault], "memory": soak.memory(samples(0.0)), "frames": {"closes": True, "doubts": []}}
     assert not soak.problems(good)
     assert good["memory"]["edge"] == {"minutes": 10.0, "early_mb": 400.0, "late_mb": 400.0}
     for worse in (

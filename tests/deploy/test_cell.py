@@ -61,8 +61,7 @@ def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "status, possible",
-    [('{"updates": {"count": 3}}', True), ('{"updates": {"count": 0}}', False), ("", False)],
+    "status, possible", [('{"updates": {"count": 3}}', True), ('{"updates": {"count": 0}}', False), ("", False)]
 )
 def test_there_is_a_mesh_from_the_first_update_on(tmp_path: Path, status: str, possible: bool) -> None:
     from freshfield_up import mesh

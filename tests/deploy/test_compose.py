@@ -40,9 +40,7 @@ def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator() -> None:
         assert networks and not networks & edge, f"{name} shares a network with the edge"
         assert networks <= emulator
         assert "--to emulator:" in service["command"]
-        assert all(COMPOSE["networks"][n]["internal"] for n in networks), (
-            "an engine may route between bridges"
-        )
+        assert all(COMPOSE["networks"][n]["internal"] for n in networks), "an engine may route between bridges"
     assert edge <= emulator
     assert not any("network_mode" in s or "links" in s for s in SERVICES.values())
 
@@ -108,10 +106,7 @@ def test_the_camera_image_has_no_torch() -> None:
 def engine() -> tuple[list[str], str]:
     """A compose command that works here and the engine below it, or skip with the reason."""
     tried = []
-    for command, check in (
-        (["docker", "compose"], ["docker", "info"]),
-        (["podman-compose"], ["podman", "info"]),
-    ):
+    for command, check in ((["docker", "compose"], ["docker", "info"]), (["podman-compose"], ["podman", "info"])):
         if shutil.which(command[0]) is None or shutil.which(check[0]) is None:
             tried.append(f"{command[0]} is not installed")
             continue

@@ -95,9 +95,7 @@ def test_files_and_modules_that_are_named_exist(page: Path) -> None:
             assert not test or f"def {test[1]}(" in (ROOT / path).read_text(), f"{name(page)}: {code}"
             there = any(ROOT.glob(path.rstrip("./"))) or path.startswith("docs/results/")
             assert there, f"{name(page)}: {path}"
-        for module in re.findall(
-            r"python -m ([\w.]+)|((?:camera_node|channel_emu|edge_server)\.[\w.]+)", code
-        ):
+        for module in re.findall(r"python -m ([\w.]+)|((?:camera_node|channel_emu|edge_server)\.[\w.]+)", code):
             found = (module[0] or module[1]).rstrip(".")
             parent, _, last = found.rpartition(".")
             spec = importlib.util.find_spec(parent)
@@ -115,6 +113,4 @@ def test_tables_say_what_the_measured_files_say() -> None:
         found = [v for v in kept.get(study, ()) if v["about"] == about and word in v["claim"]]
         assert found or study not in kept, f"docs/results/thesis/{study}.json: {about}, {word!r}: no verdict"
     for page in (ROOT / "docs").rglob("*.md"):
-        assert tables.renewed(page.read_text()) == page.read_text(), (
-            f"{name(page)}: run `python docs/tables.py`"
-        )
+        assert tables.renewed(page.read_text()) == page.read_text(), f"{name(page)}: run `python docs/tables.py`"

@@ -67,9 +67,7 @@ def dry_run(*arguments: str, **variables: str) -> str:
     command = ["make", "-n", "-B", *arguments, *(f"{k}={v}" for k, v in variables.items())]
     # Not the variables of the make that runs this test.
     plain = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
-    done = subprocess.run(
-        command, cwd=ROOT, env=plain, capture_output=True, text=True, timeout=60, check=True
-    )
+    done = subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, text=True, timeout=60, check=True)
     return done.stdout
 
 

@@ -41,12 +41,18 @@ def test_the_exit_summary_names_the_signal(tmp_path: Path) -> None:
 
 
 def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
-    obedient = python(tmp_path, "import signal, sys, time\n"
-                    "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
-                    "print('up')\ntime.sleep(60)", "obedient")  # fmt: skip
-    stubborn = python(tmp_path, "import signal, time\n"
-                  "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-                  "print('up')\ntime.sleep(60)", "stubborn")  # fmt: skip
+    obedient = python(
+        tmp_path,
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
+        "print('up')\ntime.sleep(60)",
+        "obedient",
+    )
+    stubborn = python(
+        tmp_path,
+        "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(60)",
+        "stubborn",
+    )
     for child in (obedient, stubborn):
         child.start()
         wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
@@ -112,6 +118,8 @@ def test_grpc_does_not_act_when_a_process_starts(tmp_path: Path) -> None:
     found = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert found.returncode == 0 and "fork" not in found.stderr, found.stderr

@@ -17,20 +17,7 @@ from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir
 
 FILES = sorted(SCENARIO_FOLDER.glob("*.yaml"))
-NAMES = {
-    "room",
-    "room19",
-    "tile",
-    "tower",
-    "ideal",
-    "fox",
-    "lego",
-    "kitchen",
-    "cell",
-    "scan",
-    "card",
-    "thesis",
-}
+NAMES = {"room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "cell", "scan", "card", "thesis"}
 
 
 def test_the_promised_scenarios_are_there() -> None:
@@ -65,10 +52,7 @@ def test_every_camera_has_a_first_image(file: Path) -> None:
     assert set(sources) == set(cameras)
     for source in sources.values():
         shot = source.read(source.content(0))
-        assert (shot.intrinsics.width, shot.intrinsics.height) == (
-            source.intrinsics.width,
-            source.intrinsics.height,
-        )
+        assert (shot.intrinsics.width, shot.intrinsics.height) == (source.intrinsics.width, source.intrinsics.height)
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -129,8 +129,7 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
 
 
 @pytest.mark.parametrize(
-    "name, role",
-    [pytest.param("node", "the camera node", marks=pytest.mark.slow), ("edge", "the edge server")],
+    "name, role", [pytest.param("node", "the camera node", marks=pytest.mark.slow), ("edge", "the edge server")]
 )
 def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(
     up: Callable[..., Up], name: str, role: str
@@ -239,9 +238,7 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     assert "not an earlier run's" in refusal("room", "--out", str(tmp_path), "--port", str(free_port()))
 
 
-@pytest.mark.parametrize(
-    "text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)]
-)
+@pytest.mark.parametrize("text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)])
 def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     from freshfield_up import cli as script
 

@@ -87,11 +87,21 @@ def test_several_machines_start_from_an_empty_folder(machine: Path, started, tmp
     assert str(machine.parent) in where.stdout, "the checkout was imported, not the wheel"
     edge, emulator = (f"127.0.0.1:{free_port()}" for _ in range(2))
     started(str(machine / "edge-server"), "run", "compose", "--listen", edge, "--out", "runs/edge")
-    started(str(machine / "channel-emu"), "run", "compose", "--listen", emulator, "--to", edge,
-            "--out", "runs/emulator")  # fmt: skip
+    started(
+        str(machine / "channel-emu"), "run", "compose", "--listen", emulator, "--to", edge, "--out", "runs/emulator"
+    )
     for camera in ("cam00", "cam01", "cam02"):
-        started(str(machine / "camera-node"), "run", "compose", "--camera", camera, "--to", emulator,
-                "--out", f"runs/{camera}")  # fmt: skip
+        started(
+            str(machine / "camera-node"),
+            "run",
+            "compose",
+            "--camera",
+            camera,
+            "--to",
+            emulator,
+            "--out",
+            f"runs/{camera}",
+        )
     status, end_s = tmp_path / "runs/edge/edge.json", time.monotonic() + 180
     while not (status.exists() and json.loads(status.read_text())["updates"]["count"] >= 3):
         logs = "\n".join(log.read_text()[-1500:] for log in sorted(tmp_path.glob("log-*.txt")))

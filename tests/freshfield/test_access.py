@@ -163,14 +163,7 @@ def test_a_browsers_login_is_the_token_as_password() -> None:
     for name, token in TOKENS.items():
         basic = base64.b64encode(f"whoever:{token}".encode()).decode()
         assert access.of_header(f"Basic {basic}") == access.of_header(f"bearer {token}") == Caller.named(name)
-    for wrong in (
-        "Basic é",
-        "Basic ====",
-        "Basic",
-        f"Digest {TOKENS['viewer']}",
-        f"{TOKENS['viewer']}",
-        "Bearer ",
-    ):
+    for wrong in ("Basic é", "Basic ====", "Basic", f"Digest {TOKENS['viewer']}", f"{TOKENS['viewer']}", "Bearer "):
         assert access.of_header(wrong) is None
 
 
@@ -194,9 +187,7 @@ def test_an_own_host_may_be_asked_for(host: str) -> None:
             door.check_origin(host, foreign)
 
 
-@pytest.mark.parametrize(
-    "host", [None, "", "evil.example:8080", "localhost.evil.example", "127.0.0.1.nip.io"]
-)
+@pytest.mark.parametrize("host", [None, "", "evil.example:8080", "localhost.evil.example", "127.0.0.1.nip.io"])
 def test_a_foreign_name_for_this_machine_is_refused(host: str | None) -> None:
     with pytest.raises(HttpRefused, match="Host"):
         HttpDoor(Access({}, certificates=False), "127.0.0.1").check_origin(host, None)

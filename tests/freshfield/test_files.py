@@ -64,9 +64,7 @@ def test_json_is_replaced_whole_by_any_number_of_threads(tmp_path):
         (out_folder, "folder/new/x", "folder cannot be written to: name another place"),
     ],
 )
-def test_a_place_that_cannot_be_written_is_refused_with_its_option(
-    tmp_path, capsys, monkeypatch, option, place, said
-):
+def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch, option, place, said):
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     (tmp_path / "link").symlink_to("nowhere")

@@ -12,16 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from freshfield import payload
-from freshfield.frame import (
-    Frame,
-    FrameRejected,
-    checksum,
-    counted_ids,
-    from_request,
-    parse,
-    to_request,
-    valid_id,
-)
+from freshfield.frame import Frame, FrameRejected, checksum, counted_ids, from_request, parse, to_request, valid_id
 from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 from tests.conftest import data_dir
@@ -254,9 +245,7 @@ def test_an_empty_request_is_refused_and_not_an_error():
 
 @given(st.text(max_size=70))
 def test_valid_ids_are_safe_in_file_names_and_ledgers(text):
-    assert valid_id(text) == (
-        1 <= len(text) <= 64 and all(c.isascii() and (c.isalnum() or c in "._-") for c in text)
-    )
+    assert valid_id(text) == (1 <= len(text) <= 64 and all(c.isascii() and (c.isalnum() or c in "._-") for c in text))
 
 
 RAW = to_request(frame()).SerializeToString()

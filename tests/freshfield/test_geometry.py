@@ -52,9 +52,7 @@ def test_quaternions_and_matrices_agree_with_scipy(q):
 @given(quaternions, quaternions)
 def test_products_compose_rotations(a, b):
     np.testing.assert_allclose(
-        quaternion_to_matrix(quaternion_multiply(a, b)),
-        quaternion_to_matrix(a) @ quaternion_to_matrix(b),
-        atol=1e-9,
+        quaternion_to_matrix(quaternion_multiply(a, b)), quaternion_to_matrix(a) @ quaternion_to_matrix(b), atol=1e-9
     )
 
 

@@ -25,10 +25,7 @@ def write(out, events, closed=True):
     return ledger.path
 
 
-EVENTS = [
-    Event(1, "cam00", "s", 0, "captured"),
-    Event(2, "cam00", "s", 0, "answered", "rejected:crc_mismatch"),
-]
+EVENTS = [Event(1, "cam00", "s", 0, "captured"), Event(2, "cam00", "s", 0, "answered", "rejected:crc_mismatch")]
 
 
 def test_events_come_back(tmp_path):

@@ -48,10 +48,7 @@ def test_color_is_not_subsampled_from_quality_90_up():
     image = np.zeros((32, 32, 3), np.uint8)
     image[:, ::2] = (255, 0, 0)
     image[:, 1::2] = (0, 0, 255)  # columns of one luma range that 4:2:0 would mix
-    error = {
-        q: np.abs(decode(encode(image, "jpeg", q), "jpeg", 32, 32).astype(int) - image).mean()
-        for q in (89, 90)
-    }
+    error = {q: np.abs(decode(encode(image, "jpeg", q), "jpeg", 32, 32).astype(int) - image).mean() for q in (89, 90)}
     assert error[90] < 0.5 * error[89]
 
 
@@ -116,9 +113,7 @@ def claim(data: bytes, chunk: bytes, length: int) -> bytes:
 
 JPEG = encode(np.random.default_rng(2).integers(0, 256, (48, 64, 3), dtype=np.uint8), "jpeg")
 PNG = encode(np.random.default_rng(2).integers(0, 256, (48, 64, 3), dtype=np.uint8), "png")
-PROGRESSIVE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[
-    1
-].tobytes()
+PROGRESSIVE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
 SCAN = PROGRESSIVE[PROGRESSIVE.rindex(b"\xff\xda") : -2]
 FRAME_HEADER = bytes.fromhex("ffc0000b0800300040010111 00")  # a second one, 64 x 48, of one component
 BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
@@ -152,7 +147,7 @@ BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
         (PNG[:33] + 11_000 * (bytes(4) + b"tEXt" + bytes(4)) + PNG[33:], "png", (64, 48), "bad_payload"),
     ],
     ids=lambda v: v[:8].hex() if isinstance(v, bytes) else str(v),
-)  # fmt: skip
+)
 def test_hostile_headers_are_refused_by_check_alone(data, codec, size, reason):
     with pytest.raises(PayloadError) as error:
         check(data, codec, *size)
@@ -213,9 +208,7 @@ def test_truncated_data_is_refused(codec):
 
 @given(data=st.binary(max_size=300), codec=st.sampled_from(["jpeg", "png", "zstd"]), start=st.booleans())
 def test_random_bytes_raise_nothing_but_payload_error(data, codec, start):
-    head = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "zstd": b"\x28\xb5\x2f\xfd"}[
-        codec
-    ]
+    head = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "zstd": b"\x28\xb5\x2f\xfd"}[codec]
     try:
         image = decode((head if start else b"") + data, codec, 8, 8)
     except PayloadError as error:

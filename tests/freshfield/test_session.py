@@ -45,9 +45,19 @@ def requests(count: int = 12, cameras: tuple[str, ...] = ("cam00", "cam01")):
             data = payload.encode(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8))
             captured = START_NS + k * 33_333_333 + number
             frame = wire.Frame(
-                camera, "s1", k, captured, pose, LENS, "jpeg", data, held_out=number == 0,
-                clock_offset_ns=-1_234_567, clock_uncertainty_ns=1000, pose_gap_ns=7,
-            )  # fmt: skip
+                camera,
+                "s1",
+                k,
+                captured,
+                pose,
+                LENS,
+                "jpeg",
+                data,
+                held_out=number == 0,
+                clock_offset_ns=-1_234_567,
+                clock_uncertainty_ns=1000,
+                pose_gap_ns=7,
+            )
             yield wire.to_request(frame), captured + 2_000_000
 
 
@@ -90,9 +100,7 @@ def test_viewers_find_what_they_know(tmp_path):
     assert decisions == [{"number": 0}, {"number": 1}, {"number": 2}]
     kinds = {topic: rows[0][0] for topic, rows in found.items()}
     assert kinds["/cam00/image"] == "foxglove.CompressedImage"
-    assert (
-        kinds["/cam00/calibration"] == "foxglove.CameraCalibration" and len(found["/cam00/calibration"]) == 1
-    )
+    assert kinds["/cam00/calibration"] == "foxglove.CameraCalibration" and len(found["/cam00/calibration"]) == 1
     assert kinds["/cam00/pose"] == "foxglove.PoseInFrame" and kinds["/tf"] == "foxglove.FrameTransform"
     assert kinds["/cam00/header"] == "freshfield.v1.FrameHeader"
     request, arrived_ns = sent[0]
@@ -180,9 +188,7 @@ def test_files_that_another_program_compressed_are_read(tmp_path, how):
         for schema, channel, message in make_reader(old).iter_messages(log_time_order=False):
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number
-                )
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
             times = message.log_time, message.data, message.publish_time
             writer.add_message(channels[channel.id], *times)
         writer.finish()

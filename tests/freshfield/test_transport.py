@@ -144,9 +144,23 @@ def test_host_and_port_are_told_apart(text, expected):
     assert host_port(text) == expected
 
 
-NO_ADDRESSES = ["", "host", "7001", "host:", "host:x", "host:-1", "host:65536", "host:99999", "host:\u00b2",
-                "::1", "::1:7001", "http://host:80", "ho st:80", "unix:/tmp/s",
-                "host:" + "9" * 5000]  # fmt: skip
+NO_ADDRESSES = [
+    "",
+    "host",
+    "7001",
+    "host:",
+    "host:x",
+    "host:-1",
+    "host:65536",
+    "host:99999",
+    "host:\u00b2",
+    "::1",
+    "::1:7001",
+    "http://host:80",
+    "ho st:80",
+    "unix:/tmp/s",
+    "host:" + "9" * 5000,
+]
 
 
 @pytest.mark.parametrize("text", NO_ADDRESSES)
@@ -187,14 +201,52 @@ def pem(tmp_path_factory):
         subprocess.run(["openssl", *arguments], check=True, capture_output=True, cwd=folder)
 
     for name in ("ca", "stranger"):
-        openssl("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
-                "-keyout", f"{name}.key", "-out", f"{name}.pem")  # fmt: skip
+        openssl(
+            "req",
+            "-x509",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-days",
+            "2",
+            "-subj",
+            f"/CN={name}",
+            "-keyout",
+            f"{name}.key",
+            "-out",
+            f"{name}.pem",
+        )
     (folder / "ext").write_text("subjectAltName=DNS:localhost")
     for name, subject in (("server", "server"), ("client", "viewer")):
-        openssl("req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={subject}",
-                "-keyout", f"{name}.key", "-out", f"{name}.csr")  # fmt: skip
-        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "2",
-                "-CAcreateserial", "-extfile", "ext", "-out", f"{name}.pem")  # fmt: skip
+        openssl(
+            "req",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-subj",
+            f"/CN={subject}",
+            "-keyout",
+            f"{name}.key",
+            "-out",
+            f"{name}.csr",
+        )
+        openssl(
+            "x509",
+            "-req",
+            "-in",
+            f"{name}.csr",
+            "-CA",
+            "ca.pem",
+            "-CAkey",
+            "ca.key",
+            "-days",
+            "2",
+            "-CAcreateserial",
+            "-extfile",
+            "ext",
+            "-out",
+            f"{name}.pem",
+        )
     return folder
 
 
@@ -353,10 +405,7 @@ def test_a_slow_reader_is_felt_at_once():
 
     async def scene():
         written = 0
-        async with (
-            serving(Transport(), Stalled()) as port,
-            Transport().aio_channel(f"localhost:{port}") as channel,
-        ):
+        async with serving(Transport(), Stalled()) as port, Transport().aio_channel(f"localhost:{port}") as channel:
             call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
             try:
                 async with asyncio.timeout(2):

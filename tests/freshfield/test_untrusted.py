@@ -12,14 +12,7 @@ import yaml
 
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
-from freshfield.untrusted import (
-    UntrustedError,
-    YamlWriter,
-    read_json,
-    read_yaml,
-    refuse_expansion,
-    stored_bytes,
-)
+from freshfield.untrusted import UntrustedError, YamlWriter, read_json, read_yaml, refuse_expansion, stored_bytes
 from tests.work import work_ms
 
 LEVELS = "abcdefghijklmnop"
@@ -98,9 +91,7 @@ def test_honest_references_are_followed():
     assert read_yaml("") is None and read_yaml("3") == 3
     nested = "a: &a {x: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3}\n"
     assert read_yaml("{'1': a, 1: b, ~: c, None: d}") == {"1": "a", 1: "b", None: "c", "None": "d"}
-    assert read_yaml(nested) == {"a": {"x": 1}, "b": {"x": 2}, "c": {"x": 3}}, (
-        "what is merged is no repetition"
-    )
+    assert read_yaml(nested) == {"a": {"x": 1}, "b": {"x": 2}, "c": {"x": 3}}, "what is merged is no repetition"
 
 
 def test_numbers_are_those_of_yaml_1_2():
@@ -150,9 +141,7 @@ def test_what_is_no_json_is_one_line(text, why):
     assert read_json('{"a": [{"a": 1}, {"a": 2}]}') == {"a": [{"a": 1}, {"a": 2}]}
 
 
-@pytest.mark.parametrize(
-    "text", [f"edge: 1\n{LISTS}", "name: " + "[" * 5000, f"name: {'x' * 10**5}\ncameras: 1"]
-)
+@pytest.mark.parametrize("text", [f"edge: 1\n{LISTS}", "name: " + "[" * 5000, f"name: {'x' * 10**5}\ncameras: 1"])
 def test_a_scenario_that_is_a_bomb_is_one_short_line(tmp_path, text):
     file = tmp_path / "a.yaml"
     file.write_text(text)

@@ -71,16 +71,24 @@ def fuzz_one(name: str, runs: int, seconds: float, folder: Path) -> None:
         if part >= 1:
             grown_mb, new = resident_mb() - after_a_tenth_mb, sys.getallocatedblocks() - blocks
             common = ", ".join(f"{word} {count}" for word, count in outcomes.most_common(6))
-            print(f"{name}: {done} inputs in {passed:.0f} s, slowest {slowest_ms:.1f} ms, memory "
-                  f"{resident_mb():.0f} MB, grown by {grown_mb:.1f} and {new} blocks; {common}",
-                  flush=True)  # fmt: skip
+            print(
+                f"{name}: {done} inputs in {passed:.0f} s, slowest {slowest_ms:.1f} ms, memory "
+                f"{resident_mb():.0f} MB, grown by {grown_mb:.1f} and {new} blocks; {common}",
+                flush=True,
+            )
             os._exit(grown_mb > MOST_GROWTH_MB or new > MOST_NEW_BLOCKS)
 
     options = [
-        f"-artifact_prefix={folder.parent}/{name}-", f"-dict={folder / 'words'}", "-verbosity=0",
-        f"-max_len={MOST_INPUT_BYTES}", "-len_control=0", "-rss_limit_mb=2048", "-timeout=20", "-seed=1",
+        f"-artifact_prefix={folder.parent}/{name}-",
+        f"-dict={folder / 'words'}",
+        "-verbosity=0",
+        f"-max_len={MOST_INPUT_BYTES}",
+        "-len_control=0",
+        "-rss_limit_mb=2048",
+        "-timeout=20",
+        "-seed=1",
         str(corpus),
-    ]  # fmt: skip
+    ]
     atheris.Setup([sys.argv[0], *options], take)
     atheris.Fuzz()
 
@@ -100,9 +108,7 @@ def main() -> None:
         (folder := kept / name).mkdir()
         call = f"fuzz_one({name!r}, {given.runs}, {given.seconds}, Path({str(folder)!r}))"
         program = f"from tests.fuzz.__main__ import Path, fuzz_one; {call}"
-        done = subprocess.run(
-            [sys.executable, "-c", program], stderr=subprocess.STDOUT, stdout=subprocess.PIPE
-        )
+        done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
         said = done.stdout.decode(errors="replace").splitlines()
         lines = said if done.returncode else [line for line in said if line.startswith(f"{name}: ")]
         print("\n".join(lines[-60:]), flush=True)

@@ -156,9 +156,7 @@ def models(folder: Path) -> Target:
         ending = ".bin" if data[:1] < b"\x80" else ".txt"
         cameras, _, images = data[1:].partition(SPLIT)
         (folder / f"images{ending}").write_bytes(images)
-        return of_file(f"cameras{ending}", folder, lambda f: _images(colmap.load_dataset(f)), DatasetError)(
-            cameras
-        )
+        return of_file(f"cameras{ending}", folder, lambda f: _images(colmap.load_dataset(f)), DatasetError)(cameras)
 
     return take
 
@@ -169,9 +167,15 @@ def transform_files(folder: Path) -> Target:
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
-    "request": request, "header": header, "payload": pixels, "scenario": scenarios, "checkpoint": checkpoints,
-    "mcap": mcap, "colmap": models, "transforms": transform_files,
-}  # fmt: skip
+    "request": request,
+    "header": header,
+    "payload": pixels,
+    "scenario": scenarios,
+    "checkpoint": checkpoints,
+    "mcap": mcap,
+    "colmap": models,
+    "transforms": transform_files,
+}
 MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0}
 """Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
 MOST_FILE_MS = 2000.0
@@ -188,9 +192,7 @@ def _messages() -> Iterable[bytes]:
     small = payload.encode(np.zeros((2, 2, 3), np.uint8), "zstd")
     for camera, codec, data in (("cam01", "zstd", small), ("cam00", "png", PNG), ("x", "png", PNG)):
         lens = Pinhole(2, 2, 2.0, 2.0, 1.0, 1.0, (0.1, 0.0, 0.0, 0.0))
-        sent = frame(
-            camera, codec=codec, payload=data, intrinsics=lens, generated_ns=NOW, held_out=camera == "cam00"
-        )
+        sent = frame(camera, codec=codec, payload=data, intrinsics=lens, generated_ns=NOW, held_out=camera == "cam00")
         yield to_request(sent).SerializeToString()
     yield pb.PushRequest().SerializeToString()
 
@@ -220,9 +222,10 @@ def _sessions() -> Iterable[bytes]:
 
 def _models() -> Iterable[bytes]:
     yield (
-        b"\xff1 OPENCV 2 2 2.0 2.0 1.0 1.0 0.1 0 0 0\n2 SIMPLE_RADIAL 2 2 2 1 1 0" + SPLIT
+        b"\xff1 OPENCV 2 2 2.0 2.0 1.0 1.0 0.1 0 0 0\n2 SIMPLE_RADIAL 2 2 2 1 1 0"
+        + SPLIT
         + b"# IMAGE\n1 1 0 0 0 0 0 1 1 a.png\n0 0 -1\n2 .7 .7 0 0 1 2 3 2 b.png\n\n"
-    )  # fmt: skip
+    )
     numbers = np.array([2.0, 2.0, 1.0, 1.0], "<f8").tobytes()
     camera = np.array([1, 1], "<i4").tobytes() + np.array([2, 2], "<u8").tobytes() + numbers
     pose = np.array([1.0, 0, 0, 0, 0, 0, 1], "<f8").tobytes()
@@ -236,13 +239,16 @@ def _transforms() -> Iterable[bytes]:
     entry = {"file_path": "a.png", "transform_matrix": pose, "time": 0.5, "camera": "c"}
     lens = {"fl_x": 2.0, "fl_y": 2.0, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "fps": 30}
     yield json.dumps({**lens, "frames": [entry, {**entry, "file_path": "none"}]}).encode()
-    yield json.dumps(
-        {"camera_angle_x": 0.7, "frames": [{"file_path": "./a", "transform_matrix": pose}]}
-    ).encode()
+    yield json.dumps({"camera_angle_x": 0.7, "frames": [{"file_path": "./a", "transform_matrix": pose}]}).encode()
 
 
 _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
-    "request": _messages, "header": _messages, "payload": _payloads, "checkpoint": _checkpoints,
-    "mcap": _sessions, "colmap": _models, "transforms": _transforms,
+    "request": _messages,
+    "header": _messages,
+    "payload": _payloads,
+    "checkpoint": _checkpoints,
+    "mcap": _sessions,
+    "colmap": _models,
+    "transforms": _transforms,
     "scenario": lambda: (f.read_bytes() for f in sorted(scenario.SCENARIO_FOLDER.glob("*.yaml"))),
-}  # fmt: skip
+}

@@ -11,8 +11,16 @@ from freshfield.session import SessionError
 from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
 from tests.work import work_ms
 
-HONEST = {"request": 2, "header": 2, "payload": 3, "scenario": 15, "checkpoint": 1, "mcap": 1, "colmap": 2,
-          "transforms": 2}  # fmt: skip
+HONEST = {
+    "request": 2,
+    "header": 2,
+    "payload": 3,
+    "scenario": 15,
+    "checkpoint": 1,
+    "mcap": 1,
+    "colmap": 2,
+    "transforms": 2,
+}
 ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "2 cameras")
 
 

@@ -131,7 +131,5 @@ class _Clock(clock_pb2_grpc.ClockServiceServicer):
         await asyncio.sleep(self.peer.clock_delay_s)
         now = self.peer.clock.now_ns()
         return clock_pb2.ExchangeResponse(
-            client_sent_ns=request.client_sent_ns,
-            server_received_ns=now,
-            server_sent_ns=self.peer.clock.now_ns(),
+            client_sent_ns=request.client_sent_ns, server_received_ns=now, server_sent_ns=self.peer.clock.now_ns()
         )

@@ -48,9 +48,7 @@ async def measured(scenario: Path, which: list[str], seconds: float) -> tuple[fl
 
 @pytest.mark.slow
 def test_nine_small_cameras_cost_little(tmp_path):
-    scenario = write_scenario(
-        tmp_path / "nine.yaml", 9, kind="world", scene="room", width=128, height=128, fps=15
-    )
+    scenario = write_scenario(tmp_path / "nine.yaml", 9, kind="world", scene="room", width=128, height=128, fps=15)
     share, _, arrived = asyncio.run(measured(scenario, ["--all"], 8.0))
     assert arrived > 0.9 * 8 * 9 * 15
     assert share < 0.15
@@ -59,9 +57,7 @@ def test_nine_small_cameras_cost_little(tmp_path):
 @pytest.mark.slow
 def test_one_large_camera_stays_small(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    world = write_scenario(
-        tmp_path / "world.yaml", 2, kind="world", scene="tile", width=640, height=480, fps=15
-    )
+    world = write_scenario(tmp_path / "world.yaml", 2, kind="world", scene="tile", width=640, height=480, fps=15)
     rig = write_rig(tmp_path / "rig", width=640, height=480)
     video = write_scenario(tmp_path / "video.yaml", 2, kind="video", data=str(rig), fps=15)
     for scenario in (world, video):

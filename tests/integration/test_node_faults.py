@@ -184,7 +184,5 @@ print(code, sorted(heavy), sorted(world))
     yield_lines: list[str] = []
     assert asyncio.run(scene()) > 10
     assert yield_lines[0] == "0 [] []"  # recorded data, no effects: not even the world is imported
-    assert (
-        yield_lines[1].startswith("0 []") and "camera_node.synthetic.effects.sensor_noise" in yield_lines[1]
-    )
+    assert yield_lines[1].startswith("0 []") and "camera_node.synthetic.effects.sensor_noise" in yield_lines[1]
     assert "clock_drift" not in yield_lines[1] and "motion_blur" not in yield_lines[1]

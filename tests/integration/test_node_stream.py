@@ -231,9 +231,7 @@ def test_photos_that_are_gone_are_counted_and_the_others_go_on(tmp_path, caplog)
 
     async def scene():
         peer = await Peer().start()
-        node = Node(
-            scenario, built, NodeOptions(to=peer.address, transport=Transport(), out=tmp_path / "out")
-        )
+        node = Node(scenario, built, NodeOptions(to=peer.address, transport=Transport(), out=tmp_path / "out"))
         status = {}
 
         async def work():

@@ -84,9 +84,13 @@ def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("session")
     recorder = Recorder(folder / "a.mcap", "test")
     ingest = Ingest(
-        WallClock(), FrameBuffer(("cam01", "cam02")), ["cam00"], Ledger(folder, "edge", "edge", 1),
-        lambda frame: None, recorder.frame,
-    )  # fmt: skip
+        WallClock(),
+        FrameBuffer(("cam01", "cam02")),
+        ["cam00"],
+        Ledger(folder, "edge", "edge", 1),
+        lambda frame: None,
+        recorder.frame,
+    )
     scenario = photo_scenario(write_photos(folder / "data", 24), 3, fps=25)
     sent = sent_by(scenario, seconds=1.5, take=ingest.take)
     recorder.close()
@@ -190,10 +194,7 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
         (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
     schedule = camera.schedule(7)
-    assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (
-        None,
-        0,
-    )
+    assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
 
 @pytest.mark.slow
@@ -225,9 +226,7 @@ def test_a_whole_edge_server_records_what_it_decides(session, tmp_path):
     status = json.loads((tmp_path / "out/edge.json").read_text())
     found = Session(tmp_path / "b.mcap")
     assert found.cut is None
-    assert status["recording"] == {
-        "file": "b.mcap", "written": found.messages.total(), "dropped": 0, "failed": False
-    }  # fmt: skip
+    assert status["recording"] == {"file": "b.mcap", "written": found.messages.total(), "dropped": 0, "failed": False}
     delivered = {c["camera"]: c["delivered"] for c in status["cameras"]}
     assert {camera: len(frames) for camera, frames in found.frames.items()} == delivered
     assert found.messages["/decisions"] == status["updates"]["count"]
@@ -241,9 +240,7 @@ def test_what_to_install_is_said(tmp_path):
     record = ["run", str(plan), "--record", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "out")]
     replay = ["run", str(plan), "--all", "--to", "127.0.0.1:1"]
     for command, words in (("edge_server.cli", record), ("camera_node.cli", replay)):
-        code = (
-            f"import sys; sys.modules['mcap'] = None\nfrom {command} import main\nsys.exit(main({words!r}))"
-        )
+        code = f"import sys; sys.modules['mcap'] = None\nfrom {command} import main\nsys.exit(main({words!r}))"
         ended = run([sys.executable, "-c", code], capture_output=True, text=True)
         assert ended.returncode == 2
         assert ended.stderr.splitlines()[-1].endswith("recordings need MCAP: pip install 'freshfield[mcap]'")

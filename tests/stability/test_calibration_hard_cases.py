@@ -65,8 +65,16 @@ def test_the_least_that_determines_something_does(setup):
 
 
 def test_motions_that_turn_by_nearly_half_a_turn_among_others_do_no_harm():
-    turns = [[0, 0, 0], [np.pi - 0.01, 0, 0], [0, np.pi, 0], [0.6, 0, 0.2], [0, 0.7, 0], [0.3, -0.4, 0.5],
-             [-0.5, 0.2, 0], [0.1, 0.2, -0.8]]  # fmt: skip
+    turns = [
+        [0, 0, 0],
+        [np.pi - 0.01, 0, 0],
+        [0, np.pi, 0],
+        [0.6, 0, 0.2],
+        [0, 0.7, 0],
+        [0.3, -0.4, 0.5],
+        [-0.5, 0.2, 0],
+        [0.1, 0.2, -0.8],
+    ]
     found = calibrate(of_turns(turns))
     assert distance_mm(found.transform, X) < 4 * found.refined.std_mm + 0.5
     assert any("nearly 180 degrees" in w for w in found.warnings)

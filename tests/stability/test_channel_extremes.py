@@ -36,8 +36,15 @@ def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: s
 @pytest.mark.parametrize("discipline", DISCIPLINES)
 @pytest.mark.parametrize("mean_ms", [1e12, 1e30, 1e300])
 def test_huge_delays_saturate(discipline: str, engine: str, mean_ms: float) -> None:
-    found = run({"preset": "ch5", "service": {"law": "deterministic", "mean_ms": mean_ms}, "queue_limit": 8,
-                 "discipline": discipline}, engine)  # fmt: skip
+    found = run(
+        {
+            "preset": "ch5",
+            "service": {"law": "deterministic", "mean_ms": mean_ms},
+            "queue_limit": 8,
+            "discipline": discipline,
+        },
+        engine,
+    )
     assert found["delivered"] == 0 and found["mean_age_ms"] is None
     assert found["in_flight"] <= 2 * 9
     assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
@@ -64,8 +71,12 @@ def test_a_chain_that_never_switches(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_chain_that_always_switches(engine: str) -> None:
     """40 switches a millisecond: the channel is its average."""
-    section = {"preset": "ch6", "chain": {"mu1_per_ms": 40.0, "mu2_per_ms": 40.0}, "discipline": "parallel",
-               "service_state": "modulated"}  # fmt: skip
+    section = {
+        "preset": "ch6",
+        "chain": {"mu1_per_ms": 40.0, "mu2_per_ms": 40.0},
+        "discipline": "parallel",
+        "service_state": "modulated",
+    }
     found = run(section, engine, seconds=2)
     assert found["state_share"]["low"] == pytest.approx(0.5, abs=0.01)
     # Speeds 1/30 and 1/60 average to 1/40.
@@ -108,8 +119,12 @@ def test_arrival_rates_at_both_ends(rate: float, engine: str) -> None:
 
 
 def test_service_rates_at_both_ends_under_one_chain() -> None:
-    section = {"preset": "ch6", "service": {"mean_ms": [1e-9, 1e9]}, "service_state": "modulated",
-               "discipline": "drop-new"}  # fmt: skip
+    section = {
+        "preset": "ch6",
+        "service": {"mean_ms": [1e-9, 1e9]},
+        "service_state": "modulated",
+        "discipline": "drop-new",
+    }
     python, kernel = run(section, "python"), run(section, "auto")
     assert python["delivered"] == kernel["delivered"] > 0
     # A frame that starts in the slow state waits for the fast one, half a sojourn of 30 ms and more away.
@@ -127,9 +142,7 @@ def test_a_frame_after_years_of_silence() -> None:
     link = Channel(channel_from_mapping({"preset": "ch5"}), 0).link("late")
     transit, _ = link.offer(3 * 365 * 86_400 * 10**9)
     events = link.advance(NEVER_NS)
-    assert (
-        events[-1].kind is EventKind.DELIVERED and transit.drawn_ns is not None and transit.drawn_ns < 10**9
-    )
+    assert events[-1].kind is EventKind.DELIVERED and transit.drawn_ns is not None and transit.drawn_ns < 10**9
 
 
 def test_a_clock_that_jumps() -> None:

@@ -54,12 +54,7 @@ def test_none_gives_none(shipped):
 
 def test_what_is_no_picture_is_refused_by_number(shipped):
     good = HARD["black"]
-    for bad in (
-        np.zeros((0, 5, 3), np.uint8),
-        np.zeros((5, 5), np.uint8),
-        np.zeros((5, 5, 3)),
-        np.zeros(3, np.uint8),
-    ):
+    for bad in (np.zeros((0, 5, 3), np.uint8), np.zeros((5, 5), np.uint8), np.zeros((5, 5, 3)), np.zeros(3, np.uint8)):
         with pytest.raises(EmbeddingError, match="image 1: expected uint8"):
             shipped.embed([good, bad])
 
@@ -78,9 +73,7 @@ def test_a_letterbox_keeps_aspect_and_never_loses_the_picture(shape):
 
 @pytest.mark.parametrize("gain", [np.nan, np.inf, -np.inf, 3e38])
 def test_a_model_that_gives_nan_or_overflows_gives_zero_rows_that_are_counted(tmp_path, gain):
-    made = make_embedder(
-        EmbeddingConfig(str(detector(tmp_path / "d.onnx", gain=gain)), CHANNELS, provider="cpu")
-    )
+    made = make_embedder(EmbeddingConfig(str(detector(tmp_path / "d.onnx", gain=gain)), CHANNELS, provider="cpu"))
     rows = made.embed([HARD["checkers"], HARD["white"]])
     assert np.isfinite(rows).all() and not rows.any() and made.failed == 2
 
@@ -103,9 +96,7 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     cache, square = EmbeddingCache(made, ViewDecoder().view), Pinhole.from_fov(32, 32, 60.0)
     items = [
         BufferedFrame(
-            frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8))),
-            0,
-            0,
+            frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8))), 0, 0
         )
         for k, v in enumerate((0, 255, 0))
     ]
@@ -122,9 +113,7 @@ def test_two_hundred_cameras_of_all_sizes(shipped):
         camera = Pinhole.from_fov(width, height, 60.0)
         items.append(
             BufferedFrame(
-                frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")),
-                k,
-                k,
+                frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")), k, k
             )
         )
     rows, ok = cache.of(items)

@@ -29,22 +29,28 @@ _POSES = {"refine_m": 0.05, "refine_deg": 2.0}
 _FEW = {"batch_samples": 8192, "rays": 9}
 # Of each kind, settings that together go through all of its kernels, and steps of each fit.
 THROUGH_ALL: dict[str, tuple[int, tuple[dict[str, Any], ...]]] = {
-    "ngp": (20, (
-        {}, {"smooth": 0.1, "harmonics": 4, **_PLAIN}, _FEW,
-        # Views are nanoseconds apart.
-        {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6},
-    )),
-    "tensorf": (50, (
-        {}, {"harmonics": 4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW,
-    )),
-    "nerfacto": (50, (
-        {"exposure": True, **_POSES}, {"harmonics": 4, **_PLAIN}, {"appearance": 3, **_POSES},
-        {**_FEW, "contracted": True, "radius_m": 0.5},
-    )),
-    "voxel": (20, (
-        {}, {"contracted": True, "radius_m": 0.5}, {"parts": 7, "rays": 9, "background": "random"},
-    )),
-}  # fmt: skip
+    "ngp": (
+        20,
+        (
+            {},
+            {"smooth": 0.1, "harmonics": 4, **_PLAIN},
+            _FEW,
+            # Views are nanoseconds apart.
+            {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6},
+        ),
+    ),
+    "tensorf": (50, ({}, {"harmonics": 4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW)),
+    "nerfacto": (
+        50,
+        (
+            {"exposure": True, **_POSES},
+            {"harmonics": 4, **_PLAIN},
+            {"appearance": 3, **_POSES},
+            {**_FEW, "contracted": True, "radius_m": 0.5},
+        ),
+    ),
+    "voxel": (20, ({}, {"contracted": True, "radius_m": 0.5}, {"parts": 7, "rays": 9, "background": "random"})),
+}
 
 
 def go_through_all(kind: str) -> None:
@@ -61,10 +67,12 @@ def go_through_all(kind: str) -> None:
     for later in range(3):
         rolled = [np.roll(v.image, 3 * later, axis=0) for v in VIEWS]
         field.fit(
-            [replace(v, image=image, generated_ns=later * 10**8 + k * 10**7)
-             for k, (v, image) in enumerate(zip(VIEWS, rolled))],
+            [
+                replace(v, image=image, generated_ns=later * 10**8 + k * 10**7)
+                for k, (v, image) in enumerate(zip(VIEWS, rolled))
+            ],
             Budget(steps=10),
-        )  # fmt: skip
+        )
     packed = field.view_store._packed
     assert packed is not None
     assert (packed[1].weight > 0).any() and packed[1].drawn.size, "nothing is masked"
@@ -125,10 +133,14 @@ def _saturate_voxels(field: VoxelField) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "damage"),
-    [*product(KINDS, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
-     ("nerfacto", _poison_proposal), ("voxel", _poison_voxels), ("voxel", _poison_voxel_moments),
-     ("voxel", _poison_voxel_gradient)],
-)  # fmt: skip
+    [
+        *product(KINDS, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
+        ("nerfacto", _poison_proposal),
+        ("voxel", _poison_voxels),
+        ("voxel", _poison_voxel_moments),
+        ("voxel", _poison_voxel_gradient),
+    ],
+)
 def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) -> None:
     """What is not finite is left out, counted if it is a gradient, and gone 40 steps later."""
     field = tiny(kind)

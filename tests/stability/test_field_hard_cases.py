@@ -88,9 +88,7 @@ def test_two_hundred_cameras(name: str) -> None:
 @every_field
 def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: str) -> None:
     for eye in ((2.5, 0.0, 1.0), (0.0, 0.0, 2.5)):
-        poses = [
-            look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)
-        ]
+        poses = [look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)]
         views = [replace(v, camera_to_world=p, image=picture(v.intrinsics, p)) for v, p in zip(VIEWS, poses)]
         field = tiny(name)
         field.fit(views, Budget(steps=40))

@@ -17,8 +17,7 @@ def view(camera: Pinhole) -> View:
 
 
 @pytest.mark.parametrize(
-    "lens",
-    [(0.0, 0.0, 78.0, 69.6), (100.0, 100.0, 100.0, 100.0), (-100.0, 100.0, 0.0, 0.0), (1e30, 0.0, 0.0, 0.0)],
+    "lens", [(0.0, 0.0, 78.0, 69.6), (100.0, 100.0, 100.0, 100.0), (-100.0, 100.0, 0.0, 0.0), (1e30, 0.0, 0.0, 0.0)]
 )
 def test_a_lens_that_cannot_be_undone_is_refused_and_the_field_goes_on(lens):
     field = tiny_field()

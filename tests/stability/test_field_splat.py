@@ -33,11 +33,21 @@ def _moments(field: SplatField) -> None:
     field.cloud.v[::3] = np.nan
 
 
-@pytest.mark.parametrize("damage", [
-    _parameter(0, np.nan), _parameter(4, np.inf), _parameter(7, np.nan), _parameter(OPACITY, -np.inf),
-    _parameter(12, np.nan), _parameter(12, 1e38), _parameter(3, 1e30), _parameter(3, -1e30),
-    _parameter(1, 1e-41), _moments,
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _parameter(0, np.nan),
+        _parameter(4, np.inf),
+        _parameter(7, np.nan),
+        _parameter(OPACITY, -np.inf),
+        _parameter(12, np.nan),
+        _parameter(12, 1e38),
+        _parameter(3, 1e30),
+        _parameter(3, -1e30),
+        _parameter(1, 1e-41),
+        _moments,
+    ],
+)
 def test_damage_is_healed(damage: Callable[[SplatField], None]) -> None:
     field = SplatField(TINY)
     field.fit(VIEWS, Budget(steps=40))

@@ -212,15 +212,13 @@ CASES = {
     "a light on one side": Case(light=0.6),
     "a camera is knocked": Case(sent=_knocked),
     "a camera is knocked unnoticed": Case(sent=_knocked_unnoticed),
-    "all views equally old": Case(
-        arrives=lambda k, t: t + NETWORK_S + 0.3 * (t < 1.0), fresh_s=AGAIN_S, spread=False
-    ),
+    "all views equally old": Case(arrives=lambda k, t: t + NETWORK_S + 0.3 * (t < 1.0), fresh_s=AGAIN_S, spread=False),
     "one camera only": Case(arrives=_one_camera, fresh_s=AGAIN_S),
     "out of order by a second": Case(arrives=_out_of_order, fresh_s=AGAIN_S),
     "a burst after a blackout": Case(arrives=lambda k, t: max(t, 1.0) + NETWORK_S, fresh_s=AGAIN_S),
     "singular": Case(sent=_without_weight, fresh_s=AGAIN_S),
     "equal times": Case(sent=_clocks_that_stick, fresh_s=0.2 + NETWORK_S),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(autouse=True)

@@ -108,9 +108,7 @@ def test_memory_is_bounded_however_long_it_runs():
     assert len(buffer._times) <= 600
 
 
-@pytest.mark.parametrize(
-    "angle", [0.0, 1e-12, 1e-7, 1.0, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi - 1e-9]
-)
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1.0, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi - 1e-9])
 def test_between_two_poses_however_far_apart(angle):
     """Up to and past half a turn, where the shorter way changes sides: always a rigid motion between them."""
     a, b = at(10), Pose.from_matrix(at(10).matrix() @ turn(angle))

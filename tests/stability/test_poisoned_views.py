@@ -261,9 +261,7 @@ def _in_motion(poison: Poison | None, updates: int = 3) -> tuple[Shown, Shown]:
             now[BAD] = poison(now[BAD], update)
         field.fit(now, Budget(steps=STEPS))
         if update in (WARM + 3 + updates, WARM + 14):
-            pictures = [
-                (field.render(v.camera_to_world, v.intrinsics).color, v) for v in frames(BETWEEN, update)
-            ]
+            pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v) for v in frames(BETWEEN, update)]
             score = np.mean([psnr(color, v.image / 255.0) for color, v in pictures])
             result.append((float(score), int((field.cloud.guest > 0).sum())))
     _finite(field)

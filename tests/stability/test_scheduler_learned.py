@@ -11,15 +11,7 @@ from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Batch, Diagnostics, Learner
 from edge_server.scheduler.learned.state import State, StateLayout
-from tests.edge_server.scheduler.learned.problems import (
-    OMEGAS_MS,
-    FreshOnes,
-    Waits,
-    collect,
-    regret,
-    state,
-    teach,
-)
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, collect, regret, state, teach
 
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=4)
 SPECS = [Spec("select", LAYOUT), Spec("wait", LAYOUT, OMEGAS_MS)]
@@ -207,10 +199,7 @@ def test_probabilities_at_0_and_1(bias):
     assert actions.all() if bias > 0 else (actions.sum(axis=1) == 1).all()
     assert np.isfinite(logps).all()
     finite(
-        learner,
-        learner.update(
-            learner.batch(states, actions, logps, [d.reward(a)[0] for d, a in zip(drawn, actions)])
-        ),
+        learner, learner.update(learner.batch(states, actions, logps, [d.reward(a)[0] for d, a in zip(drawn, actions)]))
     )
 
 

@@ -20,14 +20,21 @@ SETTLED_S, END_S = 2.5, 4.5
 def _mean_psnr(field: Any, cameras: int, size: int, steps: int, update_ms: float) -> float:
     """PSNR at publication, dB, of a person walking in ``room``, with ``steps`` in each update."""
     room = {
-        "name": "short updates", "seed": 3, "cameras": {"count": cameras, "held_out": ["cam00"]},
+        "name": "short updates",
+        "seed": 3,
+        "cameras": {"count": cameras, "held_out": ["cam00"]},
         "source": {"kind": "world", "scene": "room", "width": size, "height": size, "fps": 15},
-        "channel": {"preset": "ch5"}, "edge": {"policy": {"name": "all"}},
-    }  # fmt: skip
+        "channel": {"preset": "ch5"},
+        "edge": {"policy": {"name": "all"}},
+    }
     settings = RunSettings(
-        steps, first_steps=150, compute=Compute(ms_per_update=0.9 * update_ms), epoch_ms=update_ms,
-        score_every_ms=200.0, grace_ms=500.0,
-    )  # fmt: skip
+        steps,
+        first_steps=150,
+        compute=Compute(ms_per_update=0.9 * update_ms),
+        epoch_ms=update_ms,
+        score_every_ms=200.0,
+        grace_ms=500.0,
+    )
     deployment = build_deployment(parse(room, Path("short")), settings, field=field)
     scores = [p.psnr_db for p in deployment.run(END_S) if p.t_s > SETTLED_S]
     return float(np.mean([s for s in scores if s is not None]))

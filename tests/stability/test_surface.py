@@ -27,9 +27,7 @@ def with_depth(found: DepthMap, depth: np.ndarray) -> DepthMap:
 
 
 def radii(maps, **settings) -> np.ndarray:
-    mesh = mesh_from_depth_maps(
-        maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper), **settings)
-    )
+    mesh = mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper), **settings))
     assert np.isfinite(mesh.vertices).all()
     return np.linalg.norm(mesh.vertices, axis=1)
 

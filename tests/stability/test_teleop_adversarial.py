@@ -72,9 +72,14 @@ def test_limits_hold_while_an_operator_pulls_everywhere(solver, seed):
     """Sound messages, so that the arm does move: wide swings, a clutch that chatters, lost and late ones."""
     rng = np.random.default_rng(seed)
     config = TeleopConfig(
-        solver=solver, scale=(4.0, 4.0, 4.0), rate_hz=100.0, speed_rad_s=3.0, acceleration_rad_s2=8.0,
-        speed_m_s=1.0, gain_per_s=15.0,
-    )  # fmt: skip
+        solver=solver,
+        scale=(4.0, 4.0, 4.0),
+        rate_hz=100.0,
+        speed_rad_s=3.0,
+        acceleration_rad_s2=8.0,
+        speed_m_s=1.0,
+        gain_per_s=15.0,
+    )
     operator = Teleoperator(UR3E, config, HOME)
     position, way, commands = np.zeros(3), np.zeros(3), []
     for k in range(250):

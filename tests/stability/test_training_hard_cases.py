@@ -62,20 +62,19 @@ def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
 def test_damaged_late_and_doubled_frames(tmp_path):
     channel = {
         "preset": "ch6",
-        "faults": {"corruption": {"probability": 0.3}, "duplication": {"probability": 0.3},
-                   "blackout": {"windows_ms": [[0.0, 1000.0]]}},
-    }  # fmt: skip
+        "faults": {
+            "corruption": {"probability": 0.3},
+            "duplication": {"probability": 0.3},
+            "blackout": {"windows_ms": [[0.0, 1000.0]]},
+        },
+    }
     weights_after(setting(channel), config(WAIT), tmp_path)
     assert all(row["reward"] is not None for row in read_log(tmp_path))
 
 
 def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
     alone = Setting(
-        scenario(cameras={"count": 2, "held_out": ["cam00"]}),
-        steps=3,
-        decisions=2,
-        lead_ms=800.0,
-        span_ms=400.0,
+        scenario(cameras={"count": 2, "held_out": ["cam00"]}), steps=3, decisions=2, lead_ms=800.0, span_ms=400.0
     )
     weights_after(alone, config(tries=2), tmp_path)
     # There is one set, so that no try is better than another.

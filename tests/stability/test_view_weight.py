@@ -70,9 +70,7 @@ def test_full_weights_are_the_same_as_none(name: str) -> None:
 
 @long
 def test_of_two_that_disagree_the_heavier_one_is_believed(name: str) -> None:
-    red, blue = (
-        np.broadcast_to(np.array(c, np.uint8), (24, 24, 3)).copy() for c in ((230, 20, 20), (20, 20, 230))
-    )
+    red, blue = (np.broadcast_to(np.array(c, np.uint8), (24, 24, 3)).copy() for c in ((230, 20, 20), (20, 20, 230)))
     views = []
     for k, view in enumerate(VIEWS):
         views.append(replace(view, camera=f"red{k}", image=red, weight=np.full((24, 24), 1.0, np.float32)))
@@ -83,10 +81,15 @@ def test_of_two_that_disagree_the_heavier_one_is_believed(name: str) -> None:
 
 @pytest.mark.parametrize(
     "weight",
-    [np.ones((24, 23), np.float32), np.ones((24, 24)), np.full((24, 24), np.nan, np.float32),
-     np.full((24, 24), 1.5, np.float32), np.full((24, 24), -0.1, np.float32)],
+    [
+        np.ones((24, 23), np.float32),
+        np.ones((24, 24)),
+        np.full((24, 24), np.nan, np.float32),
+        np.full((24, 24), 1.5, np.float32),
+        np.full((24, 24), -0.1, np.float32),
+    ],
     ids=["shape", "float64", "nan", "above", "below"],
-)  # fmt: skip
+)
 def test_a_weight_that_is_none_is_refused_by_camera(weight) -> None:
     field = tiny("voxel")
     with pytest.raises(ValueError, match=r"cam02: weight must be float32 of shape .24, 24. within 0..1"):

@@ -37,9 +37,9 @@ def test_candidates_that_hardly_differ_are_taken_once_each(candidates: Candidate
     assert len(set(plan.order)) == len(plan.order) == min(4, len(candidates))
 
 
-@pytest.mark.parametrize("answers", [
-    [], [Answer(0, 1, True)], [Answer(0, 1, True), Answer(0, 1, False)] * 30, [Answer(2, 2, True)] * 9,
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "answers", [[], [Answer(0, 1, True)], [Answer(0, 1, True), Answer(0, 1, False)] * 30, [Answer(2, 2, True)] * 9]
+)
 @hard
 def test_answers_about_what_hardly_differs_say_nothing(candidates: Candidates, answers: list[Answer]) -> None:
     steps = StepFeatures(candidates)

@@ -51,7 +51,7 @@ EXTREMES: dict[str, list[dict]] = {
         {"refractive_index": 50.0, "roughness": 1.0},
     ],
     "vignetting": [{"exponent": 0.0}, {"exponent": 64.0}],
-}  # fmt: skip
+}
 CASES = [(name, parameters) for name, some in EXTREMES.items() for parameters in some]
 
 

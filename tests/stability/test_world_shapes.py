@@ -15,9 +15,14 @@ from camera_node.synthetic.textures import Checker
 from freshfield.geometry import Pinhole, look_at
 
 SHAPES = [
-    Sphere(0.5), Box((0.5, 0.3, 0.7)), Cylinder(0.4, 0.6), RoundCone(0.4, 0.1, 0.9),
-    RoundCone(0.2, 0.4, 0.3), capsule(0.3, 0.6), Quad((0.5, 0.5)),
-]  # fmt: skip
+    Sphere(0.5),
+    Box((0.5, 0.3, 0.7)),
+    Cylinder(0.4, 0.6),
+    RoundCone(0.4, 0.1, 0.9),
+    RoundCone(0.2, 0.4, 0.3),
+    capsule(0.3, 0.6),
+    Quad((0.5, 0.5)),
+]
 AXES = np.concatenate([np.eye(3), -np.eye(3)]).T
 
 

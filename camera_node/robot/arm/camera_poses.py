@@ -66,9 +66,7 @@ def mount_on_hand(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64]:
     raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
 
 
-def camera_poses(
-    scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str]
-) -> dict[str, PoseProvider]:
+def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str]) -> dict[str, PoseProvider]:
     """Poses of those ``cameras`` that ``config`` lists, by camera. Connects to the arm if one of them is on
     its hand. Raises ScenarioError and ArmError."""
     if config is None:

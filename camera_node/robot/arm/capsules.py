@@ -19,12 +19,24 @@ Array = NDArray[np.float64]
 
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
 PAIRS = (
-    (0, 3), (0, 4), (0, 5), (0, 6), (0, 7),
-    (1, 3), (1, 4), (1, 5), (1, 6), (1, 7),
-    (2, 4), (2, 5), (2, 6), (2, 7),
-    (3, 6), (3, 7),
+    (0, 3),
+    (0, 4),
+    (0, 5),
+    (0, 6),
+    (0, 7),
+    (1, 3),
+    (1, 4),
+    (1, 5),
+    (1, 6),
+    (1, 7),
+    (2, 4),
+    (2, 5),
+    (2, 6),
+    (2, 7),
+    (3, 6),
+    (3, 7),
     (4, 7),
-)  # fmt: skip
+)
 ABOVE_FLOOR = (3, 4, 5, 6, 7)
 _UPPER_ARM_M, _FOREARM_M = 0.1198, 0.0273
 _RADII_M = (0.064, 0.055, 0.046, 0.04, 0.036, 0.036, 0.033)
@@ -102,9 +114,7 @@ def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
     tiny = 1e-18
     denominator = uu * vv - uv * uv
     # For parallel segments any point of one will do: the nearest point of the other is found and clamped.
-    s = np.where(
-        denominator > 1e-12 * uu * vv, (uv * vr - ur * vv) / np.maximum(denominator, tiny), 0.0
-    ).clip(0.0, 1.0)
+    s = np.where(denominator > 1e-12 * uu * vv, (uv * vr - ur * vv) / np.maximum(denominator, tiny), 0.0).clip(0.0, 1.0)
     t = np.where(vv > tiny, (uv * s + vr) / np.maximum(vv, tiny), 0.0)
     clamped = t.clip(0.0, 1.0)
     s = np.where(uu > tiny, (clamped * uv - ur) / np.maximum(uu, tiny), 0.0).clip(0.0, 1.0)

@@ -50,8 +50,7 @@ def joint_states(arm: ArmConfig) -> str:
         raise ValueError(f"{trouble}: see the teach pendant; poses are right all the same")
     if samples < 0.8 * arm.frequency_hz:
         raise ValueError(
-            f"{samples:.0f} joint states a second of {arm.frequency_hz:g}: is the network or this "
-            "machine busy?"
+            f"{samples:.0f} joint states a second of {arm.frequency_hz:g}: is the network or this machine busy?"
         )
     return f"{arm.host}: running, {samples:.0f} joint states a second"
 
@@ -68,6 +67,4 @@ def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
         f"{elevation_deg:g} degrees {reached} of {count // len(tour_path.elevations_deg)}"
         for elevation_deg, reached in zip(tour_path.elevations_deg, tour.reached_by_ring(tour_path))
     )
-    raise ValueError(
-        f"{summary} ({rings}): change radius_m, elevations_deg, azimuths_deg or where the base stands"
-    )
+    raise ValueError(f"{summary} ({rings}): change radius_m, elevations_deg, azimuths_deg or where the base stands")

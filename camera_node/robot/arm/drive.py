@@ -156,11 +156,7 @@ def stop_signals() -> list[signal.Signals]:
 
 
 def visit_stops(
-    control: Any,
-    stream: ArmStream,
-    stops: Iterable[np.ndarray],
-    path: PathConfig,
-    stop_requested: threading.Event,
+    control: Any, stream: ArmStream, stops: Iterable[np.ndarray], path: PathConfig, stop_requested: threading.Event
 ) -> None:
     """Move the arm to each of ``stops`` in turn, then bring it to rest, also after an error.
 
@@ -216,9 +212,7 @@ def joints_in_motion(stream: ArmStream) -> np.ndarray:
     return joints
 
 
-def _wait_until_arrived(
-    stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event
-) -> bool:
+def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> bool:
     """Wait until the joints reach ``goal``; False if asked to stop. Raises ArmError if the arm's state is too
     old, or if it stalls or its program ends on the way."""
     patience_s = max(_STALLED_S, stream.stale_s)

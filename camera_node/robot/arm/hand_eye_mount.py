@@ -79,9 +79,7 @@ def read_hand_eye(path: Path) -> HandEye:
     except (OSError, UnicodeDecodeError, UntrustedError) as error:
         raise HandEyeError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict) or "transform" not in data:
-        raise HandEyeError(
-            f"{path}: expected setup and transform, as camera-node calibrate hand-eye --out writes"
-        )
+        raise HandEyeError(f"{path}: expected setup and transform, as camera-node calibrate hand-eye --out writes")
     setup = data.pop("setup", EYE_IN_HAND)
     if setup not in SETUPS:
         raise HandEyeError(f"{path}: setup: expected {' or '.join(SETUPS)}, got {setup!r}")
@@ -94,9 +92,7 @@ def read_hand_eye(path: Path) -> HandEye:
         if not abs(offset_s) < MAX_OFFSET_S:
             raise ValueError
     except (ValueError, TypeError, OverflowError):
-        raise HandEyeError(
-            f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way"
-        ) from None
+        raise HandEyeError(f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way") from None
     return HandEye(setup, transform, offset_s, data)
 
 

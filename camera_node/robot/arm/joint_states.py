@@ -42,13 +42,27 @@ STALE_S = 0.5
 """Default age at which a state counts as stale."""
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _ROBOT_MODES = {
-    -1: "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "powered off",
-    4: "powered on, brakes engaged", 5: "idle: brakes engaged", 6: "backdrive", 7: "running",
-}  # fmt: skip
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "powered off",
+    4: "powered on, brakes engaged",
+    5: "idle: brakes engaged",
+    6: "backdrive",
+    7: "running",
+}
 _SAFETY_MODES = {
-    1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop",
-    6: "system emergency stop", 7: "robot emergency stop", 8: "safety violation", 9: "safety fault",
-}  # fmt: skip
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "safety violation",
+    9: "safety fault",
+}
 
 
 class ArmError(ValueError):
@@ -116,9 +130,7 @@ class ArmStream:
         self.connections = 0
         self._clock, self._on_sample = clock, on_sample
         self._frequency_hz, self._interpolate = frequency_hz, interpolate
-        self._samples = SampleBuffer[Joints](
-            interpolate_joints if interpolate else None, round(max_gap_ms * 1e6)
-        )
+        self._samples = SampleBuffer[Joints](interpolate_joints if interpolate else None, round(max_gap_ms * 1e6))
         self._first_sample = threading.Event()
         self._stop = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
@@ -191,8 +203,9 @@ class ArmStream:
         module = "camera_node.robot.arm.rtde_process"
         child = subprocess.Popen(
             [sys.executable, "-m", module, self.host, str(self._frequency_hz)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
         self._child = child
         assert child.stdout is not None and child.stderr is not None
         received, patience_s = False, CONNECT_S
@@ -262,9 +275,7 @@ class HandPoses:
     wait_s: longest wait for the sample after the instant, which interpolation needs.
     """
 
-    def __init__(
-        self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = 0.03
-    ) -> None:
+    def __init__(self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = 0.03) -> None:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 
     def at(self, t_ns: int) -> tuple[Pose, int]:

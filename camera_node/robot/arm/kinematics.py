@@ -268,12 +268,9 @@ def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
 def _dh_transform(theta: float, d: float, a: float, alpha: float) -> Array:
     """Rz(theta) Tz(d) Tx(a) Rx(alpha), (4, 4)."""
     ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-    return np.array([
-        [ct, -st * ca, st * sa, a * ct],
-        [st, ct * ca, -ct * sa, a * st],
-        [0.0, sa, ca, d],
-        [0.0, 0.0, 0.0, 1.0],
-    ])  # fmt: skip
+    return np.array(
+        [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
+    )
 
 
 def pose_difference(now: Array, wanted: Array) -> Array:

@@ -79,9 +79,7 @@ class Tour:
         return [visited_deg.count(elevation_deg) for elevation_deg in path.elevations_deg]
 
 
-def plan_tour(
-    arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, start: ArrayLike | None = None
-) -> Tour:
+def plan_tour(arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, start: ArrayLike | None = None) -> Tour:
     """Plan a tour that always goes on to the nearest viewpoint left, if necessary through earlier ones.
 
     base: world-from-base (4, 4).

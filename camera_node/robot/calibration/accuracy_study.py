@@ -79,13 +79,19 @@ def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, 
                 found = [pose.matrix() for pose, _ in paired]
                 mm = np.array([distance_mm(a, b) for a, b in zip(found, truth)])
                 deg = np.array([angle_deg(a, b) for a, b in zip(found, truth)])
-                rows.append({
-                    "speed_m_per_s": speed, "arm_period_ms": period_ms, "pairing": name,
-                    "gap_ms_mean": float(np.mean([gap_ns for _, gap_ns in paired])) / 1e6,
-                    "mm_p50": float(np.median(mm)), "mm_p95": float(np.quantile(mm, 0.95)),
-                    "deg_p50": float(np.median(deg)), "deg_p95": float(np.quantile(deg, 0.95)),
-                    "us_a_pair": spent / len(frames_s) * 1e6,
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "speed_m_per_s": speed,
+                        "arm_period_ms": period_ms,
+                        "pairing": name,
+                        "gap_ms_mean": float(np.mean([gap_ns for _, gap_ns in paired])) / 1e6,
+                        "mm_p50": float(np.median(mm)),
+                        "mm_p95": float(np.quantile(mm, 0.95)),
+                        "deg_p50": float(np.median(deg)),
+                        "deg_p95": float(np.quantile(deg, 0.95)),
+                        "us_a_pair": spent / len(frames_s) * 1e6,
+                    }
+                )
     return rows
 
 
@@ -101,10 +107,7 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
         spent = dict.fromkeys(methods, 0.0)
         for trial in range(trials):
             rng = np.random.default_rng([seed, 2, count, trial])
-            of = {
-                "random": _samples(simulated.random_hands(count, rng), rng),
-                "planned": _proposed_hands(count, rng),
-            }
+            of = {"random": _samples(simulated.random_hands(count, rng), rng), "planned": _proposed_hands(count, rng)}
             for name, method in methods.items():
                 exact, samples = of["planned" if name == PLANNED else "random"]
                 bounds[name].append(cramer_rao_bound(exact, x, y, _NOISE))
@@ -118,12 +121,21 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
         for name in methods:
             (deg, mm), (deg_std, mm_std) = rms(np.reshape(errors[name], (-1, 2)))
             least = np.sqrt(np.mean(np.square(bounds[name]), axis=0))
-            rows.append({
-                "poses": count, "method": name, "trials": trials,
-                "rms_mm": float(mm), "rms_mm_std": float(mm_std), "bound_mm": float(least[1]),
-                "rms_deg": float(deg), "rms_deg_std": float(deg_std), "bound_deg": float(least[0]),
-                "failed": trials - len(errors[name]), "ms": spent[name] / trials * 1e3,
-            })  # fmt: skip
+            rows.append(
+                {
+                    "poses": count,
+                    "method": name,
+                    "trials": trials,
+                    "rms_mm": float(mm),
+                    "rms_mm_std": float(mm_std),
+                    "bound_mm": float(least[1]),
+                    "rms_deg": float(deg),
+                    "rms_deg_std": float(deg_std),
+                    "bound_deg": float(least[0]),
+                    "failed": trials - len(errors[name]),
+                    "ms": spent[name] / trials * 1e3,
+                }
+            )
     return rows
 
 
@@ -153,9 +165,7 @@ def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samp
     middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
     while len(hands) < count:
         so_far = Samples(hands, simulated.observed_targets(hands))
-        proposed = propose_pose(
-            so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng
-        )
+        proposed = propose_pose(so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng)
         hands = np.concatenate([hands, proposed[None]])
     return _samples(hands, rng)
 
@@ -182,18 +192,22 @@ def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
                 coarse.append(found.coarse_s - true_s)
                 said.append(found.std_s)
                 mm.append(distance_mm(found.refined.x, simulated.CAMERA_IN_HAND))
-            rows.append({
-                "speed_m_per_s": speed, "seconds": duration_s, "failed": failed, "coarse_ms": _rms_ms(coarse),
-                "error_ms": _rms_ms(errors), "said_std_ms": _rms_ms(said),
-                "camera_mm": float(np.sqrt(np.mean(np.square(mm)))) if mm else float("nan"),
-                "cpu_s": spent / max(1, len(errors)),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "speed_m_per_s": speed,
+                    "seconds": duration_s,
+                    "failed": failed,
+                    "coarse_ms": _rms_ms(coarse),
+                    "error_ms": _rms_ms(errors),
+                    "said_std_ms": _rms_ms(said),
+                    "camera_mm": float(np.sqrt(np.mean(np.square(mm)))) if mm else float("nan"),
+                    "cpu_s": spent / max(1, len(errors)),
+                }
+            )
     return rows
 
 
-def streams(
-    sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator
-) -> tuple[Track, Track]:
+def streams(sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator) -> tuple[Track, Track]:
     """Hand track at 125 Hz and target track at 15 Hz, both noisy, with ``offset_s`` between their stamps."""
     hand_s = np.arange(0.0, seconds, 1 / 125.0)
     seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
@@ -213,9 +227,7 @@ def plot(pairing_rows: Rows, poses_rows: Rows, path: Path) -> None:
         for name in INTERPOLATIONS:
             chosen = [r for r in pairing_rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
             left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
-        left.set(
-            xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s"
-        )
+        left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
         left.legend()
         for name in (*ALL_METHODS, PLANNED):
             chosen = [r for r in poses_rows if r["method"] == name]
@@ -225,10 +237,7 @@ def plot(pairing_rows: Rows, poses_rows: Rows, path: Path) -> None:
                 right.loglog(counts, [r["bound_mm"] for r in chosen], "k--", linewidth=0.8)
         right.set_xticks([4, 6, 10, 20, 50], ["4", "6", "10", "20", "50"], minor=False)
         right.set_xticks([], minor=True)
-        right.set(
-            xlabel="poses", ylabel="camera in hand, rms (mm)",
-            title="arm noise .5 mm, .002 rad (dashed: bounds)",
-        )  # fmt: skip
+        right.set(xlabel="poses", ylabel="camera in hand, rms (mm)", title="arm noise .5 mm, .002 rad (dashed: bounds)")
         right.legend()
 
 

@@ -46,12 +46,13 @@ input, one of:
 
 # Option -> the inputs that use it. With any other input it is an error.
 _GOES_WITH = {
-    "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
+    "board": ("folder", "live"),
+    "lens": ("folder", "live"),
+    "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
-        ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"),
-        ("live",),
+        ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"), ("live",)
     ),
-}  # fmt: skip
+}
 _INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
 
 
@@ -60,50 +61,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
     what = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raw = argparse.RawDescriptionHelpFormatter
-    _add_hand_eye(what.add_parser("hand-eye", help="pose of a camera on the end effector",
-                                  description=HAND_EYE, epilog=EXAMPLES, formatter_class=raw))  # fmt: skip
-    lens = what.add_parser("intrinsics", help="a camera's intrinsics from pictures of a target",
-                           epilog=EXAMPLES, formatter_class=raw)  # fmt: skip
-    lens.add_argument(
-        "folder", type=Path, nargs="?", metavar="FOLDER",
-        help="folder of 10 to 20 pictures, the target tilted and in every corner",
-    )  # fmt: skip
-    lens.add_argument(
-        "--live", metavar="SCENARIO",
-        help="instead of FOLDER: a guided session that says where to show the target and when to stop",
-    )  # fmt: skip
-    _add_board(lens, required=True)
-    lens.add_argument(
-        "--camera",
-        default="cam00",
-        metavar="ID",
-        help="camera of --live, and its name in the file [%(default)s]",
+    _add_hand_eye(
+        what.add_parser(
+            "hand-eye",
+            help="pose of a camera on the end effector",
+            description=HAND_EYE,
+            epilog=EXAMPLES,
+            formatter_class=raw,
+        )
+    )
+    lens = what.add_parser(
+        "intrinsics", help="a camera's intrinsics from pictures of a target", epilog=EXAMPLES, formatter_class=raw
     )
     lens.add_argument(
-        "--out",
+        "folder",
         type=Path,
-        metavar="FILE",
-        help="calibration JSON to write, as source kinds camera and video read it",
+        nargs="?",
+        metavar="FOLDER",
+        help="folder of 10 to 20 pictures, the target tilted and in every corner",
+    )
+    lens.add_argument(
+        "--live",
+        metavar="SCENARIO",
+        help="instead of FOLDER: a guided session that says where to show the target and when to stop",
+    )
+    _add_board(lens, required=True)
+    lens.add_argument(
+        "--camera", default="cam00", metavar="ID", help="camera of --live, and its name in the file [%(default)s]"
+    )
+    lens.add_argument(
+        "--out", type=Path, metavar="FILE", help="calibration JSON to write, as source kinds camera and video read it"
     )
     lens.add_argument("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
     live = _add_live_group(lens)
-    live(
-        "--moving",
-        action="store_true",
-        help="also take pictures while the target moves; needs short exposures",
+    live("--moving", action="store_true", help="also take pictures while the target moves; needs short exposures")
+    target = what.add_parser(
+        "target", help="write an image of a target, to print", epilog=EXAMPLES, formatter_class=raw
     )
-    target = what.add_parser("target", help="write an image of a target, to print", epilog=EXAMPLES,
-                             formatter_class=raw)  # fmt: skip
     target.add_argument("board", metavar="SPEC", help="target, as in hand-eye --board")
     target.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="image to write")
     target.add_argument("--dpi", type=float, default=300.0, help="dots per inch [%(default)g]")
-    study = what.add_parser("accuracy", help="simulated errors by gaps, speed and number of poses",
-                            epilog=EXAMPLES, formatter_class=raw)  # fmt: skip
+    study = what.add_parser(
+        "accuracy", help="simulated errors by gaps, speed and number of poses", epilog=EXAMPLES, formatter_class=raw
+    )
     study.add_argument("--quick", action="store_true", help="a smaller study: seconds, not minutes")
     study.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    study.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write the tables (CSV) and a figure to"
-    )
+    study.add_argument("--out", type=Path, metavar="DIR", help="folder to write the tables (CSV) and a figure to")
     study.add_argument("--json", action="store_true", help="print the tables as JSON")
 
 
@@ -112,10 +115,7 @@ def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
     live = parser.add_argument_group("with --live").add_argument
     live("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     live(
-        "--preview",
-        type=Path,
-        metavar="FILE.png",
-        help="keep the newest picture, with the corners found, in this file",
+        "--preview", type=Path, metavar="FILE.png", help="keep the newest picture, with the corners found, in this file"
     )
     live("--seconds", type=float, metavar="S", help="end the session after S seconds")
     return live
@@ -123,10 +123,12 @@ def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
 
 def _add_board(parser: argparse.ArgumentParser, required: bool) -> None:
     parser.add_argument(
-        "--board", required=required, metavar="SPEC",
+        "--board",
+        required=required,
+        metavar="SPEC",
         help="target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners), "
         "apriltag:36h11:0:80mm, qr:60mm[:TEXT]",
-    )  # fmt: skip
+    )
 
 
 # fmt: off
@@ -187,13 +189,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _hand_eye(args: argparse.Namespace) -> int:
-    given = {
-        name for name in ("folder", "pairs", "hand", "target", "live") if getattr(args, name) is not None
-    }
+    given = {name for name in ("folder", "pairs", "hand", "target", "live") if getattr(args, name) is not None}
     if given not in ({"folder"}, {"pairs"}, {"hand", "target"}, {"live"}, {"live", "hand"}):
-        raise CalibrationError(
-            "expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO"
-        )
+        raise CalibrationError("expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO")
     for option, goes_with in _GOES_WITH.items():
         if getattr(args, option) not in (None, False) and not given & set(goes_with):
             places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
@@ -234,8 +232,10 @@ def _calibrate(args: argparse.Namespace) -> Calibration:
         hand, target = files.read_track(args.hand), files.read_track(args.target)
         for name, track in (("hand", hand), ("target", target)):
             if track.counts.duplicates or track.counts.reordered:
-                _note(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
-                     f"{track.counts.reordered} out of order (sorted)")  # fmt: skip
+                _note(
+                    f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
+                    f"{track.counts.reordered} out of order (sorted)"
+                )
         return hand_eye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")

@@ -93,9 +93,7 @@ def read_visp_pose(file: Path) -> Array:
             raise ValueError(f"{values.size} numbers")
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = " ".join(str(error).split())
-        raise CalibrationError(
-            f"{file}: expected ViSP's YAML of a pose, data: tx ty tz and theta u: {why}"
-        ) from None
+        raise CalibrationError(f"{file}: expected ViSP's YAML of a pose, data: tx ty tz and theta u: {why}") from None
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = so3_exp(values[3:]), values[:3]
     return out
@@ -114,17 +112,20 @@ def read_lens(file: Path) -> Pinhole:
         if camera is None:
             raise ValueError("no camera")
         models = {(m.findtext("type") or "").strip(): m for m in camera.iter("model")}
-        name = next(n for n in ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion")
-                    if n in models)  # fmt: skip
+        name = next(n for n in ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion") if n in models)
 
         def number(key: str, default: str | None = None) -> float:
             return float(models[name].findtext(key) or default or "missing")
 
         return Pinhole(
-            int(camera.findtext("image_width") or 0), int(camera.findtext("image_height") or 0),
-            number("px"), number("py"), number("u0") + 0.5, number("v0") + 0.5,
+            int(camera.findtext("image_width") or 0),
+            int(camera.findtext("image_height") or 0),
+            number("px"),
+            number("py"),
+            number("u0") + 0.5,
+            number("v0") + 0.5,
             (number("kud", "0"), 0.0, 0.0, 0.0),
-        )  # fmt: skip
+        )
     except (OSError, ElementTree.ParseError, StopIteration, ValueError) as error:
         raise CalibrationError(
             f"{file}: expected ViSP's camera XML with px, py, u0, v0: {error or 'no model known'}"
@@ -183,18 +184,19 @@ def _pixel_noise(seen: Sequence[TargetPose]) -> float:
     return max(float(np.sqrt(squares / max(freedom, 1))), _MIN_PIXEL_NOISE)
 
 
-def to_samples(
-    seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str
-) -> Samples:
+def to_samples(seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str) -> Samples:
     """Samples with the target's covariance from the noise of its corners.
 
     seen, hands, names: target poses, hand poses in base (4, 4), and names for messages.
     """
     noise = _pixel_noise(seen)
     return Samples(
-        _stacked(list(hands)), _stacked([s.pose for s in seen]), setup,
-        np.array([s.unit_covariance * noise**2 for s in seen]).reshape(-1, 6, 6), tuple(names),
-    )  # fmt: skip
+        _stacked(list(hands)),
+        _stacked([s.pose for s in seen]),
+        setup,
+        np.array([s.unit_covariance * noise**2 for s in seen]).reshape(-1, 6, 6),
+        tuple(names),
+    )
 
 
 def read_visp_folder(
@@ -209,17 +211,13 @@ def read_visp_folder(
     if lens is None:
         lenses = sorted(folder.glob("*.xml"))
         if len(lenses) != 1:
-            raise CalibrationError(
-                f"{folder}: has {len(lenses)} camera XML files; name the lens: --lens FILE"
-            )
+            raise CalibrationError(f"{folder}: has {len(lenses)} camera XML files; name the lens: --lens FILE")
         lens = read_lens(lenses[0])
     files = list_images(folder)
     poses = {_number(f): f for f in folder.glob("*.yaml") if _number(f) is not None}
     paired = [f for f in files if _number(f) in poses]
     if not paired:
-        raise CalibrationError(
-            f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)"
-        )
+        raise CalibrationError(f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)")
     found, unused, _ = find_corners(paired, target, (lens.width, lens.height), progress)
     seen: dict[str, TargetPose] = {}
     for name, corners in found.items():

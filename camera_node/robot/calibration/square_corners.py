@@ -50,9 +50,12 @@ def _side(picture: NDArray[np.uint8], corners: Array, k: int) -> tuple[Array, Ar
     depth = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
     at = start + _SHARES[:, None, None] * along + depth[:, None] * across
     gray = cv2.remap(
-        picture, at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), cv2.INTER_LINEAR,
+        picture,
+        at[..., 0].astype(np.float32),
+        at[..., 1].astype(np.float32),
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
-    ).astype(np.float64)  # fmt: skip
+    ).astype(np.float64)
     ends = max(2, len(depth) // 6)
     inside, outside = gray[:, :ends].mean(axis=1), gray[:, -ends:].mean(axis=1)
     contrast = outside - inside

@@ -134,9 +134,7 @@ def to_gray(image: NDArray[np.uint8]) -> GrayImage:
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
-def _charuco(
-    name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50", *extra: str
-) -> Target:
+def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50", *extra: str) -> Target:
     across, down = _counts(squares)
     side, inner = _meters(square), _meters(marker)
     if not inner < side or extra:
@@ -241,8 +239,11 @@ def _qr(name: str, size: str, *text: str) -> Target:
 
 
 _MAKERS: dict[str, Callable[..., Target]] = {
-    "charuco": _charuco, "chessboard": _chessboard, "apriltag": _apriltag, "qr": _qr,
-}  # fmt: skip
+    "charuco": _charuco,
+    "chessboard": _chessboard,
+    "apriltag": _apriltag,
+    "qr": _qr,
+}
 
 
 def _refined_square(picture: GrayImage, pixels: NDArray[Any], side: float) -> Corners:

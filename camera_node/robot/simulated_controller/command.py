@@ -41,9 +41,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         asyncio.run(serve())
     except OSError as error:
-        print(
-            f"camera-node: {host}: {error.strerror}: is another arm simulated there? --host", file=sys.stderr
-        )
+        print(f"camera-node: {host}: {error.strerror}: is another arm simulated there? --host", file=sys.stderr)
         return 1
     return 0
 

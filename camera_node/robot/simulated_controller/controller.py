@@ -108,17 +108,29 @@ class Controller:
         running = self.runtime_state == PLAYING
         return {
             "timestamp": self.steps * STEP_S * self._drift,
-            "target_q": m.q, "target_qd": m.qd, "target_qdd": m.qdd, "actual_q": q, "actual_qd": m.qd,
-            "actual_TCP_pose": pose, "target_TCP_pose": pose,
+            "target_q": m.q,
+            "target_qd": m.qd,
+            "target_qdd": m.qdd,
+            "actual_q": q,
+            "actual_qd": m.qd,
+            "actual_TCP_pose": pose,
+            "target_TCP_pose": pose,
             "actual_TCP_speed": self.arm.jacobian(q) @ m.qd if m.qd.any() else None,
-            "joint_temperatures": (25.0,) * 6, "joint_mode": (253,) * 6,
-            "robot_mode": 7, "safety_mode": 1, "safety_status": 1, "safety_status_bits": 1,
+            "joint_temperatures": (25.0,) * 6,
+            "joint_mode": (253,) * 6,
+            "robot_mode": 7,
+            "safety_mode": 1,
+            "safety_status": 1,
+            "safety_status_bits": 1,
             "robot_status_bits": 0b11 if running else 0b01,
             "runtime_state": self.runtime_state,
-            "speed_scaling": 1.0, "target_speed_fraction": 1.0,
-            "actual_main_voltage": 48.0, "actual_robot_voltage": 48.0, "actual_joint_voltage": (48.0,) * 6,
+            "speed_scaling": 1.0,
+            "target_speed_fraction": 1.0,
+            "actual_main_voltage": 48.0,
+            "actual_robot_voltage": 48.0,
+            "actual_joint_voltage": (48.0,) * 6,
             "output_int_register_0": self.answer,
-        }  # fmt: skip
+        }
 
     def start_program(self) -> None:
         """Start the program that a client has uploaded."""

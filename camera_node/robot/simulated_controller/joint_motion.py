@@ -130,10 +130,7 @@ class JointMotion:
 
     def _within_limits(self, goal: Array) -> bool:
         return bool(
-            goal.shape == (6,)
-            and np.isfinite(goal).all()
-            and np.all(goal >= self._low)
-            and np.all(goal <= self._high)
+            goal.shape == (6,) and np.isfinite(goal).all() and np.all(goal >= self._low) and np.all(goal <= self._high)
         )
 
 

@@ -26,9 +26,17 @@ MAX_PACKET = 4096
 NOT_FOUND = "NOT_FOUND"
 
 _FORMATS = {
-    "BOOL": "?", "UINT8": "B", "UINT32": "I", "UINT64": "Q", "INT32": "i", "DOUBLE": "d", "VECTOR3D": "3d",
-    "VECTOR6D": "6d", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I",
-}  # fmt: skip
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+    "VECTOR6UINT32": "6I",
+}
 _TYPES = {
     "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum "
     "actual_main_voltage actual_robot_voltage actual_robot_current standard_analog_input0 "

@@ -35,10 +35,14 @@ VERSION = (5, 12, 0, 0)
 _MAX_WAITING_BYTES = 1 << 20
 _IDLE_STEPS = 4
 _DASHBOARD = {
-    "polyscopeversion": "URSoftware 5.12.0.0 (simulated)", "get serial number": "20230000001",
-    "get robot model": "UR3", "is in remote control": "true", "robotmode": "Robotmode: RUNNING",
-    "safetystatus": "Safetystatus: NORMAL", "safetymode": "Safetymode: NORMAL",
-}  # fmt: skip
+    "polyscopeversion": "URSoftware 5.12.0.0 (simulated)",
+    "get serial number": "20230000001",
+    "get robot model": "UR3",
+    "is in remote control": "true",
+    "robotmode": "Robotmode: RUNNING",
+    "safetystatus": "Safetystatus: NORMAL",
+    "safetymode": "Safetymode: NORMAL",
+}
 
 
 class ControllerServer:

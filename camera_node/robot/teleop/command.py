@@ -113,9 +113,7 @@ def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: 
         raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
 
 
-def _run_loop(
-    operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None, as_json: bool
-) -> int:
+def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None, as_json: bool) -> int:
     """Tick until asked to end, then bring the arm to rest within the limits. Returns the exit status."""
     stop_requested, clock = stop_event(), WallClock()
     period_s = 1.0 / operator.config.rate_hz

@@ -89,28 +89,29 @@ class PinkSolver:
         self._arm = arm
         self._model, collisions = _model(arm, config)
         self._configuration: Any = pink.Configuration(
-            self._model, self._model.createData(), np.zeros(6),
-            collision_model=collisions, collision_data=collisions.createData(),
-        )  # fmt: skip
-        self._task = pink.tasks.FrameTask(
-            "flange", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-3, gain=1.0
+            self._model,
+            self._model.createData(),
+            np.zeros(6),
+            collision_model=collisions,
+            collision_data=collisions.createData(),
         )
+        self._task = pink.tasks.FrameTask("flange", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-3, gain=1.0)
         # No acceleration limit: with a barrier that is already slightly crossed it would leave no solution.
         # ``limits`` enforces acceleration, and the barriers' gain is low enough for it.
         self._limits = [ConfigurationLimit(self._model), VelocityLimit(self._model)]
         self._barriers = [
             PositionBarrier(
-                "flange", p_min=np.array(config.workspace_low_m) + _BARRIER_INSET_M,
+                "flange",
+                p_min=np.array(config.workspace_low_m) + _BARRIER_INSET_M,
                 p_max=np.array(config.workspace_high_m) - _BARRIER_INSET_M,
                 gain=np.full(6, _BARRIER_GAIN_PER_S),
             ),
             # Only the nearest pairs: a barrier for every pair would cost more than it gains. A safe
             # displacement gain above 0 would hold the arm back even far from everything.
             SelfCollisionBarrier(
-                8, gain=_BARRIER_GAIN_PER_S, safe_displacement_gain=0.0,
-                d_min=config.margin_m + _BARRIER_INSET_M
+                8, gain=_BARRIER_GAIN_PER_S, safe_displacement_gain=0.0, d_min=config.margin_m + _BARRIER_INSET_M
             ),
-        ]  # fmt: skip
+        ]
         self.failed = 0
 
     def speeds(self, q: Array, target: Array) -> Array:
@@ -123,9 +124,15 @@ class PinkSolver:
         self._task.set_target(goal)
         try:
             found = self._pink.solve_ik(
-                self._configuration, [self._task], self._dt_s, solver="daqp", damping=1e-6,
-                limits=self._limits, barriers=self._barriers, safety_break=False,
-            )  # fmt: skip
+                self._configuration,
+                [self._task],
+                self._dt_s,
+                solver="daqp",
+                damping=1e-6,
+                limits=self._limits,
+                barriers=self._barriers,
+                safety_break=False,
+            )
         except (self._pink.exceptions.PinkError, ValueError, ArithmeticError):
             found = None
         if found is None or not np.isfinite(found).all():
@@ -147,9 +154,15 @@ def _model(arm: ArmModel, config: TeleopConfig) -> tuple[Any, Any]:
         placed = offset * pin.SE3(pin.utils.rotate("z", arm.theta_rad[i]), np.zeros(3))
         speed = min(config.speed_rad_s, arm.speed_rad_s[i])
         parent = model.addJoint(
-            parent, pin.JointModelRZ(), placed, f"joint{i + 1}", np.full(1, 1e3), np.full(1, speed),
-            np.full(1, arm.lower_rad[i] + margin), np.full(1, arm.upper_rad[i] - margin),
-        )  # fmt: skip
+            parent,
+            pin.JointModelRZ(),
+            placed,
+            f"joint{i + 1}",
+            np.full(1, 1e3),
+            np.full(1, speed),
+            np.full(1, arm.lower_rad[i] + margin),
+            np.full(1, arm.upper_rad[i] - margin),
+        )
         offset = pin.SE3(pin.utils.rotate("x", arm.alpha_rad[i]), np.array([arm.a_m[i], 0.0, arm.d_m[i]]))
     flange = pin.Frame("flange", parent, offset, pin.FrameType.OP_FRAME)
     model.addFrame(flange)

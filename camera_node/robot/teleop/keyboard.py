@@ -26,9 +26,19 @@ KEYS = """\
 
 _STEP_M, _STEP_RAD = 0.005, 0.02
 _MOVES = {
-    "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1),
-    "o": (3, 1), "u": (3, -1), "k": (4, 1), "i": (4, -1), "j": (5, 1), "l": (5, -1),
-}  # fmt: skip
+    "w": (0, 1),
+    "s": (0, -1),
+    "a": (1, 1),
+    "d": (1, -1),
+    "r": (2, 1),
+    "f": (2, -1),
+    "o": (3, 1),
+    "u": (3, -1),
+    "k": (4, 1),
+    "i": (4, -1),
+    "j": (5, 1),
+    "l": (5, -1),
+}
 _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 
 
@@ -44,9 +54,7 @@ class KeyboardStylus:
             self._before = termios.tcgetattr(self._fd)
             tty.setcbreak(self._fd)
         except termios.error:
-            raise TeleopError(
-                "--stylus keyboard needs a terminal: run it in one, or use network:PORT"
-            ) from None
+            raise TeleopError("--stylus keyboard needs a terminal: run it in one, or use network:PORT") from None
 
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``. Returns one sample, also if no key was pressed."""

@@ -40,9 +40,7 @@ class JointLimits:
     dt_s: length of a tick.
     """
 
-    def __init__(
-        self, low: ArrayLike, high: ArrayLike, speed: float, acceleration: float, dt_s: float
-    ) -> None:
+    def __init__(self, low: ArrayLike, high: ArrayLike, speed: float, acceleration: float, dt_s: float) -> None:
         self.low = np.asarray(low, dtype=np.float64) + _ROUNDING
         self.high = np.asarray(high, dtype=np.float64) - _ROUNDING
         self.dt_s = dt_s

@@ -60,9 +60,7 @@ class ServoSink:
                 f"arm at {self._stream.host}: {np.degrees(lag_rad):.0f} degrees behind its target: stopped; "
                 "is something in its way, or is its speed slider down?"
             )
-        if not self._control.servoJ(
-            command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _SERVO_GAIN
-        ):
+        if not self._control.servoJ(command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _SERVO_GAIN):
             raise ArmError(f"arm at {self._stream.host}: it refuses to move: see the pendant")
 
     def close(self) -> None:

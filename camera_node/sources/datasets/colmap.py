@@ -59,9 +59,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     files = find_files(path, FILES) if path.is_dir() else [path.with_name(f"cameras{path.suffix}")]
     file = next((f for f in files if f.is_file() and f.with_stem("images").is_file()), None)
     if file is None:
-        raise DatasetError(
-            f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0"
-        )
+        raise DatasetError(f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0")
     lenses, entries = (_binary if file.suffix == ".bin" else _text)(file)
     folder = _images(path if path.is_dir() else path.parent, file, images)
     sized: dict[int, Lens] = {}
@@ -102,9 +100,7 @@ def _lens(model: str, width: int, height: int, p: list[float], where: str) -> Le
     """Parameters in COLMAP's order as a lens. Raises DatasetError."""
     counts = dict(_MODELS.values())
     if model not in counts:
-        raise DatasetError(
-            f"{where}: camera model {model}: expected one of {', '.join(counts)}; undistort the images"
-        )
+        raise DatasetError(f"{where}: camera model {model}: expected one of {', '.join(counts)}; undistort the images")
     if len(p) != counts[model]:
         raise DatasetError(f"{where}: {model} has {counts[model]} parameters, not {len(p)}")
     if model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE"):
@@ -149,9 +145,7 @@ def _text(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
                 f"{file.with_stem('images')}:{number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from None
         if next(lines, None) is None:
-            raise DatasetError(
-                f"{file.with_stem('images')}:{number}: the line of {words[9]}'s points is missing: cut?"
-            )
+            raise DatasetError(f"{file.with_stem('images')}:{number}: the line of {words[9]}'s points is missing: cut?")
     return lenses, images
 
 
@@ -192,9 +186,7 @@ class _Bytes:
     def read(self, size: int) -> bytes:
         begin, self._at = self._at, self._at + size
         if self._at > len(self._data):
-            raise DatasetError(
-                f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?"
-            )
+            raise DatasetError(f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?")
         return self._data[begin : self._at]
 
     def done(self) -> None:
@@ -211,9 +203,7 @@ def _binary(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
         number, model, width, height = data.take("iiQQ")
         if model not in _MODELS:
             known = ", ".join(name for name, _ in _MODELS.values())
-            raise DatasetError(
-                f"{file}: camera {number}: model {model}: expected one of {known}; undistort the images"
-            )
+            raise DatasetError(f"{file}: camera {number}: model {model}: expected one of {known}; undistort the images")
         name, count = _MODELS[model]
         lenses[number] = _lens(name, width, height, list(data.take(f"{count}d")), f"{file}: camera {number}")
     data.done()

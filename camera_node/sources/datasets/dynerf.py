@@ -35,10 +35,7 @@ def load_rig(path: Path) -> VideoRig:
             f"{file}: has poses of {len(rows)} cameras, its folder {len(videos)} videos cam*.mp4: "
             "they belong together in the order of their names"
         )
-    cameras = {
-        video.stem: _camera(row, video, f"{file}: row {k}")
-        for k, (row, video) in enumerate(zip(rows, videos))
-    }
+    cameras = {video.stem: _camera(row, video, f"{file}: row {k}") for k, (row, video) in enumerate(zip(rows, videos))}
     return VideoRig(cameras, {video.stem: video for video in videos})
 
 

@@ -125,7 +125,5 @@ def _entry(entry: dict[str, Any], where: str) -> tuple[str, Lens, np.ndarray]:
         )
     with errors_at(where):
         Pose.from_matrix(transform)  # refuses a matrix that is not rigid, as se3_inverse needs it
-        lens = Lens(
-            width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
-        )
+        lens = Lens(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye")
     return name, lens, se3_inverse(transform)

@@ -64,10 +64,7 @@ class Lens:
     def resized(self, width: int, height: int) -> Lens:
         """The same lens for images of another size."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height,
-            fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y,
-        )  # fmt: skip
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def project(self, points: NDArray) -> Array:
         """Pixels (..., 2) of points (..., 3) in camera axes, in front of the camera."""
@@ -127,9 +124,7 @@ def _undistorted(lens: Lens) -> Pinhole:
             break
         found = tried
     if found is None:
-        raise DatasetError(
-            "the distortion coefficients belong to no lens: not even the middle can be straightened"
-        )
+        raise DatasetError("the distortion coefficients belong to no lens: not even the middle can be straightened")
     return found
 
 

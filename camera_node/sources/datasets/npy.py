@@ -108,9 +108,7 @@ def load_object(file: Path) -> Any:
     try:
         stream = io.BytesIO(file.read_bytes())
         version = np.lib.format.read_magic(stream)
-        head = (
-            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        )
+        head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = head(stream)
         if not dtype.hasobject or shape != ():
             raise DatasetError(f"{file}: expected one Python object, got an array of {dtype} {shape}")

@@ -77,12 +77,7 @@ def lens_for_image(lens: Lens, path: Path, where: str) -> Lens:
 
 
 def posed_photo(
-    photo: Photo,
-    name: str,
-    camera_to_world: np.ndarray,
-    where: str,
-    camera: str = "",
-    time_s: float | None = None,
+    photo: Photo, name: str, camera_to_world: np.ndarray, where: str, camera: str = "", time_s: float | None = None
 ) -> PosedImage:
     """A photo with its pose, as a data set's image.
 

@@ -87,9 +87,7 @@ def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -
     shares |= {camera: rest[k :: len(training)] for k, camera in enumerate(training)}
     empty = [camera for camera, share in shares.items() if not share]
     if empty:
-        raise DatasetError(
-            f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras"
-        )
+        raise DatasetError(f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras")
     return shares
 
 
@@ -215,9 +213,7 @@ def _video_sources(
         elif pose is not None:
             poses = FixedPose(pose)
         else:
-            raise ScenarioError(
-                f"{where}.files.{camera}: missing, and the calibration has no pose for {name}"
-            )
+            raise ScenarioError(f"{where}.files.{camera}: missing, and the calibration has no pose for {name}")
         sources[camera] = VideoSource(camera, rig, name, config.scale, playback, poses)
     return sources
 

@@ -19,14 +19,7 @@ from camera_node.config import BACKGROUNDS
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    errors_at,
-    find_files,
-    path_within,
-    read_json,
-)
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, find_files, path_within, read_json
 from freshfield.geometry import OPENGL_TO_OPENCV
 
 # First the files from which nerfstudio and NeRF-synthetic start a training.

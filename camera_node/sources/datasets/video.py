@@ -9,14 +9,7 @@ from pathlib import Path
 
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    errors_at,
-    find_files,
-    path_within,
-)
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, errors_at, find_files, path_within
 from camera_node.sources.datasets.video_clip import Clip
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.geometry import Pinhole
@@ -103,8 +96,7 @@ def open_clip(rig: VideoRig, name: str) -> Clip:
     expected: Pinhole = rig.cameras[name].intrinsics
     if (clip.width, clip.height) != (expected.width, expected.height):
         raise DatasetError(
-            f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for "
-            f"{expected.width} x {expected.height}"
+            f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for {expected.width} x {expected.height}"
         )
     return clip
 

@@ -104,9 +104,7 @@ def _path(name: Any, where: str) -> Path:
 
 def _pose(rotation: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
     if rotation.shape != (3, 3) or translation.size != 3:
-        raise DatasetError(
-            f"{where}: R and T are {rotation.shape} and {translation.shape}, expected 3 x 3 and 3"
-        )
+        raise DatasetError(f"{where}: R and T are {rotation.shape} and {translation.shape}, expected 3 x 3 and 3")
     return camera_to_world(rotation, translation.ravel() * _MM)
 
 
@@ -119,6 +117,12 @@ def _lens(k: np.ndarray, distortion: np.ndarray, width: int, height: int, where:
     d[: distortion.size] = distortion.ravel()
     with errors_at(where):
         return Lens(
-            width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5,
-            (float(d[0]), float(d[1]), float(d[4])), (float(d[2]), float(d[3])),
-        )  # fmt: skip
+            width,
+            height,
+            float(k[0, 0]),
+            float(k[1, 1]),
+            float(k[0, 2]) + 0.5,
+            float(k[1, 2]) + 0.5,
+            (float(d[0]), float(d[1]), float(d[4])),
+            (float(d[2]), float(d[3])),
+        )

@@ -13,9 +13,7 @@ from freshfield.geometry import Pinhole
 _RASTER = 25
 
 
-def fit_opencv_distortion(
-    width: int, height: int, k: ArrayLike, distortion: Sequence[float]
-) -> tuple[Pinhole, float]:
+def fit_opencv_distortion(width: int, height: int, k: ArrayLike, distortion: Sequence[float]) -> tuple[Pinhole, float]:
     """Least-squares fit of k1, k2, p1, p2 to a lens, over a grid of points in the image.
 
     width, height: of the image, pixels.
@@ -48,7 +46,6 @@ def fit_opencv_distortion(
     found: NDArray[np.float64] = np.zeros(4)
     if any(distortion):  # otherwise rounding errors would make the lens count as distorted
         found, *_ = np.linalg.lstsq(np.concatenate([rows_x, rows_y]), wanted, rcond=None)
-    lens = Pinhole(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5,
-                   tuple(map(float, found)))  # type: ignore[arg-type]  # fmt: skip
+    lens = Pinhole(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5, tuple(map(float, found)))  # type: ignore[arg-type]
     shown = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1))
     return lens, float(np.abs(shown - 0.5 - pixels).max())

@@ -32,11 +32,7 @@ BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _GRAB_S = 0.5
 _JOIN_S = 2.0
 # kind -> its driver's module here and class
-_DRIVERS = {
-    "camera": ("opencv", "OpenCvFeed"),
-    "oak": ("oak", "OakFeed"),
-    "realsense": ("realsense", "RealsenseFeed"),
-}
+_DRIVERS = {"camera": ("opencv", "OpenCvFeed"), "oak": ("oak", "OakFeed"), "realsense": ("realsense", "RealsenseFeed")}
 
 
 def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> Feed:

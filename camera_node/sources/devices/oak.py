@@ -78,9 +78,7 @@ class OakFeed(Feed):
         for camera in cameras:
             find(camera, config.devices.get(camera))
 
-    def __init__(
-        self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
-    ) -> None:
+    def __init__(self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock) -> None:
         dai = library()
         self._device: Any = None
         self._pipeline: Any = None
@@ -111,9 +109,7 @@ class OakFeed(Feed):
             self.close()
             if isinstance(error, CameraError):
                 raise
-            raise CameraError(
-                f"{camera}: the OAK camera could not be started: {_first_line(error)}"
-            ) from None
+            raise CameraError(f"{camera}: the OAK camera could not be started: {_first_line(error)}") from None
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
         return self._frames.grab(timeout_s)
@@ -178,9 +174,7 @@ def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rect
     found, off_px = fit_opencv_distortion(width, height, matrix, distortion)
     if off_px > _WORST_LENS_PX:
         log.warning(
-            "%s: four coefficients describe this lens to %.1f px only: set source.rectify: true",
-            camera,
-            off_px,
+            "%s: four coefficients describe this lens to %.1f px only: set source.rectify: true", camera, off_px
         )
     return found
 

@@ -34,9 +34,7 @@ _MANUAL = 1  # V4L2's value for manual exposure
 class OpenCvFeed(Feed):
     """An open ``cv2.VideoCapture``, which has no intrinsics."""
 
-    def __init__(
-        self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
-    ) -> None:
+    def __init__(self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock) -> None:
         self._camera, self._clock = camera, clock
         self.no_intrinsics = (
             f"{camera}: this camera does not know its intrinsics: calibrate it (camera-node calibrate "
@@ -60,9 +58,7 @@ class OpenCvFeed(Feed):
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
         """As ``Feed.grab``, but it waits as long as the driver does (network cameras: two seconds)."""
         if not self._capture.grab():
-            raise CameraError(
-                f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended"
-            )
+            raise CameraError(f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended")
         age_ns = self._age_ns()
         if age_ns is None:
             return None

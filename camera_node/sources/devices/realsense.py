@@ -42,8 +42,7 @@ def library() -> Any:
         ) from None
     except ImportError as error:  # it is there, and lacks a library of the system's
         raise CameraError(
-            f"RealSense cameras: pyrealsense2 cannot be loaded: {error}; on Debian and Ubuntu: "
-            "apt install libusb-1.0-0"
+            f"RealSense cameras: pyrealsense2 cannot be loaded: {error}; on Debian and Ubuntu: apt install libusb-1.0-0"
         ) from None
     return pyrealsense2
 
@@ -77,9 +76,7 @@ class RealsenseFeed(Feed):
         for camera in cameras:
             find(camera, config.devices.get(camera))
 
-    def __init__(
-        self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
-    ) -> None:
+    def __init__(self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock) -> None:
         rs = library()
         self._camera = camera
         wanted = rs.config()
@@ -163,10 +160,7 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
     """Intrinsics from the library's. Raises CameraError for a lens model that is not OpenCV's."""
     rs = library()
     straight = intrinsics.model in (rs.distortion.none, rs.distortion.inverse_brown_conrady)
-    if not straight and intrinsics.model not in (
-        rs.distortion.brown_conrady,
-        rs.distortion.modified_brown_conrady,
-    ):
+    if not straight and intrinsics.model not in (rs.distortion.brown_conrady, rs.distortion.modified_brown_conrady):
         raise CameraError(
             f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
             "the file in source.calibration"

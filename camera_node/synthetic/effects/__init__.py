@@ -34,9 +34,21 @@ from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, read_section
 
 NAMES = (
-    "clock_drift", "exposure_drift", "fog", "hot_pixels", "lens_distortion", "light_switch", "motion_blur",
-    "occluder", "pose_noise", "rolling_shutter", "sensor_noise", "shadows", "specular", "vignetting",
-)  # fmt: skip
+    "clock_drift",
+    "exposure_drift",
+    "fog",
+    "hot_pixels",
+    "lens_distortion",
+    "light_switch",
+    "motion_blur",
+    "occluder",
+    "pose_noise",
+    "rolling_shutter",
+    "sensor_noise",
+    "shadows",
+    "specular",
+    "vignetting",
+)
 
 
 class EffectError(ScenarioError):

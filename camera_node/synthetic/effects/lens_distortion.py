@@ -32,9 +32,7 @@ class LensDistortion(EffectParameters):
 
     def rendered(self, camera: Pinhole) -> Pinhole:
         if camera.distorted:
-            raise EffectError(
-                "effect lens_distortion: the scene's params have a distortion already: drop one"
-            )
+            raise EffectError("effect lens_distortion: the scene's params have a distortion already: drop one")
         lens = dataclasses.replace(camera, distortion=(self.k1, self.k2, self.p1, self.p2))
         if not invertible(lens):
             raise EffectError(

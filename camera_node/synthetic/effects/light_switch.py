@@ -56,6 +56,4 @@ class _Lamps:
         aside = light.points[:, :2] @ (math.cos(azimuth), math.sin(azimuth))
         count = len(light.points)
         left = np.sort(np.argsort(aside, kind="stable")[: max(1, count - round(self.effect.share * count))])
-        return dataclasses.replace(
-            light, points=light.points[left], strength=light.strength * len(left) / count
-        )
+        return dataclasses.replace(light, points=light.points[left], strength=light.strength * len(left) / count)

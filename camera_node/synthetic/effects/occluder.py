@@ -52,9 +52,7 @@ class Occluder(EffectParameters):
         base = scene.period_s if scene.moving else PERIOD_UNIT_S
         period = max(1, round(self.period_s / base)) * base
         elevation = np.linspace(0.0, 0.5 * math.pi, _JOINTS)
-        joints = share * reach * np.stack(
-            [np.zeros(_JOINTS), -np.cos(elevation), np.sin(elevation)], axis=1
-        )  # fmt: skip
+        joints = share * reach * np.stack([np.zeros(_JOINTS), -np.cos(elevation), np.sin(elevation)], axis=1)
         radius = 0.5 * self.thickness_share * reach
         length = float(np.linalg.norm(joints[1] - joints[0]))
         arm = Part(capsule(radius, length), Stripes((0.95, 0.72, 0.10), (0.14, 0.14, 0.15), length, axis=1))

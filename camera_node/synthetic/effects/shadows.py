@@ -40,11 +40,7 @@ class Shadows(EffectParameters):
         return scene.with_world(dataclasses.replace(scene.world, shadows=self))
 
     def blocked_light(
-        self,
-        surface: SurfacePoints,
-        light: Light,
-        moving: Sequence[PlacedParts],
-        specular: SpecularReflection | None,
+        self, surface: SurfacePoints, light: Light, moving: Sequence[PlacedParts], specular: SpecularReflection | None
     ) -> Array:
         """See ``lighting.ShadowModel``. Traces rays from points of the light to every surface point; a light
         of many points makes penumbrae."""
@@ -75,9 +71,7 @@ def _casters(placed: PlacedParts) -> PlacedParts:
     return place_parts([placed.parts[k] for k in casting], placed.matrices[casting])
 
 
-def _behind(
-    source: Array, ray: Array, distance: Array, placed: PlacedParts, visible: Array
-) -> NDArray[np.intp]:
+def _behind(source: Array, ray: Array, distance: Array, placed: PlacedParts, visible: Array) -> NDArray[np.intp]:
     """Indices of the surface points that static parts do not hide from the light point ``source``, and that
     may lie behind the body ``placed``."""
     if not placed.parts:

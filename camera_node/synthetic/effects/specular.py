@@ -45,9 +45,7 @@ class Specular(EffectParameters):
         a2 = self.roughness**2
         across = np.clip((normals * half).sum(axis=0), 0.0, 1.0)
         slopes = a2 / (across * across * (a2 - 1.0) + 1.0) ** 2  # pi times the distribution
-        masks = light * np.sqrt(view * view * (1.0 - a2) + a2) + view * np.sqrt(
-            light * light * (1.0 - a2) + a2
-        )
+        masks = light * np.sqrt(view * view * (1.0 - a2) + a2) + view * np.sqrt(light * light * (1.0 - a2) + a2)
         visibility = 0.5 / np.maximum(masks, 1e-9)  # masking over 4 cos cos
         return slopes * visibility * self.fresnel(-(half * rays).sum(axis=0)) * light
 

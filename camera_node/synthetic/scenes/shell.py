@@ -17,12 +17,18 @@ def room_shell(
     h, middle = half_m, height_m / 2
     x, y, up = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     left, back = (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)
-    placed = {"north": (x, (0, h, middle)), "west": (y, (-h, 0, middle)),
-              "east": (left, (h, 0, middle)), "south": (back, (0, -h, middle))}  # fmt: skip
+    placed = {
+        "north": (x, (0, h, middle)),
+        "west": (y, (-h, 0, middle)),
+        "east": (left, (h, 0, middle)),
+        "south": (back, (0, -h, middle)),
+    }
     wall, flat = Quad((h, middle)), Quad((h, h))
     return [
-        *(Part(wall, walls[side], facing(along, up, center), casts_shadow=False)
-          for side, (along, center) in placed.items()),
+        *(
+            Part(wall, walls[side], facing(along, up, center), casts_shadow=False)
+            for side, (along, center) in placed.items()
+        ),
         Part(flat, floor, facing(x, y, (0, 0, 0)), casts_shadow=False, takes_contact=True),
         Part(flat, ceiling, facing(x, left, (0, 0, height_m)), casts_shadow=False, glow=glow),
-    ]  # fmt: skip
+    ]

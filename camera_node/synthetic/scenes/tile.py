@@ -28,12 +28,19 @@ _RADIUS_M = 0.85
 BOTTOM_M = -0.06
 _BENCH_BOUNDS = [[-1.6, -0.65, -0.4], [1.6, 0.72, 1.4]]
 # cam00, then three rings of the half-hemisphere on the -y side.
-_ANGLES_DEG = [(0.0, 40.0)] + [
-    (a, e)
-    for e, row in ((16.0, (-85, -51, -17, 17, 51, 85)), (40.0, (-82, -56, -28, 28, 56, 82)),
-                   (64.0, (-75, -25, 25, 75)))
-    for a in row
-] + [(-40.0, 82.0), (140.0, 82.0)]  # fmt: skip
+_ANGLES_DEG = (
+    [(0.0, 40.0)]
+    + [
+        (a, e)
+        for e, row in (
+            (16.0, (-85, -51, -17, 17, 51, 85)),
+            (40.0, (-82, -56, -28, 28, 56, 82)),
+            (64.0, (-75, -25, 25, 75)),
+        )
+        for a in row
+    ]
+    + [(-40.0, 82.0), (140.0, 82.0)]
+)
 
 
 @dataclass(frozen=True)
@@ -48,9 +55,13 @@ def build(params: Params) -> Scene:
     """The tile as a scene. It does not move, so it has the shortest period."""
     grid = np.stack(np.meshgrid([-0.5, -0.3, -0.1], [-0.5, -0.3, -0.1], [0.9]), axis=-1).reshape(-1, 3)
     light = Light(
-        points=grid, strength=0.95, falloff_m=1.2, tint=(1.0, 0.97, 0.92),
-        ambient_below=(0.28, 0.29, 0.31), ambient_above=(0.50, 0.52, 0.54),
-    )  # fmt: skip
+        points=grid,
+        strength=0.95,
+        falloff_m=1.2,
+        tint=(1.0, 0.97, 0.92),
+        ambient_below=(0.28, 0.29, 0.31),
+        ambient_above=(0.50, 0.52, 0.54),
+    )
     tile = object_parts()
     around = _bench() if params.bench else []
     return Scene(
@@ -105,29 +116,28 @@ def _segments() -> list[Part]:
             if (row, column) == (0, 1):
                 metal = tx.Spots(
                     metal,
-                    [(0.005, 0.0, 0.026, soot), (0.012, 0.006, 0.013, (0.42, 0.26, 0.16)),
-                     (-0.026, 0.03, 0.009, soot)],
+                    [(0.005, 0.0, 0.026, soot), (0.012, 0.006, 0.013, (0.42, 0.26, 0.16)), (-0.026, 0.03, 0.009, soot)],
                     soft=0.012,
-                )  # fmt: skip
+                )
             if (row, column) == (1, 2):
                 metal = tx.Spots(
-                    metal,
-                    [(0.0, 0.0, 0.036, red), (0.0, 0.0, 0.024, paint), (0.0, 0.0, 0.012, red)],
-                    soft=0.004,
+                    metal, [(0.0, 0.0, 0.036, red), (0.0, 0.0, 0.024, paint), (0.0, 0.0, 0.012, red)], soft=0.004
                 )
             if (row, column) == (1, 0):
                 metal = tx.Bands(
-                    metal,
-                    [(-0.03, 0.03, -0.012, 0.012, blue), (-0.012, 0.012, -0.04, 0.04, blue)],
-                    soft=0.004,
+                    metal, [(-0.03, 0.03, -0.012, 0.012, blue), (-0.012, 0.012, -0.04, 0.04, blue)], soft=0.004
                 )
             if (row, column) == (0, 3):
                 metal = tx.Bands(
                     metal,
-                    [(-0.032, 0.0, -0.032, 0.0, green), (0.0, 0.032, 0.0, 0.032, green),
-                     (-0.032, 0.0, 0.0, 0.032, paint), (0.0, 0.032, -0.032, 0.0, paint)],
+                    [
+                        (-0.032, 0.0, -0.032, 0.0, green),
+                        (0.0, 0.032, 0.0, 0.032, green),
+                        (-0.032, 0.0, 0.0, 0.032, paint),
+                        (0.0, 0.032, -0.032, 0.0, paint),
+                    ],
                     soft=0.004,
-                )  # fmt: skip
+                )
             x, y = -0.1455 + 0.097 * column, -0.068 + 0.136 * row
             # Alternate inclination, as tiles are set so that no edge faces the flow.
             tilt_x, tilt_y = (5.0 if row == 0 else -5.0), (4.0 if column % 2 == 0 else -4.0)
@@ -142,9 +152,7 @@ class _Grooved:
     base: tx.Texture
 
     def __call__(self, uv: Array) -> Array:
-        line = np.maximum(
-            tx.soft_line(uv[1] + 0.0205, 0.041, 0.0035, 0.003), tx.soft_line(uv[0], 0.3, 0.0035, 0.003)
-        )
+        line = np.maximum(tx.soft_line(uv[1] + 0.0205, 0.041, 0.0035, 0.003), tx.soft_line(uv[0], 0.3, 0.0035, 0.003))
         return self.base(uv) * (1.0 - 0.62 * line)
 
 
@@ -172,8 +180,9 @@ def _bench() -> list[Part]:
     books = tx.Stripes((0.20, 0.30, 0.46), (0.86, 0.83, 0.76), 0.024, 1, 0.004)
     top, low = Box((0.85, 0.65, 0.02)), BOTTOM_M
 
-    def standing(shape: Box | Cylinder | Sphere, height: float, texture: tx.Texture, x: float, y: float,
-                 turn_deg: float = 0.0) -> Part:  # fmt: skip
+    def standing(
+        shape: Box | Cylinder | Sphere, height: float, texture: tx.Texture, x: float, y: float, turn_deg: float = 0.0
+    ) -> Part:
         return Part(shape, texture, at(x, y, low + height, turn_deg))
 
     return [

@@ -29,10 +29,13 @@ _RADIUS_M = 0.55
 # cam00, then three rings, turned against each other.
 _ANGLES_DEG = [(0.0, 3.0)] + [
     (a, e)
-    for e, row in ((3.0, (28, 75, 128, 180, 232, 285, 332)), (-25.0, (0, 52, 104, 156, 208, 256, 308)),
-                   (26.0, (0, 90, 180, 270)))
+    for e, row in (
+        (3.0, (28, 75, 128, 180, 232, 285, 332)),
+        (-25.0, (0, 52, 104, 156, 208, 256, 308)),
+        (26.0, (0, 90, 180, 270)),
+    )
     for a in row
-]  # fmt: skip
+]
 _HALF_M, _HEIGHT_M = 5.0, 4.0
 _WALK_CENTER, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
 _DRIVE_CENTER, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
@@ -62,9 +65,13 @@ def build(params: Params) -> Scene:
     walk = make_walk(center, radii, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
-        points=grid, strength=0.85, falloff_m=4.5, tint=(1.0, 0.97, 0.92),
-        ambient_below=(0.30, 0.30, 0.31), ambient_above=(0.50, 0.52, 0.55),
-    )  # fmt: skip
+        points=grid,
+        strength=0.85,
+        falloff_m=4.5,
+        tint=(1.0, 0.97, 0.92),
+        ambient_below=(0.30, 0.30, 0.31),
+        ambient_above=(0.50, 0.52, 0.55),
+    )
     return Scene(
         name="tower",
         params=params,
@@ -91,8 +98,7 @@ def _moving_bodies(params: Params, walk: Walk, drawn: float) -> tuple[MovingBody
 def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
     """A cart that drives along an ellipse in the walk's period; the speed determines the ellipse's size."""
     deck = tx.Stripes((0.93, 0.72, 0.12), (0.16, 0.16, 0.18), 0.2, soft=0.03)
-    crate = tx.Framed(tx.Checker((0.24, 0.46, 0.78), (0.90, 0.88, 0.82), 0.12), (0.55, 0.37, 0.20),
-                      (0.24, 0.24), 0.04)  # fmt: skip
+    crate = tx.Framed(tx.Checker((0.24, 0.46, 0.78), (0.90, 0.88, 0.82), 0.12), (0.55, 0.37, 0.20), (0.24, 0.24), 0.04)
     drum = tx.Stripes((0.80, 0.24, 0.20), (0.94, 0.92, 0.88), 0.2, axis=1, soft=0.03)
     tire = tx.Plain((0.13, 0.13, 0.14))
     parts = [
@@ -101,7 +107,7 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
         (Part(Cylinder(0.17, 0.22), drum), at(0.30, 0.05, 0.52)),
         (Part(capsule(0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
         *((Part(Sphere(0.11), tire), at(x, y, 0.11)) for x in (-0.38, 0.38) for y in (-0.27, 0.27)),
-    ]  # fmt: skip
+    ]
     local = np.stack([matrix for _, matrix in parts])
     radii = np.array(_DRIVE_RADII_M)
     if not walk.still:
@@ -113,37 +119,40 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
     def matrices(t_s: float) -> Array:
         a = 2 * math.pi * (_STILL_PHASE if walk.still else walk.phase(t_s)) * walk.direction
         x, y = _DRIVE_CENTER[0] + radii[0] * math.cos(a), _DRIVE_CENTER[1] + radii[1] * math.sin(a)
-        heading = math.atan2(
-            radii[1] * math.cos(a) * walk.direction, -radii[0] * math.sin(a) * walk.direction
-        )
+        heading = math.atan2(radii[1] * math.cos(a) * walk.direction, -radii[0] * math.sin(a) * walk.direction)
         return np.asarray(at(x, y, 0.0, math.degrees(heading)) @ local, dtype=np.float64)
 
-    return MovingBody(
-        tuple(part for part, _ in parts), matrices, contact=tuple((k, 0.2) for k in range(4, 8))
-    )
+    return MovingBody(tuple(part for part, _ in parts), matrices, contact=tuple((k, 0.2) for k in range(4, 8)))
 
 
 def _shell() -> list[Part]:
     brick = tx.Noise(tx.Brick((0.70, 0.40, 0.30), (0.88, 0.82, 0.74), 0.80, 0.40), 0.6, 0.06, seed=41)
     tiles = tx.Bands(
         tx.Diamonds((0.26, 0.50, 0.48), (0.38, 0.64, 0.58), (0.96, 0.88, 0.62), 0.8, 0.8),
-        [(-6, 6, -3, -0.95, (0.86, 0.85, 0.80)), (-6, 6, -1.0, -0.88, (0.52, 0.36, 0.24))], soft=0.04,
-    )  # fmt: skip
+        [(-6, 6, -3, -0.95, (0.86, 0.85, 0.80)), (-6, 6, -1.0, -0.88, (0.52, 0.36, 0.24))],
+        soft=0.04,
+    )
     steel = tx.Bands(
         tx.Stripes((0.44, 0.54, 0.66), (0.56, 0.66, 0.76), 0.5, soft=0.08),
-        [(-6, 6, -0.15, 0.25, (0.94, 0.76, 0.20)), (-3.2, -1.4, -2, 0.6, (0.62, 0.30, 0.24))], soft=0.04,
-    )  # fmt: skip
+        [(-6, 6, -0.15, 0.25, (0.94, 0.76, 0.20)), (-3.2, -1.4, -2, 0.6, (0.62, 0.30, 0.24))],
+        soft=0.04,
+    )
     plaster = tx.Spots(
         tx.Noise(tx.Gradient((0.58, 0.64, 0.50), (0.90, 0.88, 0.78), -2, 2), 0.7, 0.10, seed=43),
-        [(-3.4, 0.3, 0.55, (0.90, 0.42, 0.26)), (-1.2, 0.7, 0.40, (0.22, 0.42, 0.70)),
-         (1.4, 0.2, 0.60, (0.95, 0.80, 0.36)), (3.5, 0.6, 0.45, (0.46, 0.28, 0.52))],
+        [
+            (-3.4, 0.3, 0.55, (0.90, 0.42, 0.26)),
+            (-1.2, 0.7, 0.40, (0.22, 0.42, 0.70)),
+            (1.4, 0.2, 0.60, (0.95, 0.80, 0.36)),
+            (3.5, 0.6, 0.45, (0.46, 0.28, 0.52)),
+        ],
         soft=0.06,
-    )  # fmt: skip
+    )
     floor = tx.Noise(tx.Checker((0.62, 0.62, 0.60), (0.46, 0.47, 0.50), 0.5, soft=0.05), 0.5, 0.10, seed=44)
     beams = tx.Bands(
         tx.Noise(tx.Plain((0.80, 0.79, 0.76)), 0.9, 0.06, seed=45),
-        [(-5, 5, y - 0.12, y + 0.12, (0.50, 0.36, 0.24)) for y in (-3.6, -1.2, 1.2, 3.6)], soft=0.06,
-    )  # fmt: skip
+        [(-5, 5, y - 0.12, y + 0.12, (0.50, 0.36, 0.24)) for y in (-3.6, -1.2, 1.2, 3.6)],
+        soft=0.06,
+    )
     walls: dict[str, tx.Texture] = {"north": brick, "west": tiles, "east": steel, "south": plaster}
     return room_shell(_HALF_M, _HEIGHT_M, walls, floor, beams, glow=0.4)
 
@@ -151,10 +160,7 @@ def _shell() -> list[Part]:
 def _mast() -> list[Part]:
     gray = tx.Plain((0.34, 0.35, 0.38))
     hazard = tx.Stripes((0.95, 0.76, 0.12), (0.16, 0.15, 0.15), 0.25, axis=1, soft=0.02)
-    return [
-        Part(Cylinder(0.07, 1.30), hazard, at(0, 0, 1.30)),
-        Part(Box((0.32, 0.32, 0.04)), gray, at(0, 0, 0.04, 45)),
-    ]
+    return [Part(Cylinder(0.07, 1.30), hazard, at(0, 0, 1.30)), Part(Box((0.32, 0.32, 0.04)), gray, at(0, 0, 0.04, 45))]
 
 
 def _workshop() -> list[Part]:
@@ -162,11 +168,14 @@ def _workshop() -> list[Part]:
     oak = tx.Noise(tx.Plain((0.62, 0.42, 0.24)), 0.2, 0.12, seed=46, stretch=4.0)
     books = tx.Books(
         [(0.74, 0.20, 0.18), (0.16, 0.36, 0.56), (0.93, 0.78, 0.36), (0.24, 0.50, 0.34), (0.86, 0.84, 0.78)],
-        (0.50, 0.33, 0.19), 0.2, 0.6,
-    )  # fmt: skip
+        (0.50, 0.33, 0.19),
+        0.2,
+        0.6,
+    )
     plaid = tx.Plaid((0.24, 0.42, 0.40), (0.16, 0.30, 0.32), (0.66, 0.78, 0.70), 0.5, 0.5)
-    crate = tx.Framed(tx.Stripes((0.80, 0.62, 0.36), (0.66, 0.46, 0.26), 0.2, axis=1),
-                      (0.50, 0.33, 0.18), (0.4, 0.4), 0.07)  # fmt: skip
+    crate = tx.Framed(
+        tx.Stripes((0.80, 0.62, 0.36), (0.66, 0.46, 0.26), 0.2, axis=1), (0.50, 0.33, 0.18), (0.4, 0.4), 0.07
+    )
     dice = tx.Checker((0.96, 0.80, 0.22), (0.30, 0.20, 0.42), 0.18)
     drum = tx.Stripes((0.20, 0.44, 0.62), (0.90, 0.88, 0.82), 0.35, axis=1, soft=0.04)
     pipe = tx.Stripes((0.82, 0.44, 0.28), (0.92, 0.80, 0.66), 0.5, axis=1, soft=0.05)
@@ -191,15 +200,16 @@ def _workshop() -> list[Part]:
         Part(Box((0.4, 0.4, 0.4)), crate, at(-2.9, -4.2, 0.4, -10)),
         Part(Cylinder(0.32, 0.5), drum, at(3.6, 4.2, 0.5)),
         Part(Cylinder(0.32, 0.5), pipe, at(2.8, 4.4, 0.5)),
-        Part(Sphere(0.28), tx.Stripes((0.96, 0.96, 0.94), (0.90, 0.26, 0.20), 1 / 3, soft=0.03),
-             at(-3.4, 1.4, 0.28, 40)),
+        Part(
+            Sphere(0.28), tx.Stripes((0.96, 0.96, 0.94), (0.90, 0.26, 0.20), 1 / 3, soft=0.03), at(-3.4, 1.4, 0.28, 40)
+        ),
         Part(RoundCone(0.22, 0.28, 0.30), pipe, at(-4.3, 3.3, 0.22)),
         Part(Sphere(1.0), leaf, at(-4.3, 3.3, 1.25) @ np.diag([0.48, 0.48, 0.65, 1.0])),
         # Pipes under the ceiling, lamps from it.
         Part(Cylinder(0.12, 5.0), pipe, facing((0, 1, 0), (0, 0, 1), (0, -4.6, 3.3))),
         Part(Cylinder(0.12, 5.0), drum, facing((0, 0, 1), (1, 0, 0), (-4.6, 0, 3.2))),
         *(Part(Box((0.22, 0.22, 2.0)), pillar, at(x, y, 2.0)) for x in (-2.6, 2.6) for y in (-1.2, 1.2)),
-    ]  # fmt: skip
+    ]
     for x, y in ((-1.6, -3.4), (1.6, 3.4), (3.4, -1.9), (-3.5, 1.9)):
         parts.append(Part(Sphere(0.2), lamp, at(x, y, 3.3), casts_shadow=False, glow=0.4))
     return parts

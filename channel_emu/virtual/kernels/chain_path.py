@@ -50,9 +50,7 @@ def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
         end = NEVER_NS
         if sojourn_rate[state] != 0.0:
             if slot_ns == 0:
-                end = saturating_add(
-                    starts[count], saturating_round(-math.log(u[k]) / sojourn_rate[state] * 1e6)
-                )
+                end = saturating_add(starts[count], saturating_round(-math.log(u[k]) / sojourn_rate[state] * 1e6))
             else:
                 slots = math.log(u[k]) / sojourn_rate[state]
                 if slots * slot_ns < _NEVER:
@@ -123,9 +121,7 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
         work = -math.log(u[k])
         if alike:
             at_ns = (
-                saturating_add(at_ns, saturating_round(work / rates_per_ns[0]))
-                if rates_per_ns[0] > 0.0
-                else NEVER_NS
+                saturating_add(at_ns, saturating_round(work / rates_per_ns[0])) if rates_per_ns[0] > 0.0 else NEVER_NS
             )
         else:
             while True:

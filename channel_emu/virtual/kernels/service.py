@@ -26,9 +26,7 @@ def _longest_waiting(head, ticket):
 
 
 @njit(cache=True, nogil=True)
-def _drop_new(
-    arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
-):  # fmt: skip
+def _drop_new(arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due):
     """``serve`` for one camera under drop-new; writes its results into the last three arguments."""
     by_state = len(means_ms) > 1
     mean_ms = means_ms[0]
@@ -58,9 +56,20 @@ def _drop_new(
 
 @njit(cache=True, nogil=True)
 def serve(
-    arrive_ns, camera, discipline, queue_limit, work, means_ms, speeds, modulated, starts, states,
-    path_from, path_to, horizon_ns,
-):  # fmt: skip
+    arrive_ns,
+    camera,
+    discipline,
+    queue_limit,
+    work,
+    means_ms,
+    speeds,
+    modulated,
+    starts,
+    states,
+    path_from,
+    path_to,
+    horizon_ns,
+):
     """Serve the n frames of all cameras, given in the order of their arrival.
 
     arrive_ns: int64 (n,); -1: never sampled.
@@ -81,9 +90,7 @@ def serve(
     due = np.full(count, -1, np.int64)
     if discipline == DROP_NEW and cameras == 1:
         # The loop below would decide the same; this one is twice as fast, because no frame waits.
-        _drop_new(
-            arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due
-        )
+        _drop_new(arrive_ns, work, means_ms, modulated, speeds, starts, states, horizon_ns, outcome, started, due)
         return outcome, started, due
     hints = path_from.copy()
     ticket = np.arange(count)
@@ -147,9 +154,13 @@ def serve(
             hints[c] += 1
         if modulated:
             due[frame] = completion_ns(
-                work[frame], speeds, starts[path_from[c] : path_to[c]], states[path_from[c] : path_to[c] - 1],
-                at_ns, hints[c] - path_from[c],
-            )  # fmt: skip
+                work[frame],
+                speeds,
+                starts[path_from[c] : path_to[c]],
+                states[path_from[c] : path_to[c] - 1],
+                at_ns,
+                hints[c] - path_from[c],
+            )
         else:
             mean_ms = means_ms[states[hints[c]]] if len(means_ms) > 1 else means_ms[0]
             due[frame] = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))

@@ -67,19 +67,20 @@ _MODULES = {"growth": "shown.growth", "drift": "track"}  # parts whose module ha
 _SCENES = {"field": SCENES, "track": ("room", "kitchen"), "drift": ("room", "kitchen")}
 # Flag -> the parts that it applies to.
 _ONLY_OF = {
-    "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")), "resume": (*PARTS, *MORE),
-    "only": ("options", "surface"), "scene": (*_SCENES, "shown"),
-    "option": tuple(_SCENES), "model": ("embed",),
-}  # fmt: skip
+    "field": tuple(p for p in _RESUMABLE if p not in ("peer", "shown", "growth")),
+    "resume": (*PARTS, *MORE),
+    "only": ("options", "surface"),
+    "scene": (*_SCENES, "shown"),
+    "option": tuple(_SCENES),
+    "model": ("embed",),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = _parser()
     args = parser.parse_args(argv)
-    parts = list(
-        dict.fromkeys(p for part in args.part or ["all"] for p in (PARTS if part == "all" else (part,)))
-    )
+    parts = list(dict.fromkeys(p for part in args.part or ["all"] for p in (PARTS if part == "all" else (part,))))
     if unknown := set(parts) - {*PARTS, *MORE}:
         parser.error(f"no part is called {', '.join(unknown)}; there are: {', '.join((*PARTS, *MORE))}, all")
     args.field = [name for words in args.field for name in words.split(",")]
@@ -126,12 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("bench", DESCRIPTION)
     add = parser.add_argument
     add("part", nargs="*", metavar="PART", help=f"what to measure: {', '.join((*PARTS, *MORE))}, all [all]")
-    add(
-        "--json",
-        type=out_file,
-        metavar="FILE",
-        help="write the figures to FILE as JSON; plots and tables beside it",
-    )
+    add("--json", type=out_file, metavar="FILE", help="write the figures to FILE as JSON; plots and tables beside it")
     add("--resume", action="store_true", help="continue: keep the figures in FILE, measure the rest")
     add(
         "--field",
@@ -149,18 +145,23 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="measure only this row of options (e.g. exposure) or of surface (cell); may be repeated [all]",
     )
+    add("--model", type=Path, metavar="FILE", help="ONNX file of a YOLO detector, for embed [the shipped ones]")
     add(
-        "--model",
-        type=Path,
-        metavar="FILE",
-        help="ONNX file of a YOLO detector, for embed [the shipped ones]",
-    )
-    add("--scene", action="append", default=[], metavar="NAME",
+        "--scene",
+        action="append",
+        default=[],
+        metavar="NAME",
         help=f"scene, for field: {', '.join(_SCENES['field'])} [all]; for track, drift: "
         f"{', '.join(_SCENES['track'])} [track: both; drift: room]; for shown: a row of its table, or any "
-        "scenario with a synthetic scene [all rows]")  # fmt: skip
-    add("--option", action="append", default=[], metavar="KEY=VALUE",
-        help="option of the field, for field, track, drift, e.g. device=cuda; may be repeated")  # fmt: skip
+        "scenario with a synthetic scene [all rows]",
+    )
+    add(
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of the field, for field, track, drift, e.g. device=cuda; may be repeated",
+    )
     return parser
 
 
@@ -195,9 +196,16 @@ def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: d
         return
     with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
         run = BenchRun(
-            args.quick, Path(folder), args.lpips, tuple(args.field), store, tuple(args.scene), args.option,
-            tuple(args.only), args.model,
-        )  # fmt: skip
+            args.quick,
+            Path(folder),
+            args.lpips,
+            tuple(args.field),
+            store,
+            tuple(args.scene),
+            args.option,
+            tuple(args.only),
+            args.model,
+        )
         figures[part] = getattr(module, "measure_drift" if part == "drift" else "measure")(run)
 
 
@@ -212,10 +220,7 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
     if path is None:
         return
     _write_json(path, figures)
-    text = [
-        f"# Measured by `edge-server bench{' --quick' if figures['quick'] else ''}`",
-        _conditions(figures),
-    ]
+    text = [f"# Measured by `edge-server bench{' --quick' if figures['quick'] else ''}`", _conditions(figures)]
     for part in (*PARTS, *MORE):
         if not figures.get(part):
             continue

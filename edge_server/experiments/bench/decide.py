@@ -35,11 +35,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     """Milliseconds of decisions, median and 99th percentile, by kind of action and number of cameras."""
     repeats = 200 if run.quick else 2000
     load = LoadMeter()
-    found = {
-        f"{action}, {n} cameras": _decision(action, n, repeats)
-        for n in CAMERAS
-        for action in ("select", "wait")
-    }
+    found = {f"{action}, {n} cameras": _decision(action, n, repeats) for n in CAMERAS for action in ("select", "wait")}
     return {"embedding_dim": DIM, **found, "outside_cores": load.outside_cores()}
 
 

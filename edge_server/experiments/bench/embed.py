@@ -22,8 +22,15 @@ CAMERA = (480, 640)
 DIM = 32
 _WARM_UP = 3  # rounds that are not counted, because they allocate memory
 # Figures of a row of the table and their decimals.
-_COLUMNS = (("embed_ms", 3), ("runtime_ms", 3), ("ratio", 2), ("cpu_ratio", 2), ("camera_ms", 3),
-            ("camera_ratio", 2), ("camera_cpu_ratio", 2))  # fmt: skip
+_COLUMNS = (
+    ("embed_ms", 3),
+    ("runtime_ms", 3),
+    ("ratio", 2),
+    ("cpu_ratio", 2),
+    ("camera_ms", 3),
+    ("camera_ratio", 2),
+    ("camera_cpu_ratio", 2),
+)
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
@@ -75,8 +82,7 @@ def _by_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
 
     load = LoadMeter()
     spent = _in_turn(
-        {"embed": lambda: embedder.embed(frames), "runtime": alone, "camera": lambda: embedder.embed(larger)},
-        repeats,
+        {"embed": lambda: embedder.embed(frames), "runtime": alone, "camera": lambda: embedder.embed(larger)}, repeats
     )
     ms = {f"{name}_ms": statistics.median(wall for wall, _ in rows) / n for name, rows in spent.items()}
     ratios = {}
@@ -111,14 +117,24 @@ def _images(rng: np.random.Generator, n: int, height: int, width: int) -> list[N
 def table(figures: dict[str, Any]) -> str:
     """A row for each model, size and batch."""
     rows = [
-        (
-            name, size, n, *(f"{row[key]:.{digits}f}" for key, digits in _COLUMNS), row["outside_cores"],
-        )
-        for name, sizes in figures.items() if isinstance(sizes, dict)
+        (name, size, n, *(f"{row[key]:.{digits}f}" for key, digits in _COLUMNS), row["outside_cores"])
+        for name, sizes in figures.items()
+        if isinstance(sizes, dict)
         for size, batches in sizes.items()
         for n, row in batches.items()
-    ]  # fmt: skip
-    head = ("model", "size", "batch", "embed", "ONNX Runtime", "ratio", "CPU ratio", "of 640 x 480",
-            "its ratio", "its CPU ratio", "outside cores")  # fmt: skip
+    ]
+    head = (
+        "model",
+        "size",
+        "batch",
+        "embed",
+        "ONNX Runtime",
+        "ratio",
+        "CPU ratio",
+        "of 640 x 480",
+        "its ratio",
+        "its CPU ratio",
+        "outside cores",
+    )
     about = f"ms a frame, medians of {figures['repeats']} runs in turn, {figures['threads']} thread(s)"
     return f"{about}\n\n{markdown_table(head, rows)}"

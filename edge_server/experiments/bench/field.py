@@ -155,12 +155,7 @@ def _child(field: str, cache: Path | None, *words: str) -> dict[str, float]:
 
 
 def _curve(
-    title: str,
-    make: Callable[..., Field],
-    still: MultiviewStill,
-    planned_s: Sequence[float],
-    seeds: int,
-    lpips: Any,
+    title: str, make: Callable[..., Field], still: MultiviewStill, planned_s: Sequence[float], seeds: int, lpips: Any
 ) -> dict[str, Any]:
     """Fidelity against seconds from scratch: medians over seeds, and the first planned time whose median
     reaches each quality (None: none did)."""
@@ -189,8 +184,7 @@ def _curve(
 def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """Seconds of fitting until each quality; they may be slightly more than planned."""
     return {
-        f"{target}_db": next((r["fitted_s"] for r in series if r["psnr_db"] >= target), None)
-        for target in TARGETS_DB
+        f"{target}_db": next((r["fitted_s"] for r in series if r["psnr_db"] >= target), None) for target in TARGETS_DB
     }
 
 
@@ -198,9 +192,12 @@ def _point(model: Field, still: MultiviewStill, seconds: float, lpips: Any) -> d
     report = model.fit(still.training, Budget(seconds=seconds))
     score, _ = score_views(model, still.held_out, Scorer(lpips, background=still.background))
     return {
-        "fitted_s": report.seconds, "steps": report.steps, "psnr_db": score.psnr_db, "ssim": score.ssim,
+        "fitted_s": report.seconds,
+        "steps": report.steps,
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
         "lpips": score.lpips,
-    }  # fmt: skip
+    }
 
 
 def _rates(make: Callable[..., Field], still: MultiviewStill, repeats: int) -> dict[str, Any]:
@@ -265,29 +262,31 @@ def table(figures: dict[str, Any]) -> str:
     ]
     bases = [
         (
-            part["scene"], f"{part['angle_deg']:.1f}",
+            part["scene"],
+            f"{part['angle_deg']:.1f}",
             *(number(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
         )
         for part in scenes.values()
-    ]  # fmt: skip
+    ]
     curves = [
         (
-            scene, name, rows["seeds"],
+            scene,
+            name,
+            rows["seeds"],
             ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values()),
             ", ".join(grouped(rows["seconds_to_db"][f"{db}_db"]) for db in TARGETS_DB),
-            grouped(rows["outside_cores"]), speed_text(rows.get("machine")),
+            grouped(rows["outside_cores"]),
+            speed_text(rows.get("machine")),
         )
         for scene, name, rows in found
-    ]  # fmt: skip
-    of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms",
-                "rates_outside_cores")  # fmt: skip
+    ]
+    of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms", "rates_outside_cores")
     rates = [
         (scene, name, *(grouped(rows[key]) for key in of_rates), speed_text(rows.get("rates_machine")))
         for scene, name, rows in found
         if "steps_per_s" in rows
     ]
-    of_start = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s", "peak_rss_mb",
-                "machine_cores_busy")  # fmt: skip
+    of_start = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s", "peak_rss_mb", "machine_cores_busy")
     starts = [
         (name, *(grouped(row.get(key)) for key in of_start), speed_text(row.get("machine")))
         for name, row in figures.get("start", {}).items()
@@ -302,9 +301,7 @@ def table(figures: dict[str, Any]) -> str:
     }
     texts = [markdown_table(head.split("|"), rows) for head, rows in tables.items() if rows]
     if any(name.startswith("splat") for _, name, *_ in rates):
-        texts.append(
-            "Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels."
-        )
+        texts.append("Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels.")
     if found:
         texts.append(
             "The machine: how fast it was just before each time or rate was measured, all cores together: "

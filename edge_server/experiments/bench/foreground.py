@@ -145,9 +145,11 @@ def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
     whole = [dataclasses.replace(view, image=_clutter(view)) for view in training]
     sets: dict[str, list[View]] = {"whole": whole}
     for name, segment, doubt in (
-        (BOX, BOX, 1.0), (f"{GRABCUT}, doubt 1", GRABCUT, 1.0), (f"{GRABCUT}, doubt 0.3", GRABCUT, 0.3),
+        (BOX, BOX, 1.0),
+        (f"{GRABCUT}, doubt 1", GRABCUT, 1.0),
+        (f"{GRABCUT}, doubt 0.3", GRABCUT, 0.3),
         (f"{GRABCUT}, doubt 0", GRABCUT, 0.0),
-    ):  # fmt: skip
+    ):
         cut = make_foreground(ForegroundConfig(boxes=boxes, segment=segment, doubt=doubt))
         sets[name] = [_cut(cut, view) for view in whole]
     sets["true alpha"] = [_with_alpha(seen, view) for seen, view in zip(whole, training)]
@@ -167,9 +169,7 @@ def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
         found["rows"][name] = {
             "object_db": statistics.fmean(dbs),
             "spread_db": max(dbs) - min(dbs),
-            "iou": statistics.fmean(
-                _iou(_foreground_mask(v.image), true_mask(o)) for v, o in zip(fitted, training)
-            ),
+            "iou": statistics.fmean(_iou(_foreground_mask(v.image), true_mask(o)) for v, o in zip(fitted, training)),
             "fit_s": statistics.median(spent_s),
         }
         print(f"  field on {name}: {found['rows'][name]['object_db']:.2f} dB on the object", flush=True)
@@ -197,28 +197,34 @@ def table(figures: dict[str, Any]) -> str:
     )
     grounds = [figures["masks"][ground] for ground in _BACKGROUNDS]
     masks = [
-        (name, *(c for m in grounds for c in (f"{m[name]['iou']:.3f} ({m[name]['worst']:.3f})",
-                                              f"{m[name]['ms']:.1f}")))
+        (
+            name,
+            *(c for m in grounds for c in (f"{m[name]['iou']:.3f} ({m[name]['worst']:.3f})", f"{m[name]['ms']:.1f}")),
+        )
         for name in grounds[0]
-    ]  # fmt: skip
+    ]
     field = figures["field"]
     base = field["rows"]["whole"]["object_db"]
     fits = [
         (
-            name, f"{row['iou']:.3f}", f"{row['object_db']:.2f}", f"{row['spread_db']:.2f}",
-            f"{row['object_db'] - base:+.2f}", f"{row['fit_s']:.1f}",
+            name,
+            f"{row['iou']:.3f}",
+            f"{row['object_db']:.2f}",
+            f"{row['spread_db']:.2f}",
+            f"{row['object_db'] - base:+.2f}",
+            f"{row['fit_s']:.1f}",
         )
         for name, row in field["rows"].items()
-    ]  # fmt: skip
+    ]
     of_fits = (
         f"{FIELD}, {field['steps']} steps on 200 x 200 over clutter, {field['seeds']} seeds; PSNR on the "
         "object's pixels of 13 held-out views"
     )
-    return "\n\n".join((
-        about,
-        markdown_table(
-            ("segmentation", "IoU on white (worst)", "ms", "IoU on clutter (worst)", "ms"), masks
-        ),
-        of_fits,
-        markdown_table(("fitted to", "mask IoU", "dB", "spread", "against whole", "fit s"), fits),
-    ))  # fmt: skip
+    return "\n\n".join(
+        (
+            about,
+            markdown_table(("segmentation", "IoU on white (worst)", "ms", "IoU on clutter (worst)", "ms"), masks),
+            of_fits,
+            markdown_table(("fitted to", "mask IoU", "dB", "spread", "against whole", "fit s"), fits),
+        )
+    )

@@ -46,9 +46,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     return {f"{fps}_fps": _at_rate(run.folder / str(fps), scene, frames, fps, seconds) for fps in RATES}
 
 
-def _at_rate(
-    out: Path, scene: Scene, frames: dict[str, list[bytes]], fps: float, seconds: float
-) -> dict[str, Any]:
+def _at_rate(out: Path, scene: Scene, frames: dict[str, list[bytes]], fps: float, seconds: float) -> dict[str, Any]:
     """Measure one server at one frame rate. Raises BenchError."""
     out.mkdir(parents=True)
     with _edge_server(out, list(frames), fps) as (process, address):
@@ -119,9 +117,7 @@ async def _drive(
     }
 
 
-async def _camera(
-    channel: Any, scene: Scene, camera: str, images: list[bytes], fps: float, tally: _Tally
-) -> None:
+async def _camera(channel: Any, scene: Scene, camera: str, images: list[bytes], fps: float, tally: _Tally) -> None:
     """Push a frame per tick over one stream; a tick at which the last frame is unanswered is missed."""
     lens, matrix = scene.cameras[camera]
     pose, clock, session = Pose.from_matrix(matrix), WallClock(), f"bench-{os.getpid()}"
@@ -135,9 +131,7 @@ async def _camera(
     loop = asyncio.get_running_loop()
     begun, tick, sequence = loop.time(), 0, 0
     while True:
-        frame = Frame(
-            camera, session, sequence, clock.now_ns(), pose, lens, "jpeg", images[sequence % len(images)]
-        )
+        frame = Frame(camera, session, sequence, clock.now_ns(), pose, lens, "jpeg", images[sequence % len(images)])
         sent = time.perf_counter()
         outgoing.put_nowait(to_request(frame))
         answer = await stream.read()
@@ -198,8 +192,7 @@ def _edge_server(out: Path, cameras: list[str], fps: float) -> Iterator[tuple[su
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-    command = [sys.executable, "-m", "edge_server.cli", "run", str(scenario), "--listen", address,
-               "--out", str(out)]  # fmt: skip
+    command = [sys.executable, "-m", "edge_server.cli", "run", str(scenario), "--listen", address, "--out", str(out)]
     with (out / "log.txt").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         try:

@@ -21,15 +21,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.bench.run import BenchRun
-from edge_server.experiments.common.machine_probe import (
-    CHAINS,
-    PER_TASK,
-    ROUNDS,
-    TASKS,
-    copies,
-    divisions,
-    random_adds,
-)
+from edge_server.experiments.common.machine_probe import CHAINS, PER_TASK, ROUNDS, TASKS, copies, divisions, random_adds
 from edge_server.experiments.common.machine_speed import in_chains, median_s, reads
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.multiview_still import synthetic_still
@@ -309,11 +301,6 @@ def _rows(about: str, found: dict[str, Any]) -> list[tuple[str, ...]]:
             parts = kernel.get("floor_parts_ms", {})
             floor = ", ".join(f"{part.replace('_', '-')} {ms:.2f}" for part, ms in parts.items())
             explained = f"{kernel['floor_share']:.0%}" if parts else "-"
-            rows.append(
-                (about, name, f"{kernel['ms_a_step']:.2f}", f"{kernel['share']:.0%}", explained, floor)
-            )
+            rows.append((about, name, f"{kernel['ms_a_step']:.2f}", f"{kernel['share']:.0%}", explained, floor))
     outside = found["outside_kernels_share"]
-    return [
-        *rows,
-        (about, "outside kernels", f"{found['ms_a_step'] * outside:.2f}", f"{outside:.0%}", "-", ""),
-    ]
+    return [*rows, (about, "outside kernels", f"{found['ms_a_step'] * outside:.2f}", f"{outside:.0%}", "-", "")]

@@ -14,11 +14,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.bench.run import RECORDINGS, data_file, open_recording
-from edge_server.experiments.scenes.multiview_sequence import (
-    MultiviewSequence,
-    recorded_sequence,
-    synthetic_sequence,
-)
+from edge_server.experiments.scenes.multiview_sequence import MultiviewSequence, recorded_sequence, synthetic_sequence
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, synthetic_still
 from edge_server.fields import View
 from freshfield.geometry import so3_exp
@@ -54,27 +50,20 @@ OPTIONS: tuple[Option, ...] = (
     Option("distortion loss", {"distortion": 0.0}, {"distortion": 0.01}, ("tile", "room")),
     Option("no density seen by few", {"min_views": 0}, {"min_views": 2}, ("tile", "room")),
     Option(
-        "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
-        ("room, moving", "kitchen, moving"),
+        "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25}, ("room, moving", "kitchen, moving")
     ),
     Option(
-        "depth guide", {"depth_guide": 0.0}, {"depth_guide": 0.1},
-        ("tile", "tile, six", "lego", "kitchen, six", "room"),
+        "depth guide", {"depth_guide": 0.0}, {"depth_guide": 0.1}, ("tile", "tile, six", "lego", "kitchen, six", "room")
     ),
     Option("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
     Option("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen", "lego")),
     Option("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
     Option("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
     Option("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),
-    Option(
-        "stale pixels masked", {"mask_stale_ms": 0.0}, {"mask_stale_ms": 50.0}, ("room, late", "room, moving")
-    ),
+    Option("stale pixels masked", {"mask_stale_ms": 0.0}, {"mask_stale_ms": 50.0}, ("room, late", "room, moving")),
     Option("movement followed", {"follow": 0}, {"follow": 8}, ("room, late", "room, moving")),
-    Option(
-        "wrong views refused", {"refuse_beyond": 0.0}, {"refuse_beyond": 2.5},
-        ("room, moving", "kitchen, moving"),
-    ),
-)  # fmt: skip
+    Option("wrong views refused", {"refuse_beyond": 0.0}, {"refuse_beyond": 2.5}, ("room, moving", "kitchen, moving")),
+)
 
 
 @dataclass(frozen=True)
@@ -137,7 +126,7 @@ SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {
     "tile, six": (f"{FEW} of them", partial(_few, partial(_synthetic, "tile"))),
     "kitchen, six": (f"{FEW} of its 18 views", partial(_few, partial(_recorded, "kitchen", 1.0))),
     "kitchen, moving": ("30 frames a second", _kitchen_moving),
-}  # fmt: skip
+}
 MOVING = ("room, moving", "room, late", "kitchen, moving")
 
 

@@ -54,9 +54,7 @@ class BenchRun:
     model: Path | None = None
 
 
-def result_settings(
-    workload: Any, name: str, options: Mapping[str, Any] | None = None, **more: Any
-) -> dict[str, Any]:
+def result_settings(workload: Any, name: str, options: Mapping[str, Any] | None = None, **more: Any) -> dict[str, Any]:
     """The settings with which a result is stored: of the workload and of the representation.
 
     workload: a dataclass.

@@ -75,20 +75,19 @@ def measure(run: BenchRun) -> dict[str, Any]:
         maps = make_depth_maps(field.snapshot(), given, MeshSettings())
         rows[way] = {**facts, **_compared(maps, MeshSettings(), truth), "seconds": _now() - began}
         if way == _WHOLE:
-            rows[_BY_HAND] = {
-                **_compared(maps, MeshSettings(bounds=_box(scene)), truth),
-                "seconds": _now() - began,
-            }
+            rows[_BY_HAND] = {**_compared(maps, MeshSettings(bounds=_box(scene)), truth), "seconds": _now() - began}
         print(f"  {way}: {_said(rows[way])}", flush=True)
     return {
-        "views": len(views), "size": size, "steps": steps, "field": edge.field, "rows": rows,
+        "views": len(views),
+        "size": size,
+        "steps": steps,
+        "field": edge.field,
+        "rows": rows,
         "outside_cores": load_meter.outside_cores(),
-    }  # fmt: skip
+    }
 
 
-def _cut(
-    way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfig
-) -> tuple[list[View], dict[str, Any]]:
+def _cut(way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfig) -> tuple[list[View], dict[str, Any]]:
     """The views as given to the field; and the masks' IoU (mean, least) and milliseconds per image. Raises
     BenchError."""
     if way == _WHOLE:
@@ -113,9 +112,11 @@ def _cut(
         out.append(dataclasses.replace(view, image=image, weight=weight))
     status = cut.status()
     return out, {
-        "iou": float(np.mean(ious)), "least": min(ious), "whole": len(views) - cut.counts.masked,
+        "iou": float(np.mean(ious)),
+        "least": min(ious),
+        "whole": len(views) - cut.counts.masked,
         "ms": status["ms_per_image"],
-    }  # fmt: skip
+    }
 
 
 def _box(scene: Scene) -> tuple[Corner, Corner]:
@@ -151,11 +152,18 @@ def table(figures: dict[str, Any]) -> str:
         if "failed" in row:
             rows.append((way, *masks, row["failed"], *[""] * 5))
             continue
-        rows.append((
-            way, *masks, f"{row['chamfer_mm']:.2f}", f"{row['accuracy_mm']:.2f}",
-            f"{row['completeness_mm']:.2f}", f"{100 * row['complete']:.0f} %",
-            f"{100 * row['precise']:.0f} %", f"{row['seconds']:.0f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                way,
+                *masks,
+                f"{row['chamfer_mm']:.2f}",
+                f"{row['accuracy_mm']:.2f}",
+                f"{row['completeness_mm']:.2f}",
+                f"{100 * row['complete']:.0f} %",
+                f"{100 * row['precise']:.0f} %",
+                f"{row['seconds']:.0f}",
+            )
+        )
     head = (
         "cut by|mask IoU|least|ms|chamfer mm|mesh to tile mm|tile to mesh mm|surface within 3 mm|"
         "mesh within 3 mm|seconds"

@@ -26,14 +26,7 @@ from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.mesh_truth import SPACING_M
-from edge_server.experiments.scenes.tile_scan import (
-    DISTANCE_M,
-    Scan,
-    cell_scan,
-    exact_depth,
-    scan,
-    surface_truth,
-)
+from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, cell_scan, exact_depth, scan, surface_truth
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from edge_server.surface import SurfaceError
@@ -110,13 +103,15 @@ def measure(run: BenchRun) -> dict[str, Any]:
     close = scan(workload.size)
     truth = surface_truth(close)
     store.results["scan"] = {
-        "views": len(close.views), "size": workload.size, "distance_m": DISTANCE_M,
-        "truth_points": len(truth.points), "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
-    }  # fmt: skip
+        "views": len(close.views),
+        "size": workload.size,
+        "distance_m": DISTANCE_M,
+        "truth_points": len(truth.points),
+        "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
+    }
     exact = [exact_depth(close.scene, view) for view in close.views]
     # Results with other settings are measured again; a change of the cases alone keeps them.
-    about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm,
-             "depths": list(DEPTHS)}  # fmt: skip
+    about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm, "depths": list(DEPTHS)}
     store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
     progress = Progress(len(names) * workload.fit_s[-1])
     for name in names:
@@ -146,25 +141,22 @@ def _cell(size: int) -> dict[str, Any]:
     row["seconds"] = time.perf_counter() - began
     best = compare(mesh_from_depth_maps(_exact_maps(close, exact), MeshSettings()), truth)
     return {
-        **row, **dataclasses.asdict(compare(mesh, truth)), "triangles": len(mesh.faces),
-        "exact_chamfer_mm": best.chamfer_mm, "exact_complete": best.complete,
-    }  # fmt: skip
+        **row,
+        **dataclasses.asdict(compare(mesh, truth)),
+        "triangles": len(mesh.faces),
+        "exact_chamfer_mm": best.chamfer_mm,
+        "exact_complete": best.complete,
+    }
 
 
 def _exact_maps(close: Scan, exact: Sequence[NDArray[np.float64]]) -> list[DepthMap]:
     return [
-        depth_map(d.astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
-        for d, v in zip(exact, close.views)
+        depth_map(d.astype(np.float32), v.image, v.camera_to_world, v.intrinsics) for d, v in zip(exact, close.views)
     ]
 
 
 def _case(
-    name: str,
-    workload: Workload,
-    close: Scan,
-    exact: Sequence[NDArray[np.float64]],
-    truth: Truth,
-    progress: Progress,
+    name: str, workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth, progress: Progress
 ) -> dict[str, Any]:
     """Measure one case: fits that each continue the previous one."""
     representation, options = CASES[name]
@@ -227,10 +219,19 @@ def table(figures: dict[str, Any]) -> str:
         for depth in DEPTHS:
             d = fit[depth]
             seconds = ", ".join(f"{k[:-2]} {v:.1f}" for k, v in d.items() if k.endswith("_s"))
-            depths.append((
-                name, f"{fit['fit_s']:g}", fit["steps"], depth, f"{100 * d['covered']:.0f} %",
-                f"{d['bias_mm']:+.2f}", f"{d['median_mm']:.2f}", f"{d['p90_mm']:.2f}", seconds,
-            ))  # fmt: skip
+            depths.append(
+                (
+                    name,
+                    f"{fit['fit_s']:g}",
+                    fit["steps"],
+                    depth,
+                    f"{100 * d['covered']:.0f} %",
+                    f"{d['bias_mm']:+.2f}",
+                    f"{d['median_mm']:.2f}",
+                    f"{d['p90_mm']:.2f}",
+                    seconds,
+                )
+            )
     made = [("exact", "", m) for m in figures.get("exact", {}).get("meshes", [])]
     made += [(name, f"{fit['fit_s']:g}", m) for name, fit in fits for m in fit["meshes"]]
     meshes = []
@@ -239,11 +240,17 @@ def table(figures: dict[str, Any]) -> str:
         if "failed" in m:
             meshes.append([*cells, m["failed"], *[""] * 5])
             continue
-        meshes.append([
-            *cells, f"{m['chamfer_mm']:.2f}", f"{m['accuracy_mm']:.2f} ({m['accuracy_median_mm']:.2f})",
-            f"{m['completeness_mm']:.2f}", f"{100 * m['complete']:.1f} %, {100 * m['precise']:.1f} %",
-            m["triangles"], f"{m['seconds']:.1f}",
-        ])  # fmt: skip
+        meshes.append(
+            [
+                *cells,
+                f"{m['chamfer_mm']:.2f}",
+                f"{m['accuracy_mm']:.2f} ({m['accuracy_median_mm']:.2f})",
+                f"{m['completeness_mm']:.2f}",
+                f"{100 * m['complete']:.1f} %, {100 * m['precise']:.1f} %",
+                m["triangles"],
+                f"{m['seconds']:.1f}",
+            ]
+        )
     of_depth = "field|fit s|steps|depth|covered|bias mm|median mm|p90 mm|seconds"
     of_mesh = (
         "field|fit s|depth|method|voxel mm|chamfer mm|accuracy mm (median)|completeness mm|"
@@ -251,13 +258,16 @@ def table(figures: dict[str, Any]) -> str:
     )
     cells = [
         (
-            size, c["views"], f"{c['median_mm']:.2f}", f"{c['chamfer_mm']:.2f} ({c['exact_chamfer_mm']:.2f})",
+            size,
+            c["views"],
+            f"{c['median_mm']:.2f}",
+            f"{c['chamfer_mm']:.2f} ({c['exact_chamfer_mm']:.2f})",
             f"{c['accuracy_mm']:.2f} ({c['accuracy_median_mm']:.2f})",
             f"{100 * c['complete']:.1f} % ({100 * c['exact_complete']:.1f}), {100 * c['precise']:.1f} %",
             f"{c['seconds']:.0f}",
         )
         for size, c in figures.get("cell", {}).items()
-    ]  # fmt: skip
+    ]
     of_cell = (
         "cell at|views|depth, median mm|chamfer mm (exact depth)|accuracy mm (median)|"
         "within 3 mm: surface (exact depth), mesh|seconds"

@@ -22,11 +22,7 @@ from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, 
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db
-from edge_server.experiments.scenes.multiview_sequence import (
-    MultiviewSequence,
-    recorded_sequence,
-    synthetic_sequence,
-)
+from edge_server.experiments.scenes.multiview_sequence import MultiviewSequence, recorded_sequence, synthetic_sequence
 from edge_server.experiments.scenes.multiview_still import mean_baselines
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
@@ -105,9 +101,7 @@ def _measured(run: BenchRun, workload: Workload, scenes: Sequence[str]) -> dict[
     return store.results
 
 
-def _sequences(
-    workload: Workload, scenes: Sequence[str], asked: bool
-) -> Iterable[tuple[str, MultiviewSequence]]:
+def _sequences(workload: Workload, scenes: Sequence[str], asked: bool) -> Iterable[tuple[str, MultiviewSequence]]:
     for scene in scenes:
         if scene == "room":
             w = workload
@@ -150,16 +144,20 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
     for seconds in workload.update_s:
         start.load_state(warm)
         run = f"{seconds:g}_s"
-        figures[run] = _run(
-            start, sequence, workload, seconds, figures["fresh"], scorer, progress, f"{name} {run}"
-        )
+        figures[run] = _run(start, sequence, workload, seconds, figures["fresh"], scorer, progress, f"{name} {run}")
     return {**figures, "outside_cores": load.outside_cores()}
 
 
 def _run(
-    field: Field, sequence: MultiviewSequence, workload: Workload, seconds: float,
-    fresh: Mapping[str, Mapping[str, Any]], scorer: Scorer, progress: Progress, label: str,
-) -> dict[str, Any]:  # fmt: skip
+    field: Field,
+    sequence: MultiviewSequence,
+    workload: Workload,
+    seconds: float,
+    fresh: Mapping[str, Mapping[str, Any]],
+    scorer: Scorer,
+    progress: Progress,
+    label: str,
+) -> dict[str, Any]:
     """Run updates of one duration, frame by frame."""
     rows: list[dict[str, Any]] = []
     for frame in range(1, workload.updates + 1):
@@ -193,9 +191,7 @@ def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, 
     return {**found, "series": series}
 
 
-def gaps(
-    frames: Sequence[int], tracked: Sequence[float | None], fresh: Mapping[int, float]
-) -> dict[str, Any]:
+def gaps(frames: Sequence[int], tracked: Sequence[float | None], fresh: Mapping[int, float]) -> dict[str, Any]:
     """The gap of a follower, fresh minus tracked in dB; all values are None if nothing is known.
 
     frames, tracked: frame and score of each update.
@@ -296,15 +292,22 @@ def table(figures: dict[str, Any]) -> str:
         values = [_fresh(later, f"not_updated_{metric}")[1] for metric in _METRICS.values()]
         stayed = [statistics.fmean(v) if v else None for v in values]
         bases = figures[scene]["baseline"]
-        rows.append((
-            scene, name, _length(run, found), found["updates"], _both(whole, moving, "mean_db"),
-            _both(whole, moving, "fresh_mean_db"), f"{_db(stayed[0])} ({_db(stayed[1])})",
-            f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
-            _both(whole, moving, "median_db"),
-            f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
-            ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
-            _db(of_field.get("outside_cores")),
-        ))  # fmt: skip
+        rows.append(
+            (
+                scene,
+                name,
+                _length(run, found),
+                found["updates"],
+                _both(whole, moving, "mean_db"),
+                _both(whole, moving, "fresh_mean_db"),
+                f"{_db(stayed[0])} ({_db(stayed[1])})",
+                f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
+                _both(whole, moving, "median_db"),
+                f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
+                ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
+                _db(of_field.get("outside_cores")),
+            )
+        )
     return markdown_table(head.split("|"), rows)
 
 

@@ -73,9 +73,7 @@ def parse_options(words: Sequence[str]) -> dict[str, Any]:
     return options
 
 
-def run_command(
-    name: str, work: Callable[[], object], errors: tuple[type[Exception], ...], stopped: str
-) -> int:
+def run_command(name: str, work: Callable[[], object], errors: tuple[type[Exception], ...], stopped: str) -> int:
     """Call ``work`` and return the exit status of ``edge-server NAME``.
 
     errors: exceptions that are printed in one line; the status is then 2.

@@ -14,14 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.machine_probe import (
-    CHAINED,
-    CHAINS,
-    PER_TASK,
-    TASKS,
-    arithmetic,
-    random_reads,
-)
+from edge_server.experiments.common.machine_probe import CHAINED, CHAINS, PER_TASK, TASKS, arithmetic, random_reads
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.threads.thread_pool import Pool, cores
 
@@ -67,11 +60,7 @@ def speed_text(row: Row | None) -> str:
 
 def multiply_adds(pool: Pool, repeats: int) -> float:
     """Billions of float32 multiply-adds a second at the vector width that is fastest here."""
-    return max(
-        chains * in_chains(pool, k, repeats)
-        for k, (_, chains, additions) in enumerate(CHAINS)
-        if not additions
-    )
+    return max(chains * in_chains(pool, k, repeats) for k, (_, chains, additions) in enumerate(CHAINS) if not additions)
 
 
 def in_chains(pool: Pool, k: int, repeats: int) -> float:

@@ -28,9 +28,7 @@ class ResultStore:
     """
 
     def __init__(
-        self,
-        results: dict[str, Any] | None = None,
-        save: Callable[[tuple[str, ...], Result], None] | None = None,
+        self, results: dict[str, Any] | None = None, save: Callable[[tuple[str, ...], Result], None] | None = None
     ) -> None:
         self.results: dict[str, Any] = {} if results is None else results
         self._save = save
@@ -79,9 +77,7 @@ class ResultStore:
             self._save(path, result)
         return result
 
-    def get(
-        self, *path: str, compute: Callable[[], Result], settings: Mapping[str, Any] | None = None
-    ) -> Result:
+    def get(self, *path: str, compute: Callable[[], Result], settings: Mapping[str, Any] | None = None) -> Result:
         """The result at ``path``, computed and stored if ``find`` does not find it.
 
         compute: called for a missing result.

@@ -14,9 +14,12 @@ import freshfield
 _EXPERIMENTS = "edge_server/experiments"
 # Sources that only show or compare results.
 _EXCLUDED = (
-    "edge_server/page", "edge_server/report", f"{_EXPERIMENTS}/studies",
-    f"{_EXPERIMENTS}/common/statistics.py", f"{_EXPERIMENTS}/common/arguments.py",
-)  # fmt: skip
+    "edge_server/page",
+    "edge_server/report",
+    f"{_EXPERIMENTS}/studies",
+    f"{_EXPERIMENTS}/common/statistics.py",
+    f"{_EXPERIMENTS}/common/arguments.py",
+)
 # The files below them that compute results.
 _INCLUDED = tuple(f"{_EXPERIMENTS}/studies/{name}.py" for name in ("trial", "viewpoints", "preferences"))
 

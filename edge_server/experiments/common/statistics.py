@@ -196,9 +196,7 @@ def at_its_best(curve: _Curve, lower_is_better: bool = False) -> dict[int, float
     return dict(zip(seeds, (-values if lower_is_better else values).tolist()))
 
 
-def move_of_optimum(
-    curves: Mapping[float, _Curve], lower_is_better: bool = False
-) -> tuple[Interval, Interval]:
+def move_of_optimum(curves: Mapping[float, _Curve], lower_is_better: bool = False) -> tuple[Interval, Interval]:
     """How the best x of a curve moves with a parameter.
 
     curves: parameter -> x -> seed -> value.
@@ -235,9 +233,10 @@ def share_closed(
     """(policy - base) / (limit - base), a ratio of means over the seeds that have all three, with an interval
     by resampling seeds. NaN if the limit is not better than the base."""
     rows = [
-        (p, b, n) for s in policy
+        (p, b, n)
+        for s in policy
         if (p := policy[s]) is not None and (b := base.get(s)) is not None and (n := limit.get(s)) is not None
-    ]  # fmt: skip
+    ]
     if not rows:
         return Interval(np.nan, np.nan, np.nan, 0)
     table = np.array(rows, float)

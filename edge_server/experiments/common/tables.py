@@ -43,9 +43,11 @@ def mean_or_none(values: Iterable[float | None]) -> float | None:
 
 
 def over_seeds(
-    rows: Iterable[Mapping[str, Any]], keys: Sequence[str], names: Sequence[str],
+    rows: Iterable[Mapping[str, Any]],
+    keys: Sequence[str],
+    names: Sequence[str],
     average: Callable[[Iterable[float | None]], float | None],
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[dict[str, Any]]:
     """Merge the rows that agree in ``keys``: each result has these values, the number of rows as ``seeds``,
     and the ``average`` of each of ``names``."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}

@@ -19,13 +19,7 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.common.arguments import (
-    OptionError,
-    add_lpips,
-    at_least,
-    command_parser,
-    parse_options,
-)
+from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, command_parser, parse_options
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
@@ -69,36 +63,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("data", type=Path, nargs="?", metavar="DATA", help="data set (folder or file), or a synthetic scene")
     add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
-    add(
-        "--field",
-        default="ngp",
-        metavar="NAME",
-        help=f"representation: {', '.join(field_names())} [%(default)s]",
-    )
+    add("--field", default="ngp", metavar="NAME", help=f"representation: {', '.join(field_names())} [%(default)s]")
     add("--list-options", action="store_true", help="list the options of --field, with defaults, and exit")
     add("--seconds", type=float, default=60.0, metavar="S", help="seconds of fitting [%(default)g]")
     add(
-        "--holdout", metavar="K|NAME,...",
+        "--holdout",
+        metavar="K|NAME,...",
         help="views of a data set to test on: every K-th, or these images or cameras; split: the data set's "
         "test set; 0: none [8]",
-    )  # fmt: skip
+    )
     add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes by K [%(default)g]")
     add(
-        "--frame",
-        type=at_least(0),
-        default=0,
-        metavar="N",
-        help="frame of a moving scene to fit, from 0 [%(default)s]",
+        "--frame", type=at_least(0), default=0, metavar="N", help="frame of a moving scene to fit, from 0 [%(default)s]"
     )
     add(
-        "--background", choices=sorted(BACKGROUNDS), default="white",
+        "--background",
+        choices=sorted(BACKGROUNDS),
+        default="white",
         help="background of transparent images [%(default)s]",
-    )  # fmt: skip
+    )
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add(
-        "--option", action="append", default=[], metavar="KEY=VALUE",
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
         help="option of the field, e.g. levels=12 (--list-options); may be repeated",
-    )  # fmt: skip
+    )
     add_lpips(parser)
     add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")
     add("--resume", action="store_true", help="continue the fit in OUT, up to --seconds in total")
@@ -182,9 +173,7 @@ def _open(request: argparse.Namespace) -> Recorded:
 class _Run:
     """A fit in progress: its files in ``request.out`` and its lines on the terminal."""
 
-    def __init__(
-        self, request: argparse.Namespace, options: dict[str, Any], data: Recorded, model: Field
-    ) -> None:
+    def __init__(self, request: argparse.Namespace, options: dict[str, Any], data: Recorded, model: Field) -> None:
         self.request, self.options, self.data, self.model = request, options, data, model
         self.out = request.out
         metric, self.lpips_missing = open_lpips(request.lpips)
@@ -223,9 +212,14 @@ class _Run:
     def go(self) -> dict[str, Any]:
         try:
             done = fit_in_slices(
-                self.model, self.data.training, self._score, marks_s(self.request.seconds), self._scored,
-                self.spent_s, self.spent_steps,
-            )  # fmt: skip
+                self.model,
+                self.data.training,
+                self._score,
+                marks_s(self.request.seconds),
+                self._scored,
+                self.spent_s,
+                self.spent_steps,
+            )
         except KeyboardInterrupt:  # during an evaluation: the last complete one is kept
             done = False
         if not done:
@@ -244,12 +238,23 @@ class _Run:
         self.processes[-1]["t_s"] = round(at.seconds, 3)
         outside = outside_cores(self.processes[-1])
         self.load_meter.row(0.0)  # the evaluation is not measured
-        self.rows.append({
-            "number": len(self.rows), "t_s": at.seconds, "psnr_db": score.psnr_db, "psnr_moving_db": None,
-            "ssim": score.ssim, "lpips": score.lpips, "aaoi_ms": None, "selected": len(self.data.training),
-            "update_ms": at.slice_s * 1e3, "truth_gap_ms": None, "steps": at.steps, "loss": at.loss,
-            "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
-        })  # fmt: skip
+        self.rows.append(
+            {
+                "number": len(self.rows),
+                "t_s": at.seconds,
+                "psnr_db": score.psnr_db,
+                "psnr_moving_db": None,
+                "ssim": score.ssim,
+                "lpips": score.lpips,
+                "aaoi_ms": None,
+                "selected": len(self.data.training),
+                "update_ms": at.slice_s * 1e3,
+                "truth_gap_ms": None,
+                "steps": at.steps,
+                "loss": at.loss,
+                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
+            }
+        )
         print(progress_line(at, outside, bool(self.data.held_out)), flush=True)
 
     def finish(self) -> dict[str, Any]:
@@ -270,9 +275,12 @@ class _Run:
 
     def _about(self) -> dict[str, Any]:
         return {
-            "field": self.request.field, "options": self.options, "seed": self.request.seed,
-            "scenario": f"fit {_data_name(self.request.data)}", "seconds": self.spent_s,
-        }  # fmt: skip
+            "field": self.request.field,
+            "options": self.options,
+            "seed": self.request.seed,
+            "scenario": f"fit {_data_name(self.request.data)}",
+            "seconds": self.spent_s,
+        }
 
     def _status(self) -> dict[str, Any]:
         d = self.data
@@ -280,13 +288,16 @@ class _Run:
             **self._about(),
             "kind": "fit",
             "data": {
-                "file": d.file.name, "instant": d.instant, "training": len(d.training),
-                "held_out": [v.camera for v in d.held_out], "missing": d.missing,
+                "file": d.file.name,
+                "instant": d.instant,
+                "training": len(d.training),
+                "held_out": [v.camera for v in d.held_out],
+                "missing": d.missing,
             },
             "baseline": mean_baselines(d.training, d.held_out, self.background),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
-        }  # fmt: skip
+        }
 
 
 def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> str:

@@ -68,9 +68,7 @@ def fit_in_slices(
         slice_s = time.perf_counter() - began
         seconds += slice_s
         steps += report.steps if report else 0
-        on_scored(
-            Scored(seconds, slice_s, steps if report else None, report.loss if report else None, score())
-        )
+        on_scored(Scored(seconds, slice_s, steps if report else None, report.loss if report else None, score()))
         if report is None or pressed.is_set():
             return False
     return True

@@ -134,26 +134,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("frontier", DESCRIPTION)
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
-    size(
-        "--quick",
-        action="store_true",
-        help="a smaller sweep: four minutes on two cores, not one to two hours",
-    )
+    size("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not one to two hours")
     size("--shipped", action="store_true", help="the sweep that is shipped, with --field all --points FILE")
     add("--scene", default="room", metavar="NAME|DATA", help="scene: room, tile or a data set [%(default)s]")
-    add(
-        "--holdout",
-        default="8",
-        metavar="K|NAME,...",
-        help="views of a data set to test on, as in fit [%(default)s]",
-    )
-    add(
-        "--scale",
-        type=float,
-        default=1.0,
-        metavar="K",
-        help="divide image sizes of a data set by K [%(default)g]",
-    )
+    add("--holdout", default="8", metavar="K|NAME,...", help="views of a data set to test on, as in fit [%(default)s]")
+    add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes of a data set by K [%(default)g]")
     add("--frame", type=int, default=0, metavar="N", help="frame of a moving data set, from 0 [%(default)s]")
     add("--field", metavar="NAME,...|all", default="ngp", help="representations [%(default)s]")
     add(
@@ -167,15 +152,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
     add_lpips(parser)
-    add(
-        "--points",
-        type=out_file,
-        metavar="FILE",
-        help="also write the points of figure 2, for deadline_ms, to FILE",
-    )
-    add(
-        "--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]"
-    )
+    add("--points", type=out_file, metavar="FILE", help="also write the points of figure 2, for deadline_ms, to FILE")
+    add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
     return parser
 
 
@@ -198,9 +176,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     args.out.mkdir(parents=True, exist_ok=True)
     file = FrontierFile(args.out / "frontier.json")
     lpips, missing = open_lpips(args.lpips)
-    return Frontier(
-        args.out, file, sweep, still, args.scene, fields, levels, lpips, missing, args.seed, args.points
-    )
+    return Frontier(args.out, file, sweep, still, args.scene, fields, levels, lpips, missing, args.seed, args.points)
 
 
 class FrontierFile:
@@ -282,9 +258,7 @@ class Frontier:
         """Points in the FILE of --points of representations and efforts that are not measured now."""
         assert self.points is not None
         known = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
-        return [
-            row for row in known if f"{row['field']} {row['effort']}" not in {e.label for e in self._live}
-        ]
+        return [row for row in known if f"{row['field']} {row['effort']}" not in {e.label for e in self._live}]
 
     @property
     def _seeds(self) -> range:
@@ -296,9 +270,13 @@ class Frontier:
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
-                "figure": 1, "scene": self.still.describe(), **_settings(effort),
-                "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
-            }  # fmt: skip
+                "figure": 1,
+                "scene": self.still.describe(),
+                **_settings(effort),
+                "seconds": planned_s,
+                "seed": seed,
+                "lpips": self.lpips is not None,
+            }
             measure = partial(effort_sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
             point, new = self.file.get(settings, measure)
             points.append({**point, "planned_s": planned_s, "effort": effort.label})
@@ -320,9 +298,12 @@ class Frontier:
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         for effort in self._live:
             settings: Row = {
-                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, **_settings(effort),
+                "figure": "charged",
+                **asdict(moving),
+                "speed_m_per_s": speed,
+                **_settings(effort),
                 "warm_steps": sweep.warm_steps,
-            }  # fmt: skip
+            }
             measure = partial(_measured_compute, moving, speed, effort, sweep.warm_steps)
             row, new = self.file.get(settings, measure)
             compute = found[effort.label] = Compute(**{k: v for k, v in row.items() if k != "settings"})
@@ -338,9 +319,7 @@ class Frontier:
         """Rows of figure 2 for every update time, effort and speed, as means over the seeds."""
         sweep, rows = self.sweep, []
         runs = list(product(self._live, sweep.speeds, self._seeds))
-        times = {
-            e.name: (LAYERS_S, *sweep.update_s) if e.name == "layers" else sweep.update_s for e in self._live
-        }
+        times = {e.name: (LAYERS_S, *sweep.update_s) if e.name == "layers" else sweep.update_s for e in self._live}
         count = sum(len(times[effort.name]) for effort, _, _ in runs)
         for effort, speed, seed in runs:
             # Made only for the first new point, so a resumed sweep makes only those that it still needs.
@@ -349,22 +328,35 @@ class Frontier:
             compute = charged[effort.label]
             for update_s in times[effort.name]:
                 seconds, layers = max(sweep.run_s, 6.0 * update_s), effort.name == "layers"
-                steps = (
-                    update_time.static_steps(update_s) if layers else update_time.steps_for(update_s, compute)
-                )
+                steps = update_time.static_steps(update_s) if layers else update_time.steps_for(update_s, compute)
                 every_s = update_s if layers else 0.0
                 settings: Row = {
-                    "figure": 2, **asdict(sweep.moving), "speed_m_per_s": speed, **_settings(effort),
-                    "warm_steps": sweep.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
-                    "compute": asdict(compute), "lpips": self.lpips is not None, "every_s": every_s,
-                }  # fmt: skip
+                    "figure": 2,
+                    **asdict(sweep.moving),
+                    "speed_m_per_s": speed,
+                    **_settings(effort),
+                    "warm_steps": sweep.warm_steps,
+                    "steps": steps,
+                    "seed": seed,
+                    "seconds": seconds,
+                    "compute": asdict(compute),
+                    "lpips": self.lpips is not None,
+                    "every_s": every_s,
+                }
                 point, new = self.file.get(
                     settings, partial(_moving_run, start, steps, compute, seconds, self.lpips, every_s)
                 )
-                rows.append({
-                    **point, "field": effort.field, "effort": effort.name, "options": effort.options,
-                    "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
-                })  # fmt: skip
+                rows.append(
+                    {
+                        **point,
+                        "field": effort.field,
+                        "effort": effort.name,
+                        "options": effort.options,
+                        "speed_m_per_s": speed,
+                        "planned_update_s": update_s,
+                        "seed": seed,
+                    }
+                )
                 print(
                     f"[{len(rows)}/{count}] {effort.label:16} {speed:g} m/s, "
                     f"update {point['update_s']:5.2f} s  shown {_db(point['shown_psnr_db'])}  "

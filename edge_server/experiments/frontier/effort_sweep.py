@@ -72,8 +72,17 @@ def fit_from_scratch(
 
 def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Medians over seeds of the points with the same effort and planned seconds (``planned_s``)."""
-    names = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db",
-             "ssim", "lpips", "outside_cores")  # fmt: skip
+    names = (
+        "seconds",
+        "steps",
+        "ms_per_step",
+        "rays_per_s",
+        "samples_per_s",
+        "psnr_db",
+        "ssim",
+        "lpips",
+        "outside_cores",
+    )
     return over_seeds(points, ("effort", "planned_s"), names, median_or_none)
 
 

@@ -47,9 +47,15 @@ def table(rows: Sequence[Row]) -> str:
 def updates_table(rows: Sequence[Row]) -> str:
     """Table of the shown and published fidelity by speed and seconds per update."""
     digits = {
-        "speed_m_per_s": 1, "update_s": 2, "steps": 0, "shown_age_ms": 0, "shown_psnr_db": 2,
-        "shown_psnr_moving_db": 2, "psnr_db": 2, "psnr_moving_db": 2,
-    }  # fmt: skip
+        "speed_m_per_s": 1,
+        "update_s": 2,
+        "steps": 0,
+        "shown_age_ms": 0,
+        "shown_psnr_db": 2,
+        "shown_psnr_moving_db": 2,
+        "psnr_db": 2,
+        "psnr_moving_db": 2,
+    }
     cells = [(_label(row), *(number(row[name], n) for name, n in digits.items())) for row in rows]
     head = "field, effort|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
     about = "shown: at random instants, the newest publication carried on; age: of its views then"
@@ -87,9 +93,12 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
             for effort, look in zip(efforts, looks):
                 group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
                 ax.plot(
-                    [r["seconds"] for r in group], [r[key] for r in group], marker=".", **look,
+                    [r["seconds"] for r in group],
+                    [r[key] for r in group],
+                    marker=".",
+                    **look,
                     label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
-                )  # fmt: skip
+                )
             if key == "psnr_db":
                 _encircle(ax, [r["seconds"] for r in front], [r[key] for r in front], "Pareto front")
             name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
@@ -114,14 +123,19 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
             for ax, speed in zip(axes[row], speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[f"shown_{key}"] is not None]
                 for who, look in zip(efforts, _line_styles(efforts)):
-                    group = sorted((r for r in here if (r["field"], r["effort"]) == who),
-                                   key=lambda r: r["update_s"])  # fmt: skip
+                    group = sorted((r for r in here if (r["field"], r["effort"]) == who), key=lambda r: r["update_s"])
                     x = [r["update_s"] for r in group]
                     shown = [r[f"shown_{key}"] for r in group]
                     ax.plot(x, shown, marker=".", linewidth=1.2, label=" ".join(who), **look)
                     if who == main:
-                        ax.plot(x, [r[key] for r in group], ":", color=look["color"], linewidth=1.0,
-                                label=f"{' '.join(main)},\nat publication")  # fmt: skip
+                        ax.plot(
+                            x,
+                            [r[key] for r in group],
+                            ":",
+                            color=look["color"],
+                            linewidth=1.0,
+                            label=f"{' '.join(main)},\nat publication",
+                        )
                 top = best(here, f"shown_{key}")
                 if top is not None:
                     _encircle(ax, [top["update_s"]], [top[f"shown_{key}"]], "best")
@@ -143,8 +157,7 @@ def _line_styles(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
     """Color and line style of each (representation, effort)."""
     fields = list(dict.fromkeys(who[0] for who in efforts))
     return [
-        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")}
-        for who in efforts
+        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")} for who in efforts
     ]
 
 

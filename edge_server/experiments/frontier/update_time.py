@@ -64,18 +64,23 @@ class MovingScene:
                 "seed": seed,
                 "cameras": {"count": self.cameras, "held_out": ["cam00"], "phase": "spread"},
                 "source": {
-                    "kind": "world", "scene": self.scene, "width": self.size, "height": self.size,
-                    "fps": self.fps, "speed_m_per_s": speed_m_per_s,
+                    "kind": "world",
+                    "scene": self.scene,
+                    "width": self.size,
+                    "height": self.size,
+                    "fps": self.fps,
+                    "speed_m_per_s": speed_m_per_s,
                 },
                 "channel": {"preset": self.channel},
                 "edge": {
-                    "field": field, "field_options": options,
+                    "field": field,
+                    "field_options": options,
                     "policy": {"name": self.policy, "value": self.policy_value},
                     "updates": "arrivals" if options.get("layers") else "cycle",
                 },
             },
             Path("frontier"),
-        )  # fmt: skip
+        )
 
 
 class WarmStart:
@@ -83,13 +88,7 @@ class WarmStart:
     instant, or in layers that follow arrivals for a while before each run."""
 
     def __init__(
-        self,
-        moving: MovingScene,
-        speed: float,
-        field: str,
-        options: dict[str, Any],
-        seed: int,
-        warm_steps: int,
+        self, moving: MovingScene, speed: float, field: str, options: dict[str, Any], seed: int, warm_steps: int
     ) -> None:
         from edge_server.fields.registry import make_field
 
@@ -102,12 +101,7 @@ class WarmStart:
         self._warm = self.field.state()
 
     def run(
-        self,
-        steps: int,
-        compute: Compute,
-        seconds: float,
-        lpips: PerceptualMetric | None = None,
-        every_s: float = 0.0,
+        self, steps: int, compute: Compute, seconds: float, lpips: PerceptualMetric | None = None, every_s: float = 0.0
     ) -> dict[str, Any]:
         """Run updates of ``steps`` for ``seconds`` of virtual time, starting with the warm field. Returns
         mean scores.
@@ -115,9 +109,12 @@ class WarmStart:
         every_s: least time from one update to the next.
         """
         settings = RunSettings(
-            steps, compute=compute, epoch_ms=1e3 * every_s, score_every_ms=1e3 * seconds / _SCORED,
+            steps,
+            compute=compute,
+            epoch_ms=1e3 * every_s,
+            score_every_ms=1e3 * seconds / _SCORED,
             shown_every_ms=1e3 * seconds / _INSTANTS,
-        )  # fmt: skip
+        )
         if self.layers:
             self.field.reset()
             deployment = self.lead(settings, Scorer(lpips))
@@ -156,25 +153,25 @@ class WarmStart:
         costs: records the last third of the updates.
         """
         settings = replace(
-            settings, steps=static_steps(_LEAD_UPDATE_S), compute=Compute(),
-            epoch_ms=1e3 * _LEAD_UPDATE_S, score_every_ms=None,
-        )  # fmt: skip
+            settings,
+            steps=static_steps(_LEAD_UPDATE_S),
+            compute=Compute(),
+            epoch_ms=1e3 * _LEAD_UPDATE_S,
+            score_every_ms=None,
+        )
 
         def published(publication: Publication) -> None:
             if costs is not None:
                 costs.published(deployment.updates, publication.t_s >= _LEAD_S * 2 / 3)
 
         deployment = build_deployment(
-            self.scenario, settings, field=self.field, scorer=scorer, cameras=self.cameras,
-            on_published=published,
-        )  # fmt: skip
+            self.scenario, settings, field=self.field, scorer=scorer, cameras=self.cameras, on_published=published
+        )
         deployment.run(_LEAD_S)
         return deployment
 
 
-def measure_compute(
-    moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int
-) -> Compute:
+def measure_compute(moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int) -> Compute:
     """Measure the time of updates of a warm field on this machine while the scene moves and every image is
     new: ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
     snapshot), from medians of ``_UPDATES`` short and as many long updates. For layers ms_per_update and

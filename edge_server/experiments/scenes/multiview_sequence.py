@@ -72,9 +72,7 @@ class MultiviewSequence:
         for view in self.truth(frame):
             shown = field.render(view.camera_to_world, view.intrinsics).color
             now, earlier = view.generated_ns, self.before(view.camera, frame)
-            scores.append(
-                scorer.score(view.camera, shown, now, view.image, now, earlier, self.bounds[view.camera])
-            )
+            scores.append(scorer.score(view.camera, shown, now, view.image, now, earlier, self.bounds[view.camera]))
         return mean_score(scores)
 
     def _view(self, camera: str, frame: int) -> View:
@@ -97,10 +95,15 @@ def synthetic_sequence(
         return [scene.render(camera, key / fps - lag / 1e3) for lag in LAGS_MS]
 
     return MultiviewSequence(
-        name, 1e3 / fps, scene.cameras, (HELD_OUT,), bounds={HELD_OUT: BOUND},
-        key=lambda frame: frame % loop, image=cache(lambda camera, key: scene.render(camera, key / fps)),
+        name,
+        1e3 / fps,
+        scene.cameras,
+        (HELD_OUT,),
+        bounds={HELD_OUT: BOUND},
+        key=lambda frame: frame % loop,
+        image=cache(lambda camera, key: scene.render(camera, key / fps)),
         before=lambda camera, frame: before(camera, frame % loop),
-    )  # fmt: skip
+    )
 
 
 def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> MultiviewSequence:

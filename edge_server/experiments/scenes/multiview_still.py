@@ -45,9 +45,7 @@ def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 
     return MultiviewStill(name, tuple(v for v in views if v.camera != HELD_OUT), held_out)
 
 
-def open_still(
-    scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0
-) -> MultiviewStill:
+def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0) -> MultiviewStill:
     """Open ``scene``: the name of a synthetic scene, or the path of a recorded data set.
 
     size: width and height in pixels of a synthetic scene.
@@ -57,23 +55,17 @@ def open_still(
     if scene in SCENES:
         return synthetic_still(scene, size=size)
     data = load_recorded(Path(scene), holdout, scale, frame)
-    return MultiviewStill(
-        data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE
-    )
+    return MultiviewStill(data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE)
 
 
 def smallest_angle_deg(still: MultiviewStill) -> float:
     """The smallest angle between the viewing directions of a held-out and a training camera: how far a field
     must extrapolate from its training views."""
-    forward = [
-        np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
-    ]
+    forward = [np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)]
     return float(np.rad2deg(np.arccos(np.clip(forward[0] @ forward[1].T, -1.0, 1.0)).min()))
 
 
-def mean_baselines(
-    training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
-) -> dict[str, float | None]:
+def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:
     """PSNR of the baselines without a field, as means over the held-out views; None without any. color: the
     background."""
     found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
@@ -87,9 +79,11 @@ def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
     low, high = scene.bounds
     return {
         "centre_m": [float(c) for c in 0.5 * (low + high)],
-        "radius_m": float(0.5 * (high - low).max()) + 0.01, "near_m": nearest_m, "contracted": False,
+        "radius_m": float(0.5 * (high - low).max()) + 0.01,
+        "near_m": nearest_m,
+        "contracted": False,
         "background": "#" + "".join(f"{round(255 * c):02x}" for c in scene.world.background),
-    }  # fmt: skip
+    }
 
 
 def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:

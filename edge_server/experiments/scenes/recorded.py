@@ -49,9 +49,7 @@ def load_recorded(
     return Recorded(file, training, held_out, instant, dataset.missing)
 
 
-def split(
-    views: Sequence[View], holdout: str, own: Collection[str] = ()
-) -> tuple[tuple[View, ...], tuple[View, ...]]:
+def split(views: Sequence[View], holdout: str, own: Collection[str] = ()) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Split views into (training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views
     that the data set itself holds out. Raises DatasetError."""
     every = int(holdout) if holdout.strip().isdigit() else None
@@ -70,9 +68,7 @@ def split(
         out = [every > 0 and i % every == 0 for i in range(len(views))]
     training = tuple(v for v, is_out in zip(views, out) if not is_out)
     if not training:
-        raise DatasetError(
-            f"--holdout {holdout}: all {len(views)} views are held out, none is left to train on"
-        )
+        raise DatasetError(f"--holdout {holdout}: all {len(views)} views are held out, none is left to train on")
     return training, tuple(v for v, is_out in zip(views, out) if is_out)
 
 

@@ -68,17 +68,13 @@ def _scan_from(poses: Sequence[Array], size: int, fov_deg: float) -> Scan:
     lens = Pinhole.from_fov(size, size, fov_deg)
     cameras = {f"scan{k:02d}": (lens, pose) for k, pose in enumerate(poses)}
     scene = scene.with_cameras(cameras)
-    views = tuple(
-        View(name, scene.view(lens, pose).image(0.0), pose, lens) for name, (lens, pose) in cameras.items()
-    )
+    views = tuple(View(name, scene.view(lens, pose).image(0.0), pose, lens) for name, (lens, pose) in cameras.items())
     return Scan(scene, views)
 
 
 def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
     """Distance (H, W) along the ray through every pixel's center; inf if it meets nothing."""
-    renderer = replace(scene, params=replace(scene.params, supersample=1)).view(
-        view.intrinsics, view.camera_to_world
-    )
+    renderer = replace(scene, params=replace(scene.params, supersample=1)).view(view.intrinsics, view.camera_to_world)
     return renderer.distance()
 
 

@@ -23,39 +23,73 @@ from freshfield.scenario import ScenarioError
 
 # name -> (module, class, one line of help)
 STUDIES = {
-    "metrics": ("metric_distortions", "Metrics",
-                "figure 3.6: what PSNR, SSIM and LPIPS say about three artifacts"),
+    "metrics": ("metric_distortions", "Metrics", "figure 3.6: what PSNR, SSIM and LPIPS say about three artifacts"),
     "mat": ("age.max_age", "Mat", "figures 5.6, 5.7: fidelity against the maximum age of used views"),
-    "mat-delay": ("age.max_age_by_delay", "MatDelay",
-                  "figure 5.8: the best maximum age against the mean delay"),
+    "mat-delay": ("age.max_age_by_delay", "MatDelay", "figure 5.8: the best maximum age against the mean delay"),
     "lambda": ("age.age_weight", "Weighing", "equation 5.8: fidelity against the weight of timeliness"),
-    "omega": ("age.omega", "Omega",
-              "figures 6.3, 6.4: threshold and wait in both interpretations, by traffic and queue; flush"),
+    "omega": (
+        "age.omega",
+        "Omega",
+        "figures 6.3, 6.4: threshold and wait in both interpretations, by traffic and queue; flush",
+    ),
     "images": ("age.image_count", "Images", "figures 6.5, 6.6: LPIPS and age against the number of images"),
-    "representations": ("age.representations", "Representations",
-                        "figure 6.7: the same trade-off with other representations"),
-    "phase": ("age.trade_map", "Phase",
-              "where the trade-off exists: speed x delay x memory x compute, and gain of mask, freshen"),
-    "viewpoints": ("viewpoints", "Viewpoints",
-                   "tables 4.1, 4.3, figures 4.7, 4.8: which views to take of a static object"),
-    "preferences": ("preferences", "Preferences",
-                    "figure 4.6, tables 4.2, 4.3: what is learned from simulated experts' preferences"),
-    "ppo-select": ("learning.ppo_select", "PpoSelect",
-                   "figure 5.9: a scheduler that learns which views to use, against all other policies"),
-    "ppo-wait": ("learning.ppo_wait", "PpoWait",
-                 "figure 6.8: a scheduler that learns how long to wait, or a maximum age, by traffic"),
-    "ablation": ("learning.state_ablation", "Ablation",
-                 "how much ages, poses and semantics in the state contribute to a learned policy"),
-    "weights": ("learning.reward_weights", "Weights",
-                "policies learned with other weights of the reward, judged by all of them"),
-    "drift": ("learning.channel_drift", "Drift",
-              "the channel changes during use: fixed, learned and still learning policies"),
+    "representations": (
+        "age.representations",
+        "Representations",
+        "figure 6.7: the same trade-off with other representations",
+    ),
+    "phase": (
+        "age.trade_map",
+        "Phase",
+        "where the trade-off exists: speed x delay x memory x compute, and gain of mask, freshen",
+    ),
+    "viewpoints": (
+        "viewpoints",
+        "Viewpoints",
+        "tables 4.1, 4.3, figures 4.7, 4.8: which views to take of a static object",
+    ),
+    "preferences": (
+        "preferences",
+        "Preferences",
+        "figure 4.6, tables 4.2, 4.3: what is learned from simulated experts' preferences",
+    ),
+    "ppo-select": (
+        "learning.ppo_select",
+        "PpoSelect",
+        "figure 5.9: a scheduler that learns which views to use, against all other policies",
+    ),
+    "ppo-wait": (
+        "learning.ppo_wait",
+        "PpoWait",
+        "figure 6.8: a scheduler that learns how long to wait, or a maximum age, by traffic",
+    ),
+    "ablation": (
+        "learning.state_ablation",
+        "Ablation",
+        "how much ages, poses and semantics in the state contribute to a learned policy",
+    ),
+    "weights": (
+        "learning.reward_weights",
+        "Weights",
+        "policies learned with other weights of the reward, judged by all of them",
+    ),
+    "drift": (
+        "learning.channel_drift",
+        "Drift",
+        "the channel changes during use: fixed, learned and still learning policies",
+    ),
     "transfer": ("learning.transfer", "Transfer", "policies of one scene and channel, used on another"),
-    "semantics": ("learning.semantics", "Semantics",
-                  "where image embeddings in the state help, and their cost where they do not"),
-    "reward-cost": ("learning.reward_cost", "RewardCost",
-                    "reward against training time, by the effort of a fit and the embedding"),
-}  # fmt: skip
+    "semantics": (
+        "learning.semantics",
+        "Semantics",
+        "where image embeddings in the state help, and their cost where they do not",
+    ),
+    "reward-cost": (
+        "learning.reward_cost",
+        "RewardCost",
+        "reward against training time, by the effort of a fit and the embedding",
+    ),
+}
 # Studies that consist of cases: --case selects some of them.
 CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "ablation", "reward-cost")
 # Studies that train: they take long and are not part of "all".
@@ -91,9 +125,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     folders = folders_of(args)
     scenes = tuple(args.scene.split(",")) if args.scene else None
     request = StudyRequest(
-        quick=args.quick, out=args.out, folders=folders, seeds=args.seeds, scenes=scenes, jobs=args.jobs,
-        cases=tuple(args.case), episodes=args.episodes, field=args.field,
-    )  # fmt: skip
+        quick=args.quick,
+        out=args.out,
+        folders=folders,
+        seeds=args.seeds,
+        scenes=scenes,
+        jobs=args.jobs,
+        cases=tuple(args.case),
+        episodes=args.episodes,
+        field=args.field,
+    )
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
 
     def work() -> None:
@@ -154,8 +195,12 @@ def _checked(names: list[str], request: StudyRequest, ray: str | None) -> list[s
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("study", DESCRIPTION)
     add = parser.add_argument
-    add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
-        help=f"{', '.join(STUDIES)}; all: up to phase; learning: from ppo-select on")  # fmt: skip
+    add(
+        "study",
+        choices=[*STUDIES, "all", "learning"],
+        metavar="NAME",
+        help=f"{', '.join(STUDIES)}; all: up to phase; learning: from ppo-select on",
+    )
     add(
         "--quick",
         action="store_true",
@@ -163,20 +208,13 @@ def _parser() -> argparse.ArgumentParser:
         "each study that trains",
     )
     add("--seeds", type=int, metavar="N", help="seeds per point [the study's own]")
-    add(
-        "--jobs",
-        type=int,
-        default=usable_cores(),
-        metavar="N",
-        help="number of worker processes [%(default)s]",
-    )
+    add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
     add(
         "--case",
         action="append",
         default=[],
         metavar="WORDS",
-        help=f"only cases with these words in their name, in {', '.join(CASED)}; words that no name has "
-        "list all cases",
+        help=f"only cases with these words in their name, in {', '.join(CASED)}; words that no name has list all cases",
     )
     add("--episodes", type=int, metavar="N", help="episodes of each training [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
@@ -186,8 +224,12 @@ def _parser() -> argparse.ArgumentParser:
         help="shipped scenarios with fixed cameras, such as kitchen or dynerf (viewpoints and preferences: "
         "cell, too); room means room19 [the study's own]",
     )
-    add("--field", choices=field_names(), default="splat",
-        help="representation, unless the study names its own [%(default)s]")  # fmt: skip
+    add(
+        "--field",
+        choices=field_names(),
+        default="splat",
+        help="representation, unless the study names its own [%(default)s]",
+    )
     add_folders(parser)
     add("--out", type=out_folder, default="runs/study", metavar="DIR", help="folder to write [%(default)s]")
     return parser

@@ -26,16 +26,29 @@ def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
     """
     xs, ys = list(curve), [interval(values.values()) for values in curve.values()]
     color = CYCLE[place % len(CYCLE)]
-    axes.plot(xs, [y.mean for y in ys], marker="o", markersize=3, color=color, label=label,
-              linestyle="-" if place < len(CYCLE) else "--")  # fmt: skip
+    axes.plot(
+        xs,
+        [y.mean for y in ys],
+        marker="o",
+        markersize=3,
+        color=color,
+        label=label,
+        linestyle="-" if place < len(CYCLE) else "--",
+    )
     if all(y.count > 1 for y in ys):
         axes.fill_between(xs, [y.low for y in ys], [y.high for y in ys], color=color, alpha=0.15, linewidth=0)
 
 
 def draw_metrics(
-    path: Path, table: Table, x: str, axis: str, metrics: Sequence[str], lines: Sequence[tuple[str, dict]],
-    title: str, levels: Sequence[tuple[str, dict]] = (),
-) -> None:  # fmt: skip
+    path: Path,
+    table: Table,
+    x: str,
+    axis: str,
+    metrics: Sequence[str],
+    lines: Sequence[tuple[str, dict]],
+    title: str,
+    levels: Sequence[tuple[str, dict]] = (),
+) -> None:
     """Draw a panel for each of ``metrics`` that was measured, to ``path`` (PNG).
 
     x, axis: label of the points, and its text.
@@ -56,9 +69,11 @@ def draw_metrics(
                     at.axhline(level.mean, color=GRAY, linestyle=style, linewidth=1.2, label=label)
             last = metric == measured[-1]
             label_lines(
-                at, METRICS[metric].label.replace(", ", ",\n"), axis if last else None,
+                at,
+                METRICS[metric].label.replace(", ", ",\n"),
+                axis if last else None,
                 title if metric == measured[0] else None,
-            )  # fmt: skip
+            )
 
 
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:
@@ -72,8 +87,9 @@ def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]
                 width = round(image.shape[1] * _HEIGHT / image.shape[0])
                 at.imshow(cv2.resize(image, (width, _HEIGHT), interpolation=cv2.INTER_NEAREST))
                 at.set_title(label, fontsize=8, fontweight="normal", loc="center")
-            line[0].text(-0.06, 0.5, title, rotation=90, va="center", ha="right", fontsize=9,
-                         transform=line[0].transAxes)  # fmt: skip
+            line[0].text(
+                -0.06, 0.5, title, rotation=90, va="center", ha="right", fontsize=9, transform=line[0].transAxes
+            )
 
 
 def draw_trials(path: Path, request: StudyRequest, rows: Sequence[tuple[str, Sequence[Trial]]]) -> None:

@@ -46,9 +46,7 @@ def run_task(task: Task, folders: Folders, kind: str | None = None) -> list[Row]
     kind: the kind of processor that results are stored for; None: any. Raises StudyError on another kind.
     """
     if kind is not None and kind != processor():
-        raise StudyError(
-            f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor"
-        )
+        raise StudyError(f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor")
     return [run_trial(Trial(**mapping), folders) for mapping in task]
 
 
@@ -104,9 +102,7 @@ class Engine:
             for task, mappings in zip(tasks, sent):
                 yield task, run_task(mappings, self.folders)
 
-    def _in_processes(
-        self, tasks: list[list[str]], sent: list[Task]
-    ) -> Iterator[tuple[list[str], list[Row]]]:
+    def _in_processes(self, tasks: list[list[str]], sent: list[Task]) -> Iterator[tuple[list[str], list[Row]]]:
         # Fresh processes: forking one that has threads of kernels in it would hang.
         jobs = min(self.jobs, len(tasks))
         pool = ProcessPoolExecutor(jobs, WorkerContext(), init_worker, (max(1, usable_cores() // jobs),))
@@ -130,9 +126,7 @@ class Engine:
         if not ray.is_initialized():
             _start_ray(ray, self.ray)
         remote: Any = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
-        running = {
-            remote.remote(mappings, self.folders, processor()): task for task, mappings in zip(tasks, sent)
-        }
+        running = {remote.remote(mappings, self.folders, processor()): task for task, mappings in zip(tasks, sent)}
         try:
             while running:
                 finished, _ = ray.wait(list(running), num_returns=1)
@@ -149,9 +143,7 @@ def _start_ray(ray: Any, where: str) -> None:
     attempts = 2 if where == "local" else 1  # the first start on a cold disk may exceed Ray's 30 seconds
     for left in reversed(range(attempts)):
         try:
-            ray.init(
-                address=None if where == "local" else where, log_to_driver=False, include_dashboard=False
-            )
+            ray.init(address=None if where == "local" else where, log_to_driver=False, include_dashboard=False)
             return
         except Exception as error:  # Ray raises this very class where a node starts too slowly
             ray.shutdown()
@@ -210,8 +202,4 @@ def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
     for key, trial in wanted.items():
         kind = (trial.field, json.dumps(trial.field_options, sort_keys=True))
         groups.setdefault((*trial.stage, *kind, trial.seed), []).append(key)
-    return [
-        group[i : i + _TRIALS_A_TASK]
-        for group in groups.values()
-        for i in range(0, len(group), _TRIALS_A_TASK)
-    ]
+    return [group[i : i + _TRIALS_A_TASK] for group in groups.values() for i in range(0, len(group), _TRIALS_A_TASK)]

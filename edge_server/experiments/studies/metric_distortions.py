@@ -90,14 +90,12 @@ class Metrics(Study):
         rows = []
         for case, found in scores.items():
             psnr_db, ssim_, lpips_ = (number(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
-            rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_,
-                         "seeds": len(found["psnr"])})  # fmt: skip
+            rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_, "seeds": len(found["psnr"])})
         write_csv(request.out / "metrics.csv", rows)
         verdicts = [
             self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
-            self._ordering(scores, "ssim", "highest for ghosting, against the prose",
-                           "local ghosting", False),
-        ]  # fmt: skip
+            self._ordering(scores, "ssim", "highest for ghosting, against the prose", "local ghosting", False),
+        ]
         if missing:
             print(f"  LPIPS is left out: {missing}")
             return verdicts
@@ -110,17 +108,11 @@ class Metrics(Study):
 
     def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
         mine = scores[case][metric]
-        gaps = [
-            _gap(v[metric], mine) if lowest else _gap(mine, v[metric]) for c, v in scores.items() if c != case
-        ]
+        gaps = [_gap(v[metric], mine) if lowest else _gap(mine, v[metric]) for c, v in scores.items() if c != case]
         answer = all_of(gap.above(0.0) for gap in gaps)
         text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
         return Verdict(
-            metric.upper(),
-            f"{claim} (figure 3.6's table).",
-            text + ".",
-            answer,
-            min(gaps, key=lambda gap: gap.mean),
+            metric.upper(), f"{claim} (figure 3.6's table).", text + ".", answer, min(gaps, key=lambda gap: gap.mean)
         )
 
 

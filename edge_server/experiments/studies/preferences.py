@@ -29,9 +29,11 @@ from freshfield.files import write_csv, write_text
 
 ASKED = (10, 20, 40, 60)
 HABITS: dict[str, dict[str, float | bool]] = {
-    "careful": {}, "10 % wrong": {"wrong": 0.1}, "30 % lazy": {"lazy": 0.3},
+    "careful": {},
+    "10 % wrong": {"wrong": 0.1},
+    "30 % lazy": {"lazy": 0.3},
     "contradicting": {"contradicts": True},
-}  # fmt: skip
+}
 _UNSEEN = 400  # pairs
 _EMBEDDED = "edges"  # the taste whose policy is also trained with embeddings of the captured pictures (4.8)
 _TRAINED_ON = "10 % wrong"
@@ -61,9 +63,7 @@ class Preferences(Study):
         write_text(request.out / "preferences-tables.md", "\n".join(parts))
         return verdicts
 
-    def _of_scene(
-        self, request: StudyRequest, scene: str, store: ResultStore
-    ) -> tuple[list[Row], list[Row], str]:
+    def _of_scene(self, request: StudyRequest, scene: str, store: ResultStore) -> tuple[list[Row], list[Row], str]:
         """Rows of answers and of captures of one scene, and what was done."""
         work = QUICK if request.quick else FULL
         stage = open_stage(str(scenario_of(scene).path), work.candidates, work.size, request.folders.data)
@@ -76,9 +76,12 @@ class Preferences(Study):
         scores = {taste: np.array([item[taste] for item in pool]) for taste in TASTES}
         seeds = request.repeats(6, 12)
         rows = [
-            row for taste in TASTES for habit in HABITS for seed in seeds
+            row
+            for taste in TASTES
+            for habit in HABITS
+            for seed in seeds
             for row in question(features, scores[taste], taste, habit, seed)
-        ]  # fmt: skip
+        ]
         captures, curves = self._policies(request, scene, stage, work, features, scores, store)
         draw(request.out / f"preferences-{scene}.png", rows, curves)
         lens = stage.candidates.lens
@@ -90,9 +93,15 @@ class Preferences(Study):
         return rows, captures, text
 
     def _policies(
-        self, request: StudyRequest, scene: str, stage: Stage, work: Workload, features: np.ndarray,
-        scores: dict[str, np.ndarray], store: ResultStore,
-    ) -> tuple[list[Row], dict[str, dict[float, dict[int, float | None]]]]:  # fmt: skip
+        self,
+        request: StudyRequest,
+        scene: str,
+        stage: Stage,
+        work: Workload,
+        features: np.ndarray,
+        scores: dict[str, np.ndarray],
+        store: ResultStore,
+    ) -> tuple[list[Row], dict[str, dict[float, dict[int, float | None]]]]:
         """Captures by a policy trained for each taste, and by others, with the same first views; and each
         policy's return against the number of updates (figure 4.6)."""
         captures: list[Row] = []
@@ -157,9 +166,12 @@ def _measured(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
     score = stage.score(field, Scorer(background=stage.background))
     choice_ms = 1e3 * float(np.mean([stop.seconds for stop in made.stops[1:]]))
     return {
-        "psnr_db": score.psnr_db, "ssim": score.ssim, "path_m": made.path_m, "choice_ms": choice_ms,
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
+        "path_m": made.path_m,
+        "choice_ms": choice_ms,
         **_tastes(stage, field),
-    }  # fmt: skip
+    }
 
 
 def ask(expert: SimulatedExpert, features: np.ndarray, answers: int) -> RewardModel:
@@ -178,9 +190,9 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
     asked, unseen = order[len(order) // 3 :], order[: len(order) // 3]
     expert = SimulatedExpert(taste, scores[asked], rng, **HABITS[habit])  # type: ignore[arg-type]
     other = SimulatedExpert(taste, scores[unseen], np.random.default_rng([seed, 2]), **HABITS[habit])  # type: ignore[arg-type]
-    first, second = np.random.default_rng([seed, 3]).permuted(
-        np.tile(np.arange(len(unseen)), (_UNSEEN, 1)), axis=1
-    )[:, :2].T  # fmt: skip
+    first, second = (
+        np.random.default_rng([seed, 3]).permuted(np.tile(np.arange(len(unseen)), (_UNSEEN, 1)), axis=1)[:, :2].T
+    )
     said = np.array([other.answer(i, j).prefers_first for i, j in zip(first, second)])
     again = np.array([other.answer(i, j).prefers_first for i, j in zip(first, second)])
     meant = np.array([other.taste_prefers(i, j) for i, j in zip(first, second)])
@@ -188,11 +200,20 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
     for answers in ASKED:
         model = ask(expert, features[asked], answers)
         expects = model.probability(features[unseen], first, second) > 0.5
-        rows.append({
-            "expert": expert.label, "taste": taste, "habit": habit, "seed": seed, "answers": answers,
-            "agreement": float((expects == said).mean()), "with_taste": float((expects == meant).mean()),
-            "with_itself": float((said == again).mean()), "odds": model.odds, "knows": model.knows,
-        })  # fmt: skip
+        rows.append(
+            {
+                "expert": expert.label,
+                "taste": taste,
+                "habit": habit,
+                "seed": seed,
+                "answers": answers,
+                "agreement": float((expects == said).mean()),
+                "with_taste": float((expects == meant).mean()),
+                "with_itself": float((said == again).mean()),
+                "odds": model.odds,
+                "knows": model.knows,
+            }
+        )
     return rows
 
 
@@ -208,18 +229,26 @@ def judge_answers(scene: str, rows: list[Row]) -> list[Verdict]:
         here = _of(rows, "agreement", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
         itself = _of(rows, "with_itself", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
         share = interval([a / b for s in here if (a := here[s]) is not None and (b := itself[s])])
-        verdicts.append(Verdict(
-            f"{scene}, simulated expert, {taste}, 10 % wrong",
-            f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
-            f"{share.text(3)} of it, on unseen pairs.", share.above(0.9), share,
-        ))  # fmt: skip
+        verdicts.append(
+            Verdict(
+                f"{scene}, simulated expert, {taste}, 10 % wrong",
+                f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
+                f"{share.text(3)} of it, on unseen pairs.",
+                share.above(0.9),
+                share,
+            )
+        )
     unsure = [not r["knows"] for r in rows if r["habit"] == "contradicting" and r["answers"] == ASKED[-1]]
     sure = [r["knows"] for r in rows if r["habit"] == "careful" and r["answers"] == ASKED[-1]]
-    verdicts.append(Verdict(
-        f"{scene}, simulated experts, contradicting", "the model says that it does not know.",
-        f"it says so in {sum(unsure)} of {len(unsure)} cases; of careful experts it says that it knows in "
-        f"{sum(sure)} of {len(sure)}.", sum(unsure) >= 0.9 * len(unsure),
-    ))  # fmt: skip
+    verdicts.append(
+        Verdict(
+            f"{scene}, simulated experts, contradicting",
+            "the model says that it does not know.",
+            f"it says so in {sum(unsure)} of {len(unsure)} cases; of careful experts it says that it knows in "
+            f"{sum(sure)} of {len(sure)}.",
+            sum(unsure) >= 0.9 * len(unsure),
+        )
+    )
     return verdicts
 
 
@@ -232,11 +261,15 @@ def judge_captures(scene: str, captures: list[Row]) -> list[Verdict]:
             way = paired(_of(captures, "path_m", arm=other), _of(captures, "path_m", arm=arm))
             about = f"{scene}, {arm}, {JUDGED} views"
             verdicts += [
-                Verdict(about, f"better than {other} (table 4.3).", f"{gain.text(2)} dB.",
-                        gain.above(0.0), gain),
-                Verdict(f"{about}, path", f"shorter than {other}'s (table 4.3).", f"{way.text(2)} m shorter.",
-                        way.above(0.0), way),
-            ]  # fmt: skip
+                Verdict(about, f"better than {other} (table 4.3).", f"{gain.text(2)} dB.", gain.above(0.0), gain),
+                Verdict(
+                    f"{about}, path",
+                    f"shorter than {other}'s (table 4.3).",
+                    f"{way.text(2)} m shorter.",
+                    way.above(0.0),
+                    way,
+                ),
+            ]
     return verdicts
 
 
@@ -244,9 +277,7 @@ def answer_table(rows: list[Row]) -> str:
     """Agreement on unseen pairs against the number of answers, in Markdown."""
     lines = []
     for expert in dict.fromkeys(r["expert"] for r in rows):
-        cells = [
-            interval(list(_of(rows, "agreement", expert=expert, answers=n).values())).text(2) for n in ASKED
-        ]
+        cells = [interval(list(_of(rows, "agreement", expert=expert, answers=n).values())).text(2) for n in ASKED]
         itself = interval(list(_of(rows, "with_itself", expert=expert, answers=ASKED[-1]).values()))
         knows = list(_of(rows, "knows", expert=expert, answers=ASKED[-1]).values())
         lines.append([expert, *cells, f"{itself.mean:.2f}", f"{sum(map(bool, knows))} of {len(knows)}"])

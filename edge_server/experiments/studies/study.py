@@ -105,9 +105,7 @@ class StudyRequest:
             if file is None or (data is not None and (data / file).exists()):
                 found.append(scene)
             else:
-                print(
-                    f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)"
-                )
+                print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
         if not found:
             raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
         return found
@@ -122,9 +120,14 @@ class StudyRequest:
         return Trial(scene=scene, **{"field": self.field, **sized, **more})
 
     def sweep(
-        self, scene: str, seeds: Iterable[int], conditions: Sequence[tuple[Row, Row]], x: str,
-        values: Mapping[str, Sequence[float]], ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
-    ) -> list[Point]:  # fmt: skip
+        self,
+        scene: str,
+        seeds: Iterable[int],
+        conditions: Sequence[tuple[Row, Row]],
+        x: str,
+        values: Mapping[str, Sequence[float]],
+        ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
+    ) -> list[Point]:
         """Points of every seed: in each condition use-all and each value of each policy; and without delay.
 
         conditions, ideals: (labels in the table, settings of the trial) of each.
@@ -138,8 +141,9 @@ class StudyRequest:
                 found.append(Point({**labels, "policy": "all"}, base))
                 found += [
                     Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
-                    for policy, some in values.items() for value in some
-                ]  # fmt: skip
+                    for policy, some in values.items()
+                    for value in some
+                ]
             for labels, settings in ideals:
                 ideal = self.trial(scene, seed=seed, channel={"preset": "ideal"}, **settings)
                 found.append(Point({"scene": scene, **labels, "policy": "no delay"}, ideal))
@@ -290,10 +294,15 @@ def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdi
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
     write_text(request.out / f"{study.name}.md", text)
     found = {
-        "study": study.name, "title": study.title, "command": request.command(study.name),
-        "quick": request.quick, "seeds": len({p.trial.seed for p in points}) or request.seeds,
-        "field": list(dict.fromkeys(p.trial.field for p in points)), "commit": commit(),
-        "verdicts": [v.mapping() for v in verdicts], "rows": table.means(),
-    }  # fmt: skip
+        "study": study.name,
+        "title": study.title,
+        "command": request.command(study.name),
+        "quick": request.quick,
+        "seeds": len({p.trial.seed for p in points}) or request.seeds,
+        "field": list(dict.fromkeys(p.trial.field for p in points)),
+        "commit": commit(),
+        "verdicts": [v.mapping() for v in verdicts],
+        "rows": table.means(),
+    }
     write_json(request.out / f"{study.name}.json", found)
     return verdicts

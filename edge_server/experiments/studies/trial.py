@@ -106,14 +106,20 @@ class Trial:
         elif self.scale != 1.0:
             source["scale"] = self.scale * source.get("scale", 1.0)
         edge = {
-            "field": self.field, "field_options": self.field_options,
+            "field": self.field,
+            "field_options": self.field_options,
             "policy": {"name": self.policy, "value": self.value},
-            "noisy_truth": edge.get("noisy_truth", False), "lpips": edge.get("lpips", "alex"),
-        }  # fmt: skip
+            "noisy_truth": edge.get("noisy_truth", False),
+            "lpips": edge.get("lpips", "alex"),
+        }
         data = {
-            "name": self.scene, "seed": self.seed, "cameras": cameras, "source": source,
-            "channel": self.channel, "edge": edge,
-        }  # fmt: skip
+            "name": self.scene,
+            "seed": self.seed,
+            "cameras": cameras,
+            "source": source,
+            "channel": self.channel,
+            "edge": edge,
+        }
         return parse(data, Path(f"study {self.scene}"))
 
     def run_settings(self) -> RunSettings:
@@ -194,9 +200,14 @@ def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeploym
     scenario = trial.scenario()
     stage = _stage(json.dumps(trial.stage), trial, folders)
     return build_deployment(
-        scenario, trial.run_settings(), field=_field(trial), cameras=stage.cameras, data=folders.data,
-        on_published=on_published, truth=stage.truth,
-    )  # fmt: skip
+        scenario,
+        trial.run_settings(),
+        field=_field(trial),
+        cameras=stage.cameras,
+        data=folders.data,
+        on_published=on_published,
+        truth=stage.truth,
+    )
 
 
 def _finish(deployment: VirtualDeployment, trial: Trial) -> None:

@@ -28,10 +28,14 @@ from freshfield.files import write_csv, write_text
 
 # label -> (selector, weight of the way)
 ARMS = {
-    "random": ("random", 0.0), "uniform": ("uniform", 0.0), "farthest": ("farthest", 0.0),
-    "coverage": ("coverage", 0.0), "FisherRF": ("fisher", 0.0), "uniform, short way": ("uniform", 0.3),
+    "random": ("random", 0.0),
+    "uniform": ("uniform", 0.0),
+    "farthest": ("farthest", 0.0),
+    "coverage": ("coverage", 0.0),
+    "FisherRF": ("fisher", 0.0),
+    "uniform, short way": ("uniform", 0.3),
     "coverage, short way": ("coverage", 0.3),
-}  # fmt: skip
+}
 JUDGED = 8  # views of table 4.3 and of the figures
 SCENES = {True: ("tile",), False: ("tile", "lego", "kitchen", "cell")}  # by whether it is a quick pass
 _SHOWN = ("random", "uniform", "coverage", "FisherRF")
@@ -98,14 +102,17 @@ def plan(stage: Stage, arm: str, seed: int, views: int, work: Workload) -> Plan:
     """A capture of one arm; the seed draws the first view, the same for all arms."""
     selector, weight = ARMS[arm]
     return plan_capture(
-        stage.candidates, make_selector(selector), Budget(views=views), stage.take, seed=seed,
-        travel_weight=weight, fit=lambda given: stage.fit(given, work.steps, seed),
-    )  # fmt: skip
+        stage.candidates,
+        make_selector(selector),
+        Budget(views=views),
+        stage.take,
+        seed=seed,
+        travel_weight=weight,
+        fit=lambda given: stage.fit(given, work.steps, seed),
+    )
 
 
-def capture(
-    stage: Stage, arm: str, seed: int, counts: tuple[int, ...], work: Workload, scorer: Scorer
-) -> Row:
+def capture(stage: Stage, arm: str, seed: int, counts: tuple[int, ...], work: Workload, scorer: Scorer) -> Row:
     """{rows: ...}, a row for each number of views: quality on the views held out, path, and milliseconds of
     a choice. What does not depend on the budget is planned once, and its beginnings are scored."""
     whole = None if ARMS[arm][0] == "uniform" else plan(stage, arm, seed, counts[-1], work)
@@ -114,11 +121,16 @@ def capture(
         made = whole or plan(stage, arm, seed, count, work)
         score = stage.score(stage.fit(made.views[:count], work.steps, seed), scorer)
         stops = made.stops[:count]
-        rows.append({
-            "views": len(stops), "psnr_db": score.psnr_db, "ssim": score.ssim, "lpips": score.lpips,
-            "path_m": sum(s.travel_m for s in stops),
-            "choice_ms": 1e3 * float(np.mean([s.seconds for s in stops[1:]])),
-        })  # fmt: skip
+        rows.append(
+            {
+                "views": len(stops),
+                "psnr_db": score.psnr_db,
+                "ssim": score.ssim,
+                "lpips": score.lpips,
+                "path_m": sum(s.travel_m for s in stops),
+                "choice_ms": 1e3 * float(np.mean([s.seconds for s in stops[1:]])),
+            }
+        )
     return {"rows": rows}
 
 
@@ -137,23 +149,37 @@ def judge(scene: str, rows: list[Row], counts: tuple[int, ...]) -> list[Verdict]
     for arm in ("random", "FisherRF"):
         of = curve(rows, arm, "psnr_db")
         gain = paired(of[counts[-1]], of[counts[0]])
-        verdicts.append(Verdict(
-            f"{scene}, {arm}", "more views are better (table 4.1: 20.2 dB with 5 to 22.7 dB with 20).",
-            f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.", gain.above(0.0), gain,
-        ))  # fmt: skip
+        verdicts.append(
+            Verdict(
+                f"{scene}, {arm}",
+                "more views are better (table 4.1: 20.2 dB with 5 to 22.7 dB with 20).",
+                f"{counts[0]} to {counts[-1]} views: {gain.text(2)} dB.",
+                gain.above(0.0),
+                gain,
+            )
+        )
     chance, way = curve(rows, "random", "psnr_db")[JUDGED], curve(rows, "random", "path_m")[JUDGED]
     for arm in list(ARMS)[1:]:
         gain = paired(curve(rows, arm, "psnr_db")[JUDGED], chance)
-        verdicts.append(Verdict(
-            f"{scene}, {arm}, {JUDGED} views", "better than random views (table 4.3: FisherRF 4.8 dB).",
-            f"{gain.text(2)} dB.", gain.above(0.0), gain,
-        ))  # fmt: skip
+        verdicts.append(
+            Verdict(
+                f"{scene}, {arm}, {JUDGED} views",
+                "better than random views (table 4.3: FisherRF 4.8 dB).",
+                f"{gain.text(2)} dB.",
+                gain.above(0.0),
+                gain,
+            )
+        )
     shorter = paired(curve(rows, "FisherRF", "path_m")[JUDGED], way)
-    verdicts.append(Verdict(
-        f"{scene}, FisherRF, {JUDGED} views, path",
-        "shorter than a random one (table 4.3: 2.61 m, 3.28 m).",
-        f"{shorter.text(2)} m longer.", negated(shorter.above(0.0)), shorter,
-    ))  # fmt: skip
+    verdicts.append(
+        Verdict(
+            f"{scene}, FisherRF, {JUDGED} views, path",
+            "shorter than a random one (table 4.3: 2.61 m, 3.28 m).",
+            f"{shorter.text(2)} m longer.",
+            negated(shorter.above(0.0)),
+            shorter,
+        )
+    )
     return verdicts
 
 
@@ -179,12 +205,17 @@ def tables(rows: list[Row], counts: tuple[int, ...]) -> str:
         [arm, *(at(arm, m, JUDGED).text(d) for m, d in kinds), number(at(arm, "choice_ms", JUDGED).mean, 1)]
         for arm in ARMS
     ]
-    return "\n".join([
-        "PSNR (dB) against the number of views:", "",
-        markdown_table(["selector", *map(str, counts)], by_count), "",
-        f"With {JUDGED} views:", "",
-        markdown_table(["selector", "PSNR (dB)", "SSIM", "LPIPS", "path (m)", "a choice (ms)"], judged),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "PSNR (dB) against the number of views:",
+            "",
+            markdown_table(["selector", *map(str, counts)], by_count),
+            "",
+            f"With {JUDGED} views:",
+            "",
+            markdown_table(["selector", "PSNR (dB)", "SSIM", "LPIPS", "path (m)", "a choice (ms)"], judged),
+        ]
+    )
 
 
 def draw(path: Path, rows: list[Row], scene: str) -> None:
@@ -205,9 +236,6 @@ def draw_local(path: Path, stage: Stage, plans: dict[str, Plan], work: Workload)
     rows: list[tuple[str, list[tuple[str, Image]]]] = []
     for view in stage.held_out[:: max(len(stage.held_out) // 2, 1)][:2]:
         shown = [("truth", view.image[..., :3])]
-        shown += [
-            (arm, to_bytes(f.render(view.camera_to_world, view.intrinsics).color))
-            for arm, f in fields.items()
-        ]
+        shown += [(arm, to_bytes(f.render(view.camera_to_world, view.intrinsics).color)) for arm, f in fields.items()]
         rows.append((view.camera, shown))
     draw_images(path, rows)

@@ -69,9 +69,7 @@ def compare(
     features = np.array([steps.trajectory(order) for order in orders])
     by = PERSON if who == PERSON else SimulatedExpert(who, np.zeros(0), np.random.default_rng()).label
     made_of = identity(stage, plans, about.steps, about.seed)
-    session = PreferenceSession(
-        stage.name, orders, features, about.questions, about.seed, by, made_of=made_of
-    )
+    session = PreferenceSession(stage.name, orders, features, about.questions, about.seed, by, made_of=made_of)
     path = about.out / ANSWERS
     if path.exists():
         try:
@@ -91,17 +89,19 @@ def compare(
 
 
 def _on_the_page(
-    stage: Stage, about: Comparison, plans: list[Plan], session: PreferenceSession, page: tuple[str, int],
+    stage: Stage,
+    about: Comparison,
+    plans: list[Plan],
+    session: PreferenceSession,
+    page: tuple[str, int],
     transport: Transport,
-) -> tuple[PreferenceSession, ShowPlan]:  # fmt: skip
+) -> tuple[PreferenceSession, ShowPlan]:
     from edge_server.page.preferences import PageError, PreferencePage
 
     transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
 
     def progress(k: int) -> None:
-        print(
-            f"\rreconstruction {k + 1} of {len(plans)}", end="\n" if k + 1 == len(plans) else "", flush=True
-        )
+        print(f"\rreconstruction {k + 1} of {len(plans)}", end="\n" if k + 1 == len(plans) else "", flush=True)
 
     made = sprites(stage, plans, about.steps, about.seed, about.out / "reconstructions", progress)
     path = about.out / ANSWERS

@@ -78,18 +78,21 @@ def _run(args: argparse.Namespace) -> None:
         comparison = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
         session, show = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
         agreed, repeated = session.agreement
-        print(
-            f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}"
-        )
+        print(f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}")
         if session.model.knows:
             selector = learn(stage, session, views, args.seed)
             selector.save(args.out / "policy.npz")
         else:
             print(f"planned by {selector.name} instead")
     plan = plan_capture(
-        stage.candidates, selector, budget, stage.take, seed=args.seed, travel_weight=args.travel,
+        stage.candidates,
+        selector,
+        budget,
+        stage.take,
+        seed=args.seed,
+        travel_weight=args.travel,
         fit=lambda views: stage.fit(views, args.steps, args.seed),
-    )  # fmt: skip
+    )
     scorer = Scorer(open_lpips(folders.lpips)[0], background=stage.background)
     score = stage.score(stage.fit(plan.views, args.steps, args.seed), scorer)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -101,9 +104,11 @@ def _run(args: argparse.Namespace) -> None:
         print(f"{n:3}  candidate {stop.candidate:3}  {1e3 * stop.seconds:6.0f} ms  {stop.why}")
     if plan.note:
         print(plan.note)
-    print(f"{len(plan.stops)} views, {plan.path_m:.2f} m of path; held out: PSNR {score.psnr_db:.2f} dB"
-          + (f", SSIM {score.ssim:.3f}" if score.ssim is not None else "")
-          + (f", LPIPS {score.lpips:.3f}" if score.lpips is not None else ""))  # fmt: skip
+    print(
+        f"{len(plan.stops)} views, {plan.path_m:.2f} m of path; held out: PSNR {score.psnr_db:.2f} dB"
+        + (f", SSIM {score.ssim:.3f}" if score.ssim is not None else "")
+        + (f", LPIPS {score.lpips:.3f}" if score.lpips is not None else "")
+    )
     print(f"{args.out / 'plan.json'} and plan.png", flush=True)
     if show is not None:
         lines = [f"candidate {stop.candidate}: {stop.why}" for stop in plan.stops]
@@ -131,14 +136,16 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
     add(
-        "--budget",
-        required=True,
-        metavar="N|Dm|N,Dm",
-        help="number of views, meters of path, or both: 8, 2.5m, 8,2.5m",
+        "--budget", required=True, metavar="N|Dm|N,Dm", help="number of views, meters of path, or both: 8, 2.5m, 8,2.5m"
     )
     add("--selector", default="coverage", metavar="NAME", help="how to choose, see above [%(default)s]")
-    add("--travel", type=float, default=0.2, metavar="W",
-        help="weight of path length against value, each over its range; 0: none [%(default)g]")  # fmt: skip
+    add(
+        "--travel",
+        type=float,
+        default=0.2,
+        metavar="W",
+        help="weight of path length against value, each over its range; 0: none [%(default)g]",
+    )
     add(
         "--candidates",
         type=int,
@@ -146,23 +153,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="number of candidates in a synthetic scene [%(default)s]",
     )
+    add("--steps", type=at_least(1), default=400, metavar="N", help="optimizer steps of each fit [%(default)s]")
+    add("--seed", type=at_least(0), default=0, metavar="N", help="random seed, also of the first view [%(default)s]")
     add(
-        "--steps",
-        type=at_least(1),
-        default=400,
-        metavar="N",
-        help="optimizer steps of each fit [%(default)s]",
-    )
-    add(
-        "--seed",
-        type=at_least(0),
-        default=0,
-        metavar="N",
-        help="random seed, also of the first view [%(default)s]",
-    )
-    add("--ask", nargs="?", const=PERSON, choices=[PERSON, *TASTES], metavar="WHO",
+        "--ask",
+        nargs="?",
+        const=PERSON,
+        choices=[PERSON, *TASTES],
+        metavar="WHO",
         help=f"compare reconstructions first, by a {PERSON} on the page (if WHO is left out) or a simulated "
-        f"expert: {', '.join(TASTES)}")  # fmt: skip
+        f"expert: {', '.join(TASTES)}",
+    )
     add("--questions", type=at_least(1), default=60, metavar="N", help="pairs that --ask shows [%(default)s]")
     add(
         "--reconstructions",
@@ -175,11 +176,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--page-host", default="127.0.0.1", metavar="HOST", help="address of --ask's page [%(default)s]")
     transport.add_arguments(parser)
     add_folders(parser)
-    add(
-        "--out",
-        type=out_folder,
-        default="runs/viewpoints",
-        metavar="DIR",
-        help="folder to write [%(default)s]",
-    )
+    add("--out", type=out_folder, default="runs/viewpoints", metavar="DIR", help="folder to write [%(default)s]")
     return parser

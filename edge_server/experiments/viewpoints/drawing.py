@@ -37,9 +37,7 @@ def draw_plan(path: Path, stage: Stage, plans: Sequence[tuple[str, Plan]]) -> No
             order = plan.order
             at.plot(x[order], y[order], color=CYCLE[1], linewidth=1.0)
             for n, k in enumerate(order, 1):
-                at.annotate(
-                    str(n), (x[k], y[k]), color=INK, fontsize=7, textcoords="offset points", xytext=(3, 3)
-                )
+                at.annotate(str(n), (x[k], y[k]), color=INK, fontsize=7, textcoords="offset points", xytext=(3, 3))
             at.set_aspect("equal")
             at.set_title(f"{stage.name}, {title}: {plan.path_m:.2f} m", fontsize=8.5)
             at.set_xlabel("from above: degrees from the zenith")

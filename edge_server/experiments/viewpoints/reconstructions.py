@@ -42,9 +42,7 @@ def varied_plan(stage: Stage, k: int, views: int) -> Plan:
         candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
     name = ("random", "random", "farthest", "random", "coverage", "uniform")[k % 6]
     weight = float(rng.choice([0.0, 0.0, 0.5]))
-    return plan_capture(
-        candidates, make_selector(name), Budget(views=views), stage.take, seed=k, travel_weight=weight
-    )
+    return plan_capture(candidates, make_selector(name), Budget(views=views), stage.take, seed=k, travel_weight=weight)
 
 
 def taste_score(stage: Stage, field: Field, taste: str) -> float:

@@ -105,9 +105,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
     target = np.asarray(scene.target)
     radius_m = float(np.linalg.norm(target - pose[:3, 3]))
     if pose[:3, 2] @ (target - pose[:3, 3]) < 0.0:
-        raise ViewpointError(
-            f"{scenario.path}: source: its cameras look outward: there is no object to go round"
-        )
+        raise ViewpointError(f"{scenario.path}: source: its cameras look outward: there is no object to go round")
     path = None if source.arm is None else source.arm.path
     sector: dict[str, Any] = {}
     if path is not None:
@@ -139,8 +137,7 @@ def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None, sc
     candidates = from_poses([v.camera_to_world for v in views], views[0].intrinsics)
     transparent = views[0].image.shape[2] == 4
     options: dict[str, Any] = {"background": "white"} if transparent else {}
-    return Stage(scenario.name, candidates, found.held_out, options, WHITE if transparent else BLACK,
-                 recorded=views)  # fmt: skip
+    return Stage(scenario.name, candidates, found.held_out, options, WHITE if transparent else BLACK, recorded=views)
 
 
 def _render(scene: Scene, name: str, candidates: Candidates, k: int) -> View:

@@ -56,8 +56,9 @@ of the last fault, and a second run has the same digest. The queue discipline of
 cameras: of these one must be up to date. For a seed that fails, a minimal set of its faults is found, and the
 command that repeats the failure is printed.
 """
-_SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0,
-                        epoch_ms=100.0, score_every_ms=None)  # fmt: skip
+_SETTINGS = RunSettings(
+    steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0, epoch_ms=100.0, score_every_ms=None
+)
 RECOVERY_S = 2.0
 # Most frames inside a link: a queue's limit, plus the frame in service and the one not sampled yet.
 _MOST_INSIDE = QUEUE_LIMIT + 2
@@ -253,17 +254,19 @@ def _results(args: argparse.Namespace, store: ResultStore) -> Iterator[dict[str,
 def _failure(found: dict[str, Any], only: Sequence[int] | None) -> str:
     """Text with the problems of a seed, the faults needed for them, and the command that repeats them."""
     seed, problems = found["seed"], found["problems"]
-    numbers = [
-        f.number for f in draw_faults(seed, scenario_of(seed).training) if only is None or f.number in only
-    ]
+    numbers = [f.number for f in draw_faults(seed, scenario_of(seed).training) if only is None or f.number in only]
     kept = shrink(seed, numbers, problems[0])
     faults = [f"    {text}" for text in found["faults"] if int(text.partition(":")[0]) in kept]
     words = ",".join(map(str, kept)) or "none"
-    return "\n".join([
-        f"seed {seed} fails:", *(f"  {problem}" for problem in problems),
-        f"  it takes {len(kept)} of its {len(numbers)} faults:", *faults,
-        f"  edge-server chaos --seeds {seed} --faults {words}",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"seed {seed} fails:",
+            *(f"  {problem}" for problem in problems),
+            f"  it takes {len(kept)} of its {len(numbers)} faults:",
+            *faults,
+            f"  edge-server chaos --seeds {seed} --faults {words}",
+        ]
+    )
 
 
 def _seeds(text: str) -> range:

@@ -61,12 +61,7 @@ class ChaosDeployment(VirtualDeployment):
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        cameras: list[Camera],
-        settings: RunSettings,
-        faults: Sequence[Fault],
-        out: Path,
+        self, scenario: Scenario, cameras: list[Camera], settings: RunSettings, faults: Sequence[Fault], out: Path
     ) -> None:
         self.scenario = scenario
         self.really: Counter[str] = Counter()
@@ -126,9 +121,7 @@ class ChaosDeployment(VirtualDeployment):
             self.really["waiting"] += len(self._waiting)
             self._waiting.clear()
         elif role == "emulator":
-            self.really["cut_off"] += sum(link.in_flight for link in self._links.values()) + len(
-                self._upstream
-            )
+            self.really["cut_off"] += sum(link.in_flight for link in self._links.values()) + len(self._upstream)
             self._links.clear()
             self._upstream.clear()
         else:
@@ -246,9 +239,7 @@ class ChaosDeployment(VirtualDeployment):
                 reason = error.reason
                 self.rejected[reason] += 1
             camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
-            self._write(
-                "edge", "rejected" if reason else "delivered", camera, session, header.sequence, reason or ""
-            )
+            self._write("edge", "rejected" if reason else "delivered", camera, session, header.sequence, reason or "")
             if reason and (session == "?" or camera not in self._cameras):
                 self.really["strangers"] += 1
             else:
@@ -261,9 +252,7 @@ class ChaosDeployment(VirtualDeployment):
         shot, now_ns = camera.capture(0), self.clock.now_ns()
         self._attempts += 1
         sequence = 2**40 + self._attempts
-        frame = Frame(
-            camera.name, "hostile", sequence, now_ns, shot.pose, shot.intrinsics, camera.codec, shot.payload
-        )
+        frame = Frame(camera.name, "hostile", sequence, now_ns, shot.pose, shot.intrinsics, camera.codec, shot.payload)
         request = to_request(frame)
         header, data = request.header, shot.payload
         wrong: list[tuple[Any, str, list[Any]]] = [
@@ -280,9 +269,18 @@ class ChaosDeployment(VirtualDeployment):
             *((header.pose, name, [0.0, 1.0, nan, inf, 1e300, 5e-324]) for name in ("qw", "qz")),
             *((header.pose, name, [1e7, nan, -inf, 3.0]) for name in ("tx_m", "tz_m")),
             *((header.intrinsics, name, [0.0, -5.0, 1e-9, 1e9, nan]) for name in ("fx", "cy", "k1", "p2")),
-            (request, "payload", [b"", data[: len(data) // 2], bytes(rng.bytes(200)), data + data,
-                                  damage(data, tuple((float(rng.random()), 255) for _ in range(20)))]),
-        ]  # fmt: skip
+            (
+                request,
+                "payload",
+                [
+                    b"",
+                    data[: len(data) // 2],
+                    bytes(rng.bytes(200)),
+                    data + data,
+                    damage(data, tuple((float(rng.random()), 255) for _ in range(20))),
+                ],
+            ),
+        ]
         for k in rng.permutation(len(wrong))[: rng.integers(1, 4)]:
             message, name, values = wrong[k]
             setattr(message, name, values[rng.integers(len(values))])
@@ -389,9 +387,7 @@ class ChaosDeployment(VirtualDeployment):
         event, _, detail = what.partition(":")
         self._write(role, event, frame.camera, frame.session, frame.sequence, detail)
 
-    def _write(
-        self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = ""
-    ) -> None:
+    def _write(self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = "") -> None:
         now_ns = self.clock.now_ns()
         self._ledgers[role].write(now_ns, camera, session, sequence, event, detail)
         if self._line_ns[role]:

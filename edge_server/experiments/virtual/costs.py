@@ -50,8 +50,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = command_parser("costs", DESCRIPTION)
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S",
-        help="seconds of virtual time of each of three runs [%(default)g]")  # fmt: skip
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="seconds of virtual time of each of three runs [%(default)g]",
+    )
     parser.add_argument("--out", type=out_file, required=True, metavar="FILE", help="JSON file to write")
     add_folders(parser)
     args = parser.parse_args(argv)

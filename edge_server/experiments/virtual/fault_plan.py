@@ -12,16 +12,7 @@ from edge_server.scheduler import parse_policy
 from freshfield.scenario import Scenario, parse, seed_sequence
 
 ROLES = ("node", "emulator", "edge")
-POLICIES = (
-    "all",
-    "threshold:120",
-    "wait:80",
-    "freshest-k:2",
-    "round-robin:2",
-    "random",
-    "age-driven",
-    "periodic:300",
-)
+POLICIES = ("all", "threshold:120", "wait:80", "freshest-k:2", "round-robin:2", "random", "age-driven", "periodic:300")
 DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
 QUEUE_LIMIT = 4
 SECONDS = 4.5
@@ -30,10 +21,18 @@ _FAULTS_BEGIN_S = (0.3, 2.0)
 FAULTS_OVER_S = 2.5
 _SMALL: dict[str, dict[str, Any]] = {
     "voxel": {"sizes": [16, 24], "refine_at": [10], "rays": 512, "cells": 16},
-    "ngp": {"device": "cpu", "levels": 4, "log2_table": 12, "finest_resolution": 64, "batch_samples": 4096,
-            "rays": 512, "samples": 32, "cells": 32},
+    "ngp": {
+        "device": "cpu",
+        "levels": 4,
+        "log2_table": 12,
+        "finest_resolution": 64,
+        "batch_samples": 4096,
+        "rays": 512,
+        "samples": 32,
+        "cells": 32,
+    },
     "splat": {"gaussians": 300, "start": 200, "seed_cells": 12},
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,12 @@ def scenario_of(seed: int) -> Scenario:
         channel["server"] = {"shared": True}
     if discipline in ("fcfs", "parallel"):
         channel["queue_limit"] = QUEUE_LIMIT
-    faults = {"loss": {"probability": 0.1}, "duplication": {"probability": 0.1},
-              "corruption": {"probability": 0.1}, "reset": {"at_ms": [900.0]}}  # fmt: skip
+    faults = {
+        "loss": {"probability": 0.1},
+        "duplication": {"probability": 0.1},
+        "corruption": {"probability": 0.1},
+        "reset": {"at_ms": [900.0]},
+    }
     channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
     field = str(rng.choice(sorted(_SMALL)))
     policy, value = parse_policy(str(rng.choice(POLICIES)))
@@ -81,14 +84,20 @@ def scenario_of(seed: int) -> Scenario:
             "seed": seed,
             "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
             # With its own motion, its frames, which no other seed needs, are not kept on disk.
-            "source": {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
-                       "motion_seed": seed, "params": {"supersample": 1}},
+            "source": {
+                "kind": "world",
+                "scene": "room",
+                "width": 32,
+                "height": 32,
+                "fps": 15,
+                "motion_seed": seed,
+                "params": {"supersample": 1},
+            },
             "channel": channel,
-            "edge": {"field": field, "field_options": _SMALL[field],
-                     "policy": {"name": policy, "value": value}},
+            "edge": {"field": field, "field_options": _SMALL[field], "policy": {"name": policy, "value": value}},
         },
         Path(f"chaos-{seed}.yaml"),
-    )  # fmt: skip
+    )
 
 
 def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
@@ -100,9 +109,10 @@ def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
 
 def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
     kind = str(
-        rng.choice(["crash", "stall", "full_disk", "slow_disk", "away", "clock_step", "hostile", "policy",
-                    "checkpoint"])
-    )  # fmt: skip
+        rng.choice(
+            ["crash", "stall", "full_disk", "slow_disk", "away", "clock_step", "hostile", "policy", "checkpoint"]
+        )
+    )
     for_ms, value, target = float(rng.uniform(20.0, 1e3 * FAULTS_OVER_S - _FAULTS_BEGIN_S[1] * 1e3)), 0.0, ""
     if kind in ("crash", "stall", "full_disk", "slow_disk"):
         target, value = str(rng.choice(ROLES)), float(kind == "crash" and rng.random() < 0.7)

@@ -144,24 +144,27 @@ class ShownTruth:
         earlier = [world.image(index - round(lag * 1e6) // GRID_NS) for lag in LAGS_MS]
         shown, moving = field.render(world.pose, world.lens).color, moving_mask(truth, earlier)
         display_ms = (present_ns - publication.published_ns) / 1e6
-        ages_ms = {
-            "newest": min(publication.ages_ms) + display_ms, "mean": publication.aaoi_ms + display_ms
-        }  # fmt: skip
+        ages_ms = {"newest": min(publication.ages_ms) + display_ms, "mean": publication.aaoi_ms + display_ms}
         waiting_ms = publication.aaoi_ms - (publication.network_ms or 0.0) - publication.update_ms
-        self.instants.append({
-            "t_s": present_ns / 1e9,
-            "shown": squared_errors(shown, truth, moving),
-            **{known: squared_errors(world.carried(present_ns - 1e6 * age_ms, present_ns), truth, moving)
-               for known, age_ms in ages_ms.items()},
-            "frozen": squared_errors(
-                world.image(index - round(1e6 * ages_ms["mean"] / GRID_NS)), truth, moving
-            ),
-            "lag_ms": world.lag_ms(shown, index, moving),
-            "age_ms": {
-                **ages_ms, "network": publication.network_ms, "waiting": waiting_ms,
-                "computing": publication.update_ms, "display": display_ms,
-            },
-        })  # fmt: skip
+        self.instants.append(
+            {
+                "t_s": present_ns / 1e9,
+                "shown": squared_errors(shown, truth, moving),
+                **{
+                    known: squared_errors(world.carried(present_ns - 1e6 * age_ms, present_ns), truth, moving)
+                    for known, age_ms in ages_ms.items()
+                },
+                "frozen": squared_errors(world.image(index - round(1e6 * ages_ms["mean"] / GRID_NS)), truth, moving),
+                "lag_ms": world.lag_ms(shown, index, moving),
+                "age_ms": {
+                    **ages_ms,
+                    "network": publication.network_ms,
+                    "waiting": waiting_ms,
+                    "computing": publication.update_ms,
+                    "display": display_ms,
+                },
+            }
+        )
 
 
 def squared_errors(shown: NDArray, truth: NDArray, moving: NDArray[np.bool_]) -> dict[str, float | None]:

@@ -74,9 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if decisions is not None:
                 decisions.record(deployment.updates.policy, publication.number)
 
-        deployment = build_deployment(
-            scenario, settings, scorer=scorer, data=folders.data, on_published=published
-        )
+        deployment = build_deployment(scenario, settings, scorer=scorer, data=folders.data, on_published=published)
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         if config.deadline_ms is not None:
@@ -100,9 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def summary(
-    scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float
-) -> dict[str, Any]:
+def summary(scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float) -> dict[str, Any]:
     """A run's frame counts, means over its last fifth, and a digest for comparing runs, as plain values.
 
     last_fifth: scores at publication, the thesis's measure. shown: scores of the images at random instants.
@@ -163,9 +159,7 @@ def show(found: dict[str, Any]) -> str:
         f"  views       {number(found['views'], 1)} an update",
         "  last fifth  "
         + ", ".join(
-            f"{k} {number(v, 3)}"
-            for k, v in found["last_fifth"].items()
-            if k != "perceptual" or v is not None
+            f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
         ),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
@@ -217,9 +211,7 @@ def _compute(text: str) -> ComputeConfig:
     try:
         return ComputeConfig(float(step), float(update or 0.0))
     except ValueError:
-        raise ScenarioError(
-            f"--compute {text}: expected zero, or ms a step and ms an update such as 4:30"
-        ) from None
+        raise ScenarioError(f"--compute {text}: expected zero, or ms a step and ms an update such as 4:30") from None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -235,10 +227,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--steps", type=int, metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
     add("--compute", metavar="zero|MS:MS", help="ms per step and ms per update [edge.compute, else zero]")
-    add("--epoch-ms", type=float, metavar="MS",
-        help=f"ms between decisions [{_CYCLE_MS:g}; edge.update_ms if updates follow arrivals]")  # fmt: skip
+    add(
+        "--epoch-ms",
+        type=float,
+        metavar="MS",
+        help=f"ms between decisions [{_CYCLE_MS:g}; edge.update_ms if updates follow arrivals]",
+    )
     add_folders(parser)
-    add("--out", type=out_folder, metavar="DIR",
-        help="folder to write simulation.json, series.jsonl and a learned policy's decisions to")  # fmt: skip
+    add(
+        "--out",
+        type=out_folder,
+        metavar="DIR",
+        help="folder to write simulation.json, series.jsonl and a learned policy's decisions to",
+    )
     add("--json", action="store_true", help="print the result as one JSON object")
     return parser

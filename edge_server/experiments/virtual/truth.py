@@ -92,10 +92,9 @@ class CapturedTruth:
             shown = field.render(shot.pose.matrix(), shot.intrinsics).color
             scores.append(
                 self._scorer.score(
-                    camera.name, shown, present_ns, _image(camera, shot), times[-1], earlier,
-                    self._bounds[camera.name],
+                    camera.name, shown, present_ns, _image(camera, shot), times[-1], earlier, self._bounds[camera.name]
                 )
-            )  # fmt: skip
+            )
         return mean_score(scores)
 
 

@@ -275,20 +275,22 @@ class VirtualDeployment:
             )
         }
         return {
-            "captured": sent, "replaced": 0, "waiting": 0, "sent": sent, **ends,
+            "captured": sent,
+            "replaced": 0,
+            "waiting": 0,
+            "sent": sent,
+            **ends,
             "duplicated": sum(link.counts[EventKind.DUPLICATED] for link in self._links.values()),
             "delivered": sum(self.delivered.values()),
             "rejected": dict(self.rejected),
             "in_flight": sum(link.in_flight for link in self._links.values()),
-        }  # fmt: skip
+        }
 
     # --- cameras and channel --------------------------------------------------------------------------
 
     def _link_event_ns(self) -> int:
         """Instant of the next event of a link."""
-        return self._channel_origin_ns + min(
-            (k.next_event_ns for k in self._links.values()), default=NEVER_NS
-        )
+        return self._channel_origin_ns + min((k.next_event_ns for k in self._links.values()), default=NEVER_NS)
 
     def _wake_ns(self) -> int:
         """Instant at which the edge's loop continues, if nothing arrives before."""
@@ -347,9 +349,7 @@ class VirtualDeployment:
         now_ns = self.clock.now_ns()
         try:
             if flips:
-                from channel_emu.model.faults.corruption import (
-                    damage,  # loaded only where a scenario lists it
-                )
+                from channel_emu.model.faults.corruption import damage  # loaded only where a scenario lists it
 
                 request = to_request(self._with_image(frame))
                 request.payload = damage(request.payload, flips)
@@ -370,11 +370,7 @@ class VirtualDeployment:
             return frame
         shot = self._cameras[frame.camera].capture(frame.sequence)
         return dataclasses.replace(
-            frame,
-            pose=shot.pose,
-            intrinsics=shot.intrinsics,
-            payload=shot.payload,
-            pose_gap_ns=shot.pose_gap_ns,
+            frame, pose=shot.pose, intrinsics=shot.intrinsics, payload=shot.payload, pose_gap_ns=shot.pose_gap_ns
         )
 
     # --- the edge -------------------------------------------------------------------------------------
@@ -404,9 +400,7 @@ class VirtualDeployment:
             if settings.scratch:
                 updates.field.reset()
             treated = len(selection.items) if updates.policy.treatment is not None else 0
-            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(
-                steps, treated, selection.arrivals
-            )
+            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(steps, treated, selection.arrivals)
             fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps), publishes_ns)
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
@@ -437,9 +431,11 @@ class VirtualDeployment:
         # Earlier frames first: of a camera's frames, the one made last is kept longest.
         earlier = self.with_images(selection.earlier)
         return dataclasses.replace(
-            selection, others=self.with_images(selection.others), earlier=earlier,
+            selection,
+            others=self.with_images(selection.others),
+            earlier=earlier,
             items=self.with_images(selection.items),
-        )  # fmt: skip
+        )
 
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)

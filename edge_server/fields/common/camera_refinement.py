@@ -116,9 +116,13 @@ class PoseCorrections:
         return known
 
     def correct(
-        self, view: View, render: Callable[[Array, Array], NDArray[np.float32]], pixel_m: float,
-        rng: np.random.Generator, background: NDArray[np.float32],
-    ) -> None:  # fmt: skip
+        self,
+        view: View,
+        render: Callable[[Array, Array], NDArray[np.float32]],
+        pixel_m: float,
+        rng: np.random.Generator,
+        background: NDArray[np.float32],
+    ) -> None:
         """One Gauss-Newton step for one camera.
 
         view: the camera's view. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
@@ -195,9 +199,15 @@ class CameraRefinement:
         return data
 
     def learn(
-        self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
-        sums: NDArray[np.float64], make_renderer: Callable[[], RaySnapshot],
-    ) -> Views:  # fmt: skip
+        self,
+        views: Sequence[View],
+        data: Views,
+        box: SceneBox,
+        step: int,
+        seed: int,
+        sums: NDArray[np.float64],
+        make_renderer: Callable[[], RaySnapshot],
+    ) -> Views:
         """Learn from a step; returns the corrected data.
 
         step: number of steps made. seed: the field's.

@@ -21,9 +21,10 @@ _BORDER = 17  # points on each edge of an image
 def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
     """1.3 times the field of view: lowest and highest x / z, then y / z, of rays through the image's edge."""
     u, v = np.linspace(0.0, camera.width, _BORDER), np.linspace(0.0, camera.height, _BORDER)
-    edge = np.concatenate([
-        np.stack(np.broadcast_arrays(u, y), axis=-1) for y in (0.0, float(camera.height))
-    ] + [np.stack(np.broadcast_arrays(x, v), axis=-1) for x in (0.0, float(camera.width))])  # fmt: skip
+    edge = np.concatenate(
+        [np.stack(np.broadcast_arrays(u, y), axis=-1) for y in (0.0, float(camera.height))]
+        + [np.stack(np.broadcast_arrays(x, v), axis=-1) for x in (0.0, float(camera.width))]
+    )
     rays = camera.rays(edge)
     ratios = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
     low, high = ratios.min(axis=0), ratios.max(axis=0)

@@ -15,9 +15,7 @@ from edge_server.fields.common.view_store import Arrays, ViewStore
 VERSION = 1  # of what ``pack_state`` writes
 
 
-def pack_state(
-    name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays
-) -> Arrays:
+def pack_state(name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays) -> Arrays:
     """The whole state of a field in one dictionary of copies.
 
     name: of the representation. counters: facts, ready for JSON. arrays: what was learned.
@@ -53,9 +51,7 @@ def unpack_meta(
         mine = getattr(settings, option)
         mine = list(mine) if isinstance(mine, tuple) else mine  # as JSON has it
         if mine != theirs.get(option):
-            raise ValueError(
-                f"the state was made with {option} = {theirs.get(option)}, this field has {mine}"
-            )
+            raise ValueError(f"the state was made with {option} = {theirs.get(option)}, this field has {mine}")
     return meta
 
 

@@ -30,9 +30,7 @@ class OccupancyGrid:
     unknown: density of what was never sampled; with ``EMPTY`` the first sample decides.
     """
 
-    def __init__(
-        self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY
-    ) -> None:
+    def __init__(self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY) -> None:
         self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
         self.density = np.full(cells**3, unknown, np.float32)
         self.seen = np.zeros(cells**3, np.uint16)
@@ -41,9 +39,7 @@ class OccupancyGrid:
         self.needed = 1
 
     @classmethod
-    def for_box(
-        cls, cells: int, min_views: int, box: SceneBox | None, unknown: float = EMPTY
-    ) -> OccupancyGrid:
+    def for_box(cls, cells: int, min_views: int, box: SceneBox | None, unknown: float = EMPTY) -> OccupancyGrid:
         """A grid that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
         return cls(cells, box.contracted if box else False, near, min_views, unknown)
@@ -79,9 +75,16 @@ class OccupancyGrid:
                 length += mask.size
         marked = np.zeros_like(self.seen)
         pool.run(
-            count_views, self.cells, self.contracted, self.near, views, mask_first, np.concatenate(parts),
-            self.seen, marked,
-        )  # fmt: skip
+            count_views,
+            self.cells,
+            self.contracted,
+            self.near,
+            views,
+            mask_first,
+            np.concatenate(parts),
+            self.seen,
+            marked,
+        )
         self.needed = min(self.min_views, len(store.memory))
         moving = None
         if length:
@@ -90,13 +93,35 @@ class OccupancyGrid:
         self.update_occupied(empty)
         return moving
 
-    def refresh(self, pool: Pool, key: np.uint64, phase: int, encoding: Any, levels: int, net: Net,
-                acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
+    def refresh(
+        self,
+        pool: Pool,
+        key: np.uint64,
+        phase: int,
+        encoding: Any,
+        levels: int,
+        net: Net,
+        acts: NDArray[np.float32],
+        x: NDArray[np.float32],
+    ) -> None:
         """Sample the density of every ``PHASES``-th cell, from cell ``phase`` on."""
         pool.run(
-            sample_density, key, phase % PHASES, PHASES, np.float32(FADE), encoding, levels, net, self.cells,
-            self.contracted, self.seen, self.needed, self.density, acts, x,
-        )  # fmt: skip
+            sample_density,
+            key,
+            phase % PHASES,
+            PHASES,
+            np.float32(FADE),
+            encoding,
+            levels,
+            net,
+            self.cells,
+            self.contracted,
+            self.seen,
+            self.needed,
+            self.density,
+            acts,
+            x,
+        )
         self.update_occupied()
 
     def update_occupied(self, empty: float = EMPTY) -> None:

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.kernels.plane_sweep import (
-    MOST_VIEWS,
-    NOT_SEEN,
-    SEES,
-    UNMARKED,
-    score_cells,
-    sweep_rays,
-)
+from edge_server.fields.common.kernels.plane_sweep import MOST_VIEWS, NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
@@ -58,9 +51,15 @@ def foreground_mask(image: NDArray[np.uint8], plain: NDArray[np.float32] | None)
 
 
 def score_grid(
-    settings: SweepSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-    moved: Sequence[NDArray[np.bool_] | None] | None, all_data: Views, cells: int, least: int = 0,
-) -> NDArray[np.float32]:  # fmt: skip
+    settings: SweepSettings,
+    pool: Pool,
+    box: SceneBox,
+    views: Sequence[View],
+    moved: Sequence[NDArray[np.bool_] | None] | None,
+    all_data: Views,
+    cells: int,
+    least: int = 0,
+) -> NDArray[np.float32]:
     """How well the cameras agree on the color of each cell, float32 (cells^3,): see ``score_cells``.
 
     moved: bool (H, W) of each view; only cells that most cameras see move are scored. None: all cells are.
@@ -97,17 +96,32 @@ def score_grid(
     needed = min(max(settings.min_views, least), len(some))
     scores = np.zeros(cells**3, np.float32)
     pool.run(
-        score_cells, cams, data, blurred, flags, plain is not None,
-        plain if plain is not None else np.zeros(3, np.float32), np.float32(TOLERANCE), box.contracted, cells,
-        needed, scores,
-    )  # fmt: skip
+        score_cells,
+        cams,
+        data,
+        blurred,
+        flags,
+        plain is not None,
+        plain if plain is not None else np.zeros(3, np.float32),
+        np.float32(TOLERANCE),
+        box.contracted,
+        cells,
+        needed,
+        scores,
+    )
     return scores
 
 
 def sweep_depths(
-    pool: Pool, box: SceneBox, data: Views, view_of: NDArray[np.int64], pixels: NDArray[np.int64],
-    scores: NDArray[np.float32], cells: int, least: float = NOT_SEEN,
-) -> NDArray[np.float32]:  # fmt: skip
+    pool: Pool,
+    box: SceneBox,
+    data: Views,
+    view_of: NDArray[np.int64],
+    pixels: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    cells: int,
+    least: float = NOT_SEEN,
+) -> NDArray[np.float32]:
     """The distance in scene units of the best cell on each ray, float32 (N,); 0: none scores above ``least``.
 
     view_of, pixels: int64 (N,), each ray's view and its pixel there.
@@ -116,9 +130,8 @@ def sweep_depths(
     distance = np.zeros(pixels.size, np.float32)
     near, middle = np.float32(max(0.01, box.near_m / box.radius_m)), np.float32(box.distance_m / box.radius_m)
     pool.run(
-        sweep_rays, data, view_of, pixels, near, middle, box.contracted, cells, np.float32(least), scores,
-        distance,
-    )  # fmt: skip
+        sweep_rays, data, view_of, pixels, near, middle, box.contracted, cells, np.float32(least), scores, distance
+    )
     return distance
 
 

@@ -88,10 +88,16 @@ def run_by_pixel(
     n = len(pixels)
     color, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     pool.run(
-        kernel, np.array(lens_row(intrinsics), dtype=np.float64), np.ascontiguousarray(pose[:3, :3]),
-        box.normalise(pose[:3, 3]), np.ascontiguousarray(pixels, dtype=np.float64), *args,
-        color, depth, opacity,
-    )  # fmt: skip
+        kernel,
+        np.array(lens_row(intrinsics), dtype=np.float64),
+        np.ascontiguousarray(pose[:3, :3]),
+        box.normalise(pose[:3, 3]),
+        np.ascontiguousarray(pixels, dtype=np.float64),
+        *args,
+        color,
+        depth,
+        opacity,
+    )
     depth *= np.float32(box.radius_m)
     return color, depth, opacity
 
@@ -114,9 +120,7 @@ class RaySnapshot(PixelSnapshot):
     def copied(self) -> Self:
         """See ``stepped_field.StepSnapshot``."""
         space = self.space._replace(
-            occupied=self.space.occupied.copy(),
-            coarse=self.space.coarse.copy(),
-            density=np.zeros(0, np.float32),
+            occupied=self.space.occupied.copy(), coarse=self.space.coarse.copy(), density=np.zeros(0, np.float32)
         )
         encoding = self.encoding._replace(table=self.encoding.table.copy())
         return replace(self, encoding=encoding, net=Net(self.net.widths, self.net.params.copy()), space=space)
@@ -127,9 +131,19 @@ class RaySnapshot(PixelSnapshot):
         """See ``PixelSnapshot``."""
         room, workers = TILE * ROUND, self.pool.threads
         return run_by_pixel(
-            self.pool, render_tiles, self.box, camera_to_world, intrinsics, pixels,
-            self.space, self.encoding, self.levels, self.net, self.harmonics, self.background,
+            self.pool,
+            render_tiles,
+            self.box,
+            camera_to_world,
+            intrinsics,
+            pixels,
+            self.space,
+            self.encoding,
+            self.levels,
+            self.net,
+            self.harmonics,
+            self.background,
             np.empty((workers, int(self.net.widths.sum()), room), np.float32),
             np.empty((workers, 3, room), np.float32),
             np.empty((workers, 2, room), np.float32),
-        )  # fmt: skip
+        )

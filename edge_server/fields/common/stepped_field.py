@@ -146,9 +146,7 @@ class SteppedField(ABC, Generic[S]):
         """Begin at step 0, without a snapshot, in the box of ``view_store`` (None: no scene yet)."""
 
     @abstractmethod
-    def _begin_fit(
-        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
-    ) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
         """Take views in, under the lock; returns a fit's step, and the rays and samples used so far."""
 
     @abstractmethod

@@ -124,9 +124,7 @@ def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bo
             same = again and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
         # A camera that moved may see what no other has seen: that is no reason to refuse it.
-        memory[view.camera] = CameraMemory(
-            view, moved, known.refusals_left if known is not None and stood else 0
-        )
+        memory[view.camera] = CameraMemory(view, moved, known.refusals_left if known is not None and stood else 0)
     return news
 
 

@@ -23,14 +23,7 @@ from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
-from edge_server.fields.common.kernels.train import (
-    CHUNK,
-    CHUNK_RAYS,
-    Batch,
-    RaySampling,
-    Scratch,
-    train_chunks,
-)
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, Batch, RaySampling, Scratch, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
@@ -65,15 +58,11 @@ class TrainedField(SteppedField[RaySnapshot]):
     _batch: Batch
     _cameras: CameraRefinement
     _occupancy: OccupancyGrid
-    _swept: (
-        tuple[tuple[View, ...], NDArray[np.float32]] | None
-    )  # views, and what ``depth_guide`` returned for them
+    _swept: tuple[tuple[View, ...], NDArray[np.float32]] | None  # views, and what ``depth_guide`` returned for them
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def _begin_fit(
-        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
-    ) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
@@ -168,9 +157,7 @@ class TrainedField(SteppedField[RaySnapshot]):
 
     def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
         """Fill ``self._batch``, gradients included, from one step's rays."""
-        self.pool.run(
-            train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch
-        )
+        self.pool.run(train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch)
 
     @abstractmethod
     def _gather(self, levels: int, scale: float) -> None:
@@ -263,9 +250,15 @@ class TrainedField(SteppedField[RaySnapshot]):
         key = step_key(s.seed, self.step)
         if self.step % EVERY == 0:
             self._occupancy.refresh(
-                self.pool, key, self.step // EVERY, self._encoding, levels, self._net,
-                self._scratch.acts, self._scratch_x,
-            )  # fmt: skip
+                self.pool,
+                key,
+                self.step // EVERY,
+                self._encoding,
+                levels,
+                self._net,
+                self._scratch.acts,
+                self._scratch_x,
+            )
         space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
         recipe = RaySampling(

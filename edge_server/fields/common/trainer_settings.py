@@ -27,9 +27,7 @@ class FieldSettings:
     centre_m: tuple[float, float, float] | None = option(
         None, "center of the scene's box, x y z in meters; None: found from the cameras"
     )
-    radius_m: float | None = option(
-        None, "half the side of the scene's box, meters; None: found from the cameras"
-    )
+    radius_m: float | None = option(None, "half the side of the scene's box, meters; None: found from the cameras")
     near_m: float | None = option(
         None, "near plane, meters: nothing closer to a camera is rendered; None: found from the cameras"
     )
@@ -44,12 +42,8 @@ class FieldSettings:
     age_tau_ms: float = option(
         0.0, "age relative to the newest view, in ms, at which a view's weight is 1/e; 0: all weigh 1"
     )
-    mask_stale_ms: float = option(
-        0.0, "mask moved pixels of views that are this many ms older than the newest; 0: off"
-    )
-    mask_grow_px_s: float = option(
-        0.0, "dilation of the mask of ``mask_stale_ms``, in pixels per second of age"
-    )
+    mask_stale_ms: float = option(0.0, "mask moved pixels of views that are this many ms older than the newest; 0: off")
+    mask_grow_px_s: float = option(0.0, "dilation of the mask of ``mask_stale_ms``, in pixels per second of age")
     refuse_beyond: float = option(
         2.5,
         "refuse views whose typical error is more than this many times the usual one; 0, or while cameras' "
@@ -57,13 +51,10 @@ class FieldSettings:
     )
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(
-        None,
-        "worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or one a core, at most 8",
+        None, "worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or one a core, at most 8"
     )
     nice: int = option(0, "niceness added to worker threads (Linux), 0 to 19; in a server 5")
-    device: str = option(
-        "auto", "cpu, cuda (``ngp`` and ``splat`` only) or auto (cpu; never a GPU by itself)"
-    )
+    device: str = option("auto", "cpu, cuda (``ngp`` and ``splat`` only) or auto (cpu; never a GPU by itself)")
 
     def __post_init__(self) -> None:
         self._within(
@@ -148,9 +139,7 @@ class TrainerSettings(FieldSettings):
         if self.batch_samples % BATCH:
             raise ValueError(f"{name}: batch_samples must be a multiple of {BATCH}, not {self.batch_samples}")
         if self.hidden % 4 or self.cells % 4:
-            raise ValueError(
-                f"{name}: hidden ({self.hidden}) and cells ({self.cells}) must be multiples of 4"
-            )
+            raise ValueError(f"{name}: hidden ({self.hidden}) and cells ({self.cells}) must be multiples of 4")
         if self.harmonics not in (1, 4, 9):
             raise ValueError(f"{name}: harmonics must be 1, 4 or 9, not {self.harmonics}")
         super().__post_init__()
@@ -212,7 +201,5 @@ def settings_from(
         raise ValueError(f"{kind.name}: effort must be one of {', '.join(efforts)}, not {effort!r}")
     valid = option_help(kind)
     if unknown := sorted(set(given) - set(valid)):
-        raise ValueError(
-            f"{kind.name} has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}"
-        )
+        raise ValueError(f"{kind.name} has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
     return replace(kind(), **{"seed": seed, **efforts[effort], **given})

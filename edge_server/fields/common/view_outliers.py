@@ -59,11 +59,7 @@ def pixel_weights(
 
 
 def find_outliers(
-    views: Sequence[View],
-    memory: Mapping[str, CameraMemory],
-    beyond: float,
-    settled: bool,
-    render_points: RenderPoints,
+    views: Sequence[View], memory: Mapping[str, CameraMemory], beyond: float, settled: bool, render_points: RenderPoints
 ) -> NDArray[np.bool_]:
     """Which views contradict the field so much that this fit leaves them out (``refuse``): bool (V,).
 
@@ -79,9 +75,7 @@ def find_outliers(
     errors = np.array([_typical_error(view, colors) for view, colors in zip(views, rendered)])
     usual = usual_error(errors, beyond)
     few = 4 * (errors > beyond * usual).sum() <= len(views)
-    return np.array(
-        [refuse(memory[v.camera], e, usual, beyond, few) for v, e in zip(views, errors)], np.bool_
-    )
+    return np.array([refuse(memory[v.camera], e, usual, beyond, few) for v, e in zip(views, errors)], np.bool_)
 
 
 def refuse(camera: CameraMemory, error: float, usual: float, beyond: float, few: bool) -> bool:

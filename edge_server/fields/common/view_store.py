@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
-from edge_server.fields.common.supervision import (
-    CameraMemory,
-    check_view,
-    pack_views,
-    remember_views,
-    without_views,
-)
+from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views, without_views
 from edge_server.fields.common.trainer_settings import FieldSettings
 from edge_server.fields.common.view_outliers import RenderPoints, find_outliers, pixel_weights
 from freshfield.geometry import Pinhole
@@ -95,15 +89,11 @@ class ViewStore:
             known.view.shows_ns != view.shows_ns or not np.array_equal(known.view.image, view.image)
         )
 
-    def without_outliers(
-        self, views: Sequence[View], update: PackedUpdate, step: int, field: PixelSnapshot
-    ) -> Views:
+    def without_outliers(self, views: Sequence[View], update: PackedUpdate, step: int, field: PixelSnapshot) -> Views:
         """``update.data`` without the views that contradict ``field``, which has learned for ``step`` steps.
         Pictures that were known already are not judged again."""
 
-        def render_points(
-            views: Sequence[View], points: Sequence[NDArray[np.float64]]
-        ) -> list[NDArray[np.float32]]:
+        def render_points(views: Sequence[View], points: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float32]]:
             return [
                 field.render_pixels(view.camera_to_world, view.intrinsics, where)[0]
                 for view, where in zip(views, points)
@@ -120,9 +110,7 @@ class ViewStore:
         """The cameras of ``views`` that are refused."""
         return tuple(view.camera for view in views if view.camera in self.refused_cameras)
 
-    def find_outliers(
-        self, views: Sequence[View], step: int, render_points: RenderPoints
-    ) -> NDArray[np.bool_]:
+    def find_outliers(self, views: Sequence[View], step: int, render_points: RenderPoints) -> NDArray[np.bool_]:
         """Which views contradict a field that has learned for ``step`` steps: see ``view_outliers``."""
         settled = step >= SETTLED_STEPS
         return find_outliers(views, self.memory, self.settings.refuse_beyond, settled, render_points)
@@ -185,9 +173,13 @@ class ViewStore:
             carried_to_ns = known.pop("carried_to_ns", None)
             known["distortion"] = tuple(known["distortion"])
             view = View(
-                camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns,
+                camera,
+                arrays[f"image_{k}"],
+                arrays[f"pose_{k}"],
+                Pinhole(**known),
+                generated_ns,
                 carried_to_ns=carried_to_ns,
-            )  # fmt: skip
+            )
             check_view(view)
             moved = arrays.get(f"moved_{k}")
             if moved is not None and (moved.dtype != np.bool_ or moved.shape != view.image.shape[:2]):

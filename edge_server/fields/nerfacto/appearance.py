@@ -97,9 +97,15 @@ class CameraAppearance(CameraRefinement):
         return super().corrected(views, data, box)
 
     def learn(
-        self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
-        sums: NDArray[np.float64], make_renderer: Callable[[], RaySnapshot],
-    ) -> Views:  # fmt: skip
+        self,
+        views: Sequence[View],
+        data: Views,
+        box: SceneBox,
+        step: int,
+        seed: int,
+        sums: NDArray[np.float64],
+        make_renderer: Callable[[], RaySnapshot],
+    ) -> Views:
         """Update from the gradients of ``step``; returns the corrected data."""
         if self.appearances is not None:
             cameras = [v.camera for v in views]

@@ -41,12 +41,23 @@ class NerfactoSnapshot(RaySnapshot):
         """See ``PixelSnapshot``."""
         workers = self.pool.threads
         return run_by_pixel(
-            self.pool, render_with_proposal, self.box, camera_to_world, intrinsics, pixels,
-            self.sampling, self.space, self.encoding, self.levels, self.net, self.harmonics, self.background,
+            self.pool,
+            render_with_proposal,
+            self.box,
+            camera_to_world,
+            intrinsics,
+            pixels,
+            self.sampling,
+            self.space,
+            self.encoding,
+            self.levels,
+            self.net,
+            self.harmonics,
+            self.background,
             np.empty((workers, int(self.net.widths.sum()), SAMPLE_BATCH), np.float32),
             np.empty((workers, 3, SAMPLE_BATCH), np.float32),
             np.empty((workers, 3, SAMPLE_BATCH), np.float32),
-        )  # fmt: skip
+        )
 
 
 class NerfactoField(TrainedField):
@@ -54,9 +65,17 @@ class NerfactoField(TrainedField):
 
     name = "nerfacto"
     shape = (
-        "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers",
-        "harmonics", "cells", "proposal_cells", "appearance",
-    )  # fmt: skip
+        "levels",
+        "log2_table",
+        "base_resolution",
+        "finest_resolution",
+        "hidden",
+        "hidden_layers",
+        "harmonics",
+        "cells",
+        "proposal_cells",
+        "appearance",
+    )
     settings: NerfactoSettings
     _cameras: CameraAppearance
 
@@ -118,17 +137,26 @@ class NerfactoField(TrainedField):
                 d_embeddings=np.zeros((len(bins.counts), *cameras.embeddings.shape), np.float32)
             )
         self.pool.run(
-            train_with_proposal, data, recipe, self._sampling(), space, self._encoding, self._net,
-            cameras.embeddings, weights, self._batch, bins, self._scratch, self._proposal_scratch,
-        )  # fmt: skip
+            train_with_proposal,
+            data,
+            recipe,
+            self._sampling(),
+            space,
+            self._encoding,
+            self._net,
+            cameras.embeddings,
+            weights,
+            self._batch,
+            bins,
+            self._scratch,
+            self._proposal_scratch,
+        )
         cameras.gradient, cameras.rays = bins.d_embeddings, int(self._batch.rays.sum())
 
     def _gather(self, levels: int, scale: float) -> None:
         batch, bins, e = self._batch, self._proposal_gradients, self._encoding
         grid = Grid(e.resolution, e.first, e.dense, e.table)
-        self.pool.run(
-            scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
-        )
+        self.pool.run(scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
         if weight := smoothing(self.settings, self.step):
             self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
         self.pool.run(scatter_proposal, e, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)

@@ -20,9 +20,7 @@ class NerfactoSettings(HashGridSettings):
     samples_ramp: int = option(200, "training steps after which ``samples`` is reached")
     bins: int = option(96, "bins of a ray, one lookup of proposal density in each")
     proposal_cells: int = option(64, "cells a side of the proposal's grid")
-    interlevel: float = option(
-        5.0, "weight of the interlevel loss, which trains the proposal; 0: uniform samples"
-    )
+    interlevel: float = option(5.0, "weight of the interlevel loss, which trains the proposal; 0: uniform samples")
     proposal_decay: float = option(3e-2, "pull of the proposal's raw densities back to thin fog")
     even: float = option(0.4, "share of a ray's samples that is allocated uniformly")
     anneal: int = option(40, "steps over which the uniform share falls from 1 to ``even``")
@@ -42,9 +40,7 @@ class NerfactoSettings(HashGridSettings):
             ("appearance", 0, 16),
         )
         if self.proposal_cells % 4:
-            raise ValueError(
-                f"{self.name}: proposal_cells must be a multiple of 4, not {self.proposal_cells}"
-            )
+            raise ValueError(f"{self.name}: proposal_cells must be a multiple of 4, not {self.proposal_cells}")
         if self.appearance and self.exposure:
             # Measured: they compensate each other, and the field is worse than with neither.
             raise ValueError(f"{self.name}: appearance and exposure explain the same thing: choose one")
@@ -53,9 +49,22 @@ class NerfactoSettings(HashGridSettings):
 
 SETTINGS = NerfactoSettings
 EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 16,
-            "samples_start": 16},
+    "low": {
+        "levels": 6,
+        "log2_table": 14,
+        "finest_resolution": 96,
+        "batch_samples": 8192,
+        "samples": 16,
+        "samples_start": 16,
+    },
     "medium": {},
-    "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 32,
-             "samples_start": 32, "bins": 128},
-}  # fmt: skip
+    "high": {
+        "log2_table": 17,
+        "hidden": 64,
+        "batch_samples": 32768,
+        "rays": 8192,
+        "samples": 32,
+        "samples_start": 32,
+        "bins": 128,
+    },
+}

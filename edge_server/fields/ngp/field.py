@@ -49,13 +49,9 @@ class NgpField(TrainedField):
 
     def _gather(self, levels: int, scale: float) -> None:
         batch = self._batch
-        self.pool.run(
-            scatter, self._grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
-        )
+        self.pool.run(scatter, self._grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
         if weight := smoothing(self.settings, self.step):
-            self.pool.run(
-                smooth_grid, self._grid, levels, np.float32(weight / scale), self._table_g, self._dirty
-            )
+            self.pool.run(smooth_grid, self._grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
 
 
 def make(settings: NgpSettings) -> Field:

@@ -8,9 +8,16 @@ from typing import Any
 from edge_server.fields.common.trainer_settings import HashGridSettings
 
 STATE_SHAPE = (
-    "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
-    "cells", "samples",
-)  # fmt: skip
+    "levels",
+    "log2_table",
+    "base_resolution",
+    "finest_resolution",
+    "hidden",
+    "hidden_layers",
+    "harmonics",
+    "cells",
+    "samples",
+)
 """Options in which a state and the field that loads it must agree."""
 
 

@@ -41,15 +41,7 @@ from edge_server.fields.common.training_schedule import (
 )
 from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
-from edge_server.fields.ngp.torch_model import (
-    TorchGrid,
-    encode,
-    mlp,
-    ray_losses,
-    ray_weights,
-    shade,
-    to_torch,
-)
+from edge_server.fields.ngp.torch_model import TorchGrid, encode, mlp, ray_losses, ray_weights, shade, to_torch
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # rendered at a time
@@ -186,9 +178,7 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
     shape = STATE_SHAPE
     settings: NgpSettings
 
-    def __init__(
-        self, settings: NgpSettings | None = None, device: str = "cuda", pool: Pool | None = None
-    ) -> None:
+    def __init__(self, settings: NgpSettings | None = None, device: str = "cuda", pool: Pool | None = None) -> None:
         settings = settings or NgpSettings()
         if missing := unsupported_options(settings):
             raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
@@ -197,9 +187,7 @@ class NgpTorchField(SteppedField[TorchSnapshot]):
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use device cpu")
         super().__init__(settings, pool)
 
-    def _begin_fit(
-        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
-    ) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:

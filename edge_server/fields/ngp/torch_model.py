@@ -102,9 +102,8 @@ def ray_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def ray_losses(
-    sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor,
-    distortion: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor, distortion: float
+) -> tuple[Tensor, Tensor]:
     """Color errors (R,) and losses (R,) of rays with samples (R, S), none nearer than the one before it: 3.22
     and mip-NeRF 360's distortion loss."""
     weight, left = ray_weights(sigma, delta)

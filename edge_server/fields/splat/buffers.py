@@ -39,9 +39,12 @@ class RasterBuffers:
         return self._lists
 
     def project_and_bin(
-        self, cams: NDArray[np.float32], gaussians: Gaussians, wanted: Sequence[NDArray[np.uint8] | None],
+        self,
+        cams: NDArray[np.float32],
+        gaussians: Gaussians,
+        wanted: Sequence[NDArray[np.uint8] | None],
         differentiate: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Project the Gaussians into the cameras, and list them by tile.
 
         cams: float32 (B, CAMERA), see ``camera_rows``.

@@ -74,9 +74,7 @@ class SplatField(SteppedField[SplatSnapshot]):
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def _begin_fit(
-        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
-    ) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
         with self._lock:
             change = self._ingest(views)
         if change is None:
@@ -115,11 +113,17 @@ class SplatField(SteppedField[SplatSnapshot]):
 
     def _counters(self) -> dict[str, Any]:
         return {
-            "step": self.step, "grown": self._grown, "dropped": self.dropped,
-            "now_ns": self._now_ns, "given": [v.camera for v in self._given],
-            "refused": sorted(self._refused), "unsure": sorted(self._unsure),
-            "reseeded": self._reseeded, "unjudged": sorted(self._unjudged), "errors": self._errors,
-        }  # fmt: skip
+            "step": self.step,
+            "grown": self._grown,
+            "dropped": self.dropped,
+            "now_ns": self._now_ns,
+            "given": [v.camera for v in self._given],
+            "refused": sorted(self._refused),
+            "unsure": sorted(self._unsure),
+            "reseeded": self._reseeded,
+            "unjudged": sorted(self._unjudged),
+            "errors": self._errors,
+        }
 
     def _arrays(self) -> Arrays:
         return {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
@@ -141,9 +145,7 @@ class SplatField(SteppedField[SplatSnapshot]):
         self._grown = 0  # step of the last splitting and pruning
         self._step_time, self._tracking_time, self._reseed_time = StepTimer(), StepTimer(), StepTimer()
         self.cloud = GaussianCloud.empty(self.settings)
-        self._raster, self._tracking_raster, self._render_raster = (
-            RasterBuffers(self.pool) for _ in range(3)
-        )
+        self._raster, self._tracking_raster, self._render_raster = (RasterBuffers(self.pool) for _ in range(3))
         self._now_ns = None
         self._snapshot = None
         self._views: tuple[View, ...] = ()
@@ -172,9 +174,11 @@ class SplatField(SteppedField[SplatSnapshot]):
             elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
             self._now_ns = now_ns
             self._cams = camera_rows(
-                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.view_store.box,
+                [v.camera_to_world for v in views],
+                [v.intrinsics for v in views],
+                self.view_store.box,
                 [max((v.shows_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
-            )  # fmt: skip
+            )
             if not known:
                 self._before = self.cloud.params[:, :3].copy()
                 extrapolate(self.cloud, elapsed_s, any(memory[v.camera].moved is not None for v in views))
@@ -188,8 +192,17 @@ class SplatField(SteppedField[SplatSnapshot]):
             self._views, self._given, self._epoch = tuple(views), tuple(views), -1
             fresh = any(v.camera in news for k, v in enumerate(views) if k in self._asked)
             if len(self.cloud) and fresh and not known and any(m is not None for m in moved):
-                change = SceneChange(self.view_store.box, views, data, moved, self._changed, self._cams,
-                               self.view_store.background(), elapsed_s, len(self._asked))  # fmt: skip
+                change = SceneChange(
+                    self.view_store.box,
+                    views,
+                    data,
+                    moved,
+                    self._changed,
+                    self._cams,
+                    self.view_store.background(),
+                    elapsed_s,
+                    len(self._asked),
+                )
         if len(self.cloud) == 0:
             self._seed()
         self._snapshot = None
@@ -315,9 +328,19 @@ class SplatField(SteppedField[SplatSnapshot]):
             key=key,
         )
         self.pool.run(
-            train_tiles, self._data, picked.astype(np.int64), tasks, raster.columns, raster.projected,
-            raster.lists, loss, raster.memory, raster.saved, raster.sums, losses,
-        )  # fmt: skip
+            train_tiles,
+            self._data,
+            picked.astype(np.int64),
+            tasks,
+            raster.columns,
+            raster.projected,
+            raster.lists,
+            loss,
+            raster.memory,
+            raster.saved,
+            raster.sums,
+            losses,
+        )
         pixels, room = TILE * TILE * len(tasks), raster.lists.pair.shape[1]
         pairs = sum(min(needed, room) for needed in raster.lists.needed[: len(picked)].tolist())
         if wanted[0] is None or wanted[0] is not self._changed[picked[0]]:  # not of changed tiles alone
@@ -328,10 +351,18 @@ class SplatField(SteppedField[SplatSnapshot]):
                 return None, pixels, pairs, 0
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
         self.pool.run(
-            adam_step, cams, gaussians, len(cloud), raster.projected, raster.lists.own_first,
-            raster.lists.own_count, raster.sums, cloud.optimizer_state(), self._adam_parameters(progress),
+            adam_step,
+            cams,
+            gaussians,
+            len(cloud),
+            raster.projected,
+            raster.lists.own_first,
+            raster.lists.own_count,
+            raster.sums,
+            cloud.optimizer_state(),
+            self._adam_parameters(progress),
             dropped,
-        )  # fmt: skip
+        )
         if s.planar:
             self._planar_step(int(picked[0]))
         _, square, broken = losses.sum(axis=0).tolist()
@@ -399,10 +430,9 @@ class SplatField(SteppedField[SplatSnapshot]):
         others = [view for view in self.view_store.views if view.camera not in given]
         if not slots and not others:
             return
-        cams = np.concatenate([
-            self._cams[slots],
-            camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box),
-        ])  # fmt: skip
+        cams = np.concatenate(
+            [self._cams[slots], camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box)]
+        )
         wanted = [tiles[k] for k in slots] + [None] * len(others)
         self._render_raster.project_and_bin(cams, cloud.gaussians(), wanted, differentiate=False)
         shows = (self._render_raster.lists.own_count[: len(cams), : len(cloud)] > 0).any(axis=0)
@@ -444,7 +474,12 @@ def _equal(a: Sequence[View], b: Sequence[View]) -> bool:
     """Whether two sets of views have the same content."""
     return len(a) == len(b) and all(
         x is y
-        or (x.camera == y.camera and x.shows_ns == y.shows_ns and x.intrinsics == y.intrinsics
-            and np.array_equal(x.camera_to_world, y.camera_to_world) and np.array_equal(x.image, y.image))
+        or (
+            x.camera == y.camera
+            and x.shows_ns == y.shows_ns
+            and x.intrinsics == y.intrinsics
+            and np.array_equal(x.camera_to_world, y.camera_to_world)
+            and np.array_equal(x.image, y.image)
+        )
         for x, y in zip(a, b)
-    )  # fmt: skip
+    )

@@ -69,9 +69,7 @@ class GaussianCloud:
         self._replace({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
 
     def add(self, new: GaussianCloud) -> None:
-        self._replace({
-            f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)
-        })  # fmt: skip
+        self._replace({f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)})
 
     def _replace(self, arrays: dict[str, NDArray]) -> None:
         # All at once: Ctrl-C in between would leave arrays of different lengths.
@@ -108,9 +106,7 @@ def prune_least_sensitive(cloud: GaussianCloud, count: int) -> None:
         cloud.keep(keep)
 
 
-def densify_and_prune(
-    cloud: GaussianCloud, settings: SplatSettings, pixels: float, rng: np.random.Generator
-) -> None:
+def densify_and_prune(cloud: GaussianCloud, settings: SplatSettings, pixels: float, rng: np.random.Generator) -> None:
     """Remove faint Gaussians and those that no view shows, then split those with the largest gradient by the
     projected mean.
 
@@ -137,11 +133,7 @@ def densify_and_prune(
 
 
 def _split(
-    cloud: GaussianCloud,
-    chosen: NDArray[np.int64],
-    pixels: float,
-    settings: SplatSettings,
-    rng: np.random.Generator,
+    cloud: GaussianCloud, chosen: NDArray[np.int64], pixels: float, settings: SplatSettings, rng: np.random.Generator
 ) -> None:
     one = cloud.params[chosen].copy()
     size = np.exp(one[:, SCALE : SCALE + 3])

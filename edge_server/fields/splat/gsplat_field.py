@@ -62,9 +62,16 @@ class GsplatField(SplatField):
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         tiny = replace(
-            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False, centre_m=None,
-            radius_m=None, near_m=None,
-        )  # fmt: skip
+            self.settings,
+            gaussians=64,
+            start=8,
+            min_views=1,
+            seed_cells=8,
+            contracted=False,
+            centre_m=None,
+            radius_m=None,
+            near_m=None,
+        )
         image = np.full((32, 32, 3), 128, np.uint8)
         image[8:16, 8:16] = 255  # or there would be no Gaussians to rasterize
         field = GsplatField(tiny, self._rasterize, str(self._device))
@@ -118,9 +125,7 @@ class GsplatField(SplatField):
         pose = torch.eye(4, device=self._device)
         pose[:3, :3] = cam[:ORIGIN].view(3, 3)
         pose[:3, 3] = -pose[:3, :3] @ cam[ORIGIN:LENS]
-        camera = torch.tensor(
-            [[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]], device=self._device
-        )
+        camera = torch.tensor([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]], device=self._device)
         direction = torch.nn.functional.normalize(params[:, :3] - cam[ORIGIN:LENS], dim=-1)
         count = self.settings.harmonics
         coefficients = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
@@ -185,9 +190,7 @@ class GsplatField(SplatField):
         m = rule.beta1 * cloud.m[drawn] + (1.0 - rule.beta1) * g[drawn]
         v = rule.beta2 * cloud.v[drawn] + (1.0 - rule.beta2) * g[drawn] ** 2
         cloud.m[drawn], cloud.v[drawn] = m, v
-        step = (
-            rule.rates * m * correct[:, :1] * correct[:, 2:] / (np.sqrt(v * correct[:, 1:2]) + rule.epsilon)
-        )
+        step = rule.rates * m * correct[:, :1] * correct[:, 2:] / (np.sqrt(v * correct[:, 1:2]) + rule.epsilon)
         step[:, :SCALE] *= np.maximum(np.abs(cloud.params[drawn, :3]).max(axis=1), 1.0)[:, None]
         cloud.params[drawn] -= step
         clamp_gaussians(cloud.params, rule.largest, rule.thinnest)
@@ -209,7 +212,5 @@ def make_cuda(settings: SplatSettings) -> SplatField:
     try:
         from gsplat import rasterization
     except ImportError:
-        raise ValueError(
-            'splat: device cuda needs gsplat: pip install "freshfield[cuda]", or use device cpu'
-        ) from None
+        raise ValueError('splat: device cuda needs gsplat: pip install "freshfield[cuda]", or use device cpu') from None
     return GsplatField(settings, rasterization)

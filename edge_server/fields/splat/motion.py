@@ -81,13 +81,13 @@ class SceneChange:
         """Project the Gaussians into the changed tiles of ``slots``, for rendering."""
         slots = self.slots
         raster.project_and_bin(
-            np.ascontiguousarray(self.cams[slots]), cloud.gaussians(), [self.tiles[k] for k in slots],
+            np.ascontiguousarray(self.cams[slots]),
+            cloud.gaussians(),
+            [self.tiles[k] for k in slots],
             differentiate=False,
-        )  # fmt: skip
+        )
 
-    def evidence(
-        self, pool: Pool, gaussians: Gaussians, allowed: NDArray[np.float32] | None = None
-    ) -> Evidence:
+    def evidence(self, pool: Pool, gaussians: Gaussians, allowed: NDArray[np.float32] | None = None) -> Evidence:
         """Evidence for each Gaussian. allowed: see ``collect_evidence``; None: no view contradicts."""
         count, data = len(gaussians.params), self.data
         found = Evidence.zeros(count)
@@ -101,9 +101,7 @@ class SceneChange:
         return found
 
 
-def weighted_changes(
-    moved: Sequence[NDArray[np.bool_] | None], data: Views
-) -> list[NDArray[np.bool_] | None]:
+def weighted_changes(moved: Sequence[NDArray[np.bool_] | None], data: Views) -> list[NDArray[np.bool_] | None]:
     """``moved`` without pixels of weight 0; None for views without any changed pixel left, or with so many
     that it is no motion."""
     left: list[NDArray[np.bool_] | None] = []
@@ -146,9 +144,7 @@ def extrapolate(cloud: GaussianCloud, elapsed_s: float, moves: bool) -> None:
     cloud.params[:, :3] += cloud.velocity * np.float32(elapsed_s)
 
 
-def track(
-    raster: RasterBuffers, cloud: GaussianCloud, change: SceneChange, steps: int
-) -> Iterator[tuple[int, int]]:
+def track(raster: RasterBuffers, cloud: GaussianCloud, change: SceneChange, steps: int) -> Iterator[tuple[int, int]]:
     """Move the guests, and update their velocities, until rendering agrees with the views: first whole
     bodies, then smaller parts. Gradient descent with one gradient for all Gaussians of a cell: alone, a
     Gaussian would rather change its color. Yields pixels and pairs of each step, ``steps`` at most.
@@ -182,13 +178,30 @@ def track(
             tasks = raster.tasks()
             losses = np.zeros((len(tasks), 3))
             raster.pool.run(
-                train_tiles, change.data, picked, tasks, raster.columns, raster.projected, raster.lists, loss,
-                raster.memory, raster.saved, raster.sums, losses,
-            )  # fmt: skip
+                train_tiles,
+                change.data,
+                picked,
+                tasks,
+                raster.columns,
+                raster.projected,
+                raster.lists,
+                loss,
+                raster.memory,
+                raster.saved,
+                raster.sums,
+                losses,
+            )
             raster.pool.run(
-                position_gradients, cams, gaussians, guests, raster.projected, raster.lists.own_first,
-                raster.lists.own_count, raster.sums, slope,
-            )  # fmt: skip
+                position_gradients,
+                cams,
+                gaussians,
+                guests,
+                raster.projected,
+                raster.lists.own_first,
+                raster.lists.own_count,
+                raster.sums,
+                slope,
+            )
             total = np.stack([np.bincount(cell, slope[:, a], count) for a in range(3)], axis=-1)
             m, v = 0.6 * m + 0.4 * total, 0.8 * v + 0.2 * (total**2).sum(axis=1)
             length = np.sqrt(v / (1 - 0.8 ** (k + 1))) + 1e-12
@@ -201,9 +214,7 @@ def track(
             yield TILE * TILE * len(tasks), int(raster.lists.needed[: len(cams)].sum())
 
 
-def release_left_behind(
-    pool: Pool, cloud: GaussianCloud, change: SceneChange, before: NDArray[np.float32]
-) -> None:
+def release_left_behind(pool: Pool, cloud: GaussianCloud, change: SceneChange, before: NDArray[np.float32]) -> None:
     """Make guests static at their positions ``before``, (N, 3), where the views agree better with that: the
     body moved on without them."""
     guests = np.flatnonzero(cloud.guest)
@@ -220,11 +231,7 @@ def release_left_behind(
 
 
 def reseed(
-    settings: SplatSettings,
-    raster: RasterBuffers,
-    cloud: GaussianCloud,
-    change: SceneChange,
-    rng: np.random.Generator,
+    settings: SplatSettings, raster: RasterBuffers, cloud: GaussianCloud, change: SceneChange, rng: np.random.Generator
 ) -> None:
     """Remove contradicted Gaussians from the visual hull of what changed, and seed new ones where the
     rendering is still wrong.
@@ -253,9 +260,7 @@ def reseed(
     cloud.add(new)
 
 
-def _visual_hull(
-    pool: Pool, cloud: GaussianCloud, change: SceneChange
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _visual_hull(pool: Pool, cloud: GaussianCloud, change: SceneChange) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which Gaussians lie in the hull of what changed, and which are contradicted there: bool (N,) each."""
     allowed = np.where(cloud.guest > 0, MAX_ERROR_GUEST, MAX_ERROR).astype(np.float32)
     found = change.evidence(pool, cloud.gaussians(), allowed)
@@ -290,14 +295,11 @@ def _inherit_velocity(cloud: GaussianCloud, new: GaussianCloud, size: float) -> 
 def _grid_cells(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     """The index (N,) of the cube of side ``size`` that each point (N, 3) lies in, counted from 0."""
     index = np.floor(points / size).clip(-1000, 1000).astype(np.int64) + 1000
-    cell: NDArray[np.int64] = np.unique((index[:, 0] * 2001 + index[:, 1]) * 2001 + index[:, 2],
-                                        return_inverse=True)[1]  # fmt: skip
+    cell: NDArray[np.int64] = np.unique((index[:, 0] * 2001 + index[:, 1]) * 2001 + index[:, 2], return_inverse=True)[1]
     return cell.reshape(-1)
 
 
-def _wrong_pixels(
-    raster: RasterBuffers, cloud: GaussianCloud, change: SceneChange
-) -> list[NDArray[np.bool_] | None]:
+def _wrong_pixels(raster: RasterBuffers, cloud: GaussianCloud, change: SceneChange) -> list[NDArray[np.bool_] | None]:
     """The changed pixels that are not rendered as they are now. Where a body has left, the background behind
     it may be known already."""
     slots = change.slots
@@ -308,9 +310,18 @@ def _wrong_pixels(
     data, tasks = change.data, raster.tasks()
     error = np.zeros(int(data.first[-1]), np.float32)
     raster.pool.run(
-        compare_tiles, data, np.array(slots, np.int64), tasks, raster.columns, raster.projected, raster.lists,
-        change.background, raster.memory, raster.saved, error,
-    )  # fmt: skip
+        compare_tiles,
+        data,
+        np.array(slots, np.int64),
+        tasks,
+        raster.columns,
+        raster.projected,
+        raster.lists,
+        change.background,
+        raster.memory,
+        raster.saved,
+        error,
+    )
     for k in slots:
         mask = change.moved[k]
         assert mask is not None

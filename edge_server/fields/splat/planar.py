@@ -62,9 +62,19 @@ def plane_depth(
     width, height = int(camera[SIZE]), int(camera[SIZE + 1])
     out = np.zeros((height, width, 5), np.float32)
     raster.pool.run(
-        render_planes, slot, int(raster.columns[slot]), int(raster.rows[slot]), width, height,
-        raster.projected, raster.lists, gaussian_planes(gaussians, camera), raster.memory, raster.saved, out,
-    )  # fmt: skip
+        render_planes,
+        slot,
+        int(raster.columns[slot]),
+        int(raster.rows[slot]),
+        width,
+        height,
+        raster.projected,
+        raster.lists,
+        gaussian_planes(gaussians, camera),
+        raster.memory,
+        raster.saved,
+        out,
+    )
     rays = lens.rays()
     along = (out[..., :3] * rays).sum(axis=-1)
     opacity = np.clip(np.nan_to_num(out[..., 4]), 0.0, 1.0)
@@ -84,11 +94,7 @@ def flatten(cloud: GaussianCloud, settings: SplatSettings) -> None:
 
 
 def align(
-    cloud: GaussianCloud,
-    settings: SplatSettings,
-    raster: RasterBuffers,
-    camera: NDArray[np.float32],
-    lens: Pinhole,
+    cloud: GaussianCloud, settings: SplatSettings, raster: RasterBuffers, camera: NDArray[np.float32], lens: Pinhole
 ) -> None:
     """Turn the Gaussians that a camera sees towards the normals of the depth they render together. camera:
     its row; ``raster`` has the whole image of it at slot 0."""
@@ -97,9 +103,19 @@ def align(
     height, width = depth.shape
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     raster.pool.run(
-        accumulate_normals, 0, int(raster.columns[0]), int(raster.rows[0]), width, height, raster.projected,
-        raster.lists, depth_normals(depth, opacity, lens), raster.memory, raster.saved, normal_sums,
-    )  # fmt: skip
+        accumulate_normals,
+        0,
+        int(raster.columns[0]),
+        int(raster.rows[0]),
+        width,
+        height,
+        raster.projected,
+        raster.lists,
+        depth_normals(depth, opacity, lens),
+        raster.memory,
+        raster.saved,
+        normal_sums,
+    )
     first, count = raster.lists.own_first[0, : len(cloud)], raster.lists.own_count[0, : len(cloud)]
     which = np.flatnonzero(count > 0)
     sums = np.concatenate([np.zeros((1, 4)), np.cumsum(normal_sums.astype(np.float64), axis=0)])
@@ -115,14 +131,10 @@ def align(
     half_turn = 0.5 * settings.align * np.cross(normal, wanted)
     step = np.concatenate([np.ones((len(half_turn), 1)), half_turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
-    cloud.params[which, part] = quaternion_normalize(
-        quaternion_multiply(step, unit_quaternions(cloud.params[which]))
-    )
+    cloud.params[which, part] = quaternion_normalize(quaternion_multiply(step, unit_quaternions(cloud.params[which])))
 
 
-def depth_normals(
-    depth: NDArray[np.float32], opacity: NDArray[np.float32], lens: Pinhole
-) -> NDArray[np.float32]:
+def depth_normals(depth: NDArray[np.float32], opacity: NDArray[np.float32], lens: Pinhole) -> NDArray[np.float32]:
     """float32 (H, W, 4): unit normals, in camera axes and facing the camera, of the surface in ``depth``
     (H, W), and 1 where they are reliable: inside the image, where it is opaque and not at an edge."""
     rays = lens.rays()

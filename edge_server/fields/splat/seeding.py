@@ -21,10 +21,16 @@ _CANDIDATES = 4  # rays tried for each Gaussian: those that meet no surface are 
 
 
 def seed_gaussians(
-    settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-    masks: Sequence[NDArray[np.bool_] | None] | None, weight: NDArray[np.float32], count: int,
-    rng: np.random.Generator, moved: Sequence[NDArray[np.bool_] | None] | None = None,
-) -> NDArray[np.float32]:  # fmt: skip
+    settings: SplatSettings,
+    pool: Pool,
+    box: SceneBox,
+    views: Sequence[View],
+    masks: Sequence[NDArray[np.bool_] | None] | None,
+    weight: NDArray[np.float32],
+    count: int,
+    rng: np.random.Generator,
+    moved: Sequence[NDArray[np.bool_] | None] | None = None,
+) -> NDArray[np.float32]:
     """Parameters of up to ``count`` new Gaussians, float32 (N, P).
 
     masks: for each view bool (H, W), the pixels from which Gaussians may start (None: no pixel); None instead
@@ -73,9 +79,8 @@ def seed_gaussians(
 
 
 def _candidate_pixels(
-    settings: SplatSettings, views: Sequence[View], data: Views,
-    masks: Sequence[NDArray[np.bool_] | None] | None,
-) -> NDArray[np.int64]:  # fmt: skip
+    settings: SplatSettings, views: Sequence[View], data: Views, masks: Sequence[NDArray[np.bool_] | None] | None
+) -> NDArray[np.int64]:
     """Indices, over all views, of the pixels that do not show plain background."""
     plain = empty_color(settings, [views[k] for k in supervising_views(data)])
     parts = [np.zeros(0, np.int64)]

@@ -35,9 +35,7 @@ class SplatSettings(FieldSettings):
     rate_rotation: float = option(0.02, "learning rate of quaternions")
     rate_opacity: float = option(0.15, "learning rate of opacities before the sigmoid")
     rate_color: float = option(0.02, "learning rate of colors; a tenth of it for harmonics")
-    settle_after: float = option(
-        300.0, "steps for which a Gaussian trains at full rates; then they fall as 1 / steps"
-    )
+    settle_after: float = option(300.0, "steps for which a Gaussian trains at full rates; then they fall as 1 / steps")
     rate_settled: float = option(0.1, "minimum share of the full rates, reached after ``settle_after``")
     epsilon: float = option(1e-3, "Adam's epsilon, on gradients summed over pixels")
     fade: float = option(0.0, "penalty on opacity: removes Gaussians that no view needs")
@@ -53,9 +51,7 @@ class SplatSettings(FieldSettings):
     changed_share: float = option(0.25, "share of steps that train only on tiles that changed")
     follow: int = option(8, "steps at the start of an update that track moving Gaussians; 0: none")
     reseed: float = option(0.25, "largest share of ``gaussians`` that is seeded anew where something moved")
-    flatten: float = option(
-        0.0, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none"
-    )
+    flatten: float = option(0.0, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none")
     align: float = option(
         0.0, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3); 0: none"
     )
@@ -66,22 +62,38 @@ class SplatSettings(FieldSettings):
 
     def __post_init__(self) -> None:
         self._within(
-            ("gaussians", 1, 1 << 20), ("start", 1, 1 << 20), ("views_a_step", 1, 64), ("seed_cells", 0, 256),
-            ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
-            ("follow", 0, 1000), ("settle_after", 1.0, 1e9), ("rate_settled", 0.0, 1.0),
-            ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
-            ("seed_opacity", 0.001, 0.99), ("fade", 0.0, 1e3),
-            ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
-            ("aspect", 1.0, 1e4), ("reseed", 0.0, 1.0),
-            ("rate_position", 0.0, 100.0), ("rate_scale", 0.0, 10.0), ("rate_rotation", 0.0, 10.0),
-            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), ("flatten", 0.0, 1.0),
-            ("align", 0.0, 1.0), ("align_every", 1, 1 << 30),
-        )  # fmt: skip
+            ("gaussians", 1, 1 << 20),
+            ("start", 1, 1 << 20),
+            ("views_a_step", 1, 64),
+            ("seed_cells", 0, 256),
+            ("densify_every", 1, 1 << 30),
+            ("opacity_reset", 0, 1 << 30),
+            ("follow", 0, 1000),
+            ("settle_after", 1.0, 1e9),
+            ("rate_settled", 0.0, 1.0),
+            ("dssim", 0.0, 1e3),
+            ("seed_scale", 0.01, 100.0),
+            ("seed_opacity", 0.001, 0.99),
+            ("fade", 0.0, 1e3),
+            ("grow", 0.0, 1.0),
+            ("prune", 0.0, 0.9),
+            ("largest", 1e-3, 50.0),
+            ("widest", 1e-3, 1e3),
+            ("aspect", 1.0, 1e4),
+            ("reseed", 0.0, 1.0),
+            ("rate_position", 0.0, 100.0),
+            ("rate_scale", 0.0, 10.0),
+            ("rate_rotation", 0.0, 10.0),
+            ("rate_opacity", 0.0, 10.0),
+            ("rate_color", 0.0, 10.0),
+            ("flatten", 0.0, 1.0),
+            ("align", 0.0, 1.0),
+            ("align_every", 1, 1 << 30),
+        )
         for name, allowed in (("harmonics", (1, 4, 9)), ("loss", ("mse", "l1"))):
             if getattr(self, name) not in allowed:
                 raise ValueError(
-                    f"splat: {name} must be one of {', '.join(map(str, allowed))}, "
-                    f"not {getattr(self, name)!r}"
+                    f"splat: {name} must be one of {', '.join(map(str, allowed))}, not {getattr(self, name)!r}"
                 )
         if self.layers and self.device == "cuda":
             raise ValueError("splat: layers work on the CPU: device must be cpu or auto, not cuda")

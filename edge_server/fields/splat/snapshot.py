@@ -77,9 +77,20 @@ class SplatSnapshot:
         color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
         opacity = np.empty((h, w), np.float32)
         self.pool.run(
-            render_tiles, int(raster.columns[0]), int(raster.rows[0]), w, h, raster.projected, raster.lists,
-            self.background, raster.memory, raster.saved, color, depth, opacity,
-        )  # fmt: skip
+            render_tiles,
+            int(raster.columns[0]),
+            int(raster.rows[0]),
+            w,
+            h,
+            raster.projected,
+            raster.lists,
+            self.background,
+            raster.memory,
+            raster.saved,
+            color,
+            depth,
+            opacity,
+        )
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
 

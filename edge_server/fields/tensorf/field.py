@@ -27,9 +27,17 @@ class TensorfField(TrainedField):
 
     name = "tensorf"
     shape = (
-        "density_rank", "color_rank", "resolution_start", "resolution", "upsample", "hidden",
-        "hidden_layers", "harmonics", "cells", "samples",
-    )  # fmt: skip
+        "density_rank",
+        "color_rank",
+        "resolution_start",
+        "resolution",
+        "upsample",
+        "hidden",
+        "hidden_layers",
+        "harmonics",
+        "cells",
+        "samples",
+    )
     settings: TensorfSettings
 
     def __init__(self, settings: TensorfSettings | None = None, pool: Pool | None = None) -> None:
@@ -41,13 +49,10 @@ class TensorfField(TrainedField):
         density, color = MODES * s.density_rank // CHANNELS, MODES * s.color_rank // CHANNELS
         rows = _rows(size)
         table = np.zeros((density + color, rows, CHANNELS), np.float32)
-        table[:, : size * (size + 1)] = rng.normal(
-            0.0, s.first, (density + color, size * (size + 1), CHANNELS)
-        )
+        table[:, : size * (size + 1)] = rng.normal(0.0, s.first, (density + color, size * (size + 1), CHANNELS))
         planes = Planes(
-            size, density, density + color, rows, np.float32(np.log(FIRST_DENSITY)),
-            table.reshape(-1, CHANNELS),
-        )  # fmt: skip
+            size, density, density + color, rows, np.float32(np.log(FIRST_DENSITY)), table.reshape(-1, CHANNELS)
+        )
         return planes, init_net(CHANNELS * color, s, rng)
 
     def _feature_rows(self) -> int:
@@ -66,9 +71,7 @@ class TensorfField(TrainedField):
 
     def _gather(self, levels: int, scale: float) -> None:
         batch, planes = self._batch, self._encoding
-        self.pool.run(
-            scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
-        )
+        self.pool.run(scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
 
 
 def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:

@@ -47,6 +47,5 @@ SETTINGS = TensorfSettings
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"color_rank": 8, "resolution": 96, "hidden": 16, "batch_samples": 8192, "samples": 96},
     "medium": {},
-    "high": {"density_rank": 16, "color_rank": 24, "hidden": 64, "batch_samples": 32768, "rays": 8192,
-             "samples": 256},
-}  # fmt: skip
+    "high": {"density_rank": 16, "color_rank": 24, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
+}

@@ -61,9 +61,7 @@ class VoxelField(SteppedField[VoxelSnapshot]):
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def _begin_fit(
-        self, views: Sequence[View], step_budget: StepBudget, budget: Budget
-    ) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
         s = self.settings
         with self._lock:
             update = self.view_store.add(views)
@@ -109,12 +107,7 @@ class VoxelField(SteppedField[VoxelSnapshot]):
     # --- state --------------------------------------------------------------------------------
 
     def _counters(self) -> dict[str, Any]:
-        return {
-            "step": self.step,
-            "updates": self._updates,
-            "dropped": self.dropped,
-            "needed": self._occupancy.needed,
-        }
+        return {"step": self.step, "updates": self._updates, "dropped": self.dropped, "needed": self._occupancy.needed}
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         self._updates = int(meta["updates"])
@@ -145,9 +138,7 @@ class VoxelField(SteppedField[VoxelSnapshot]):
         table = _empty_grid(self._sizes[0])
         table[:] = (s.first, 0.5, 0.5, 0.5)
         self._set_grid(self._sizes[0], table)
-        self._occupancy = OccupancyGrid.for_box(
-            s.cells, s.min_views, self.view_store.box, unknown=2.0 * EMPTY
-        )
+        self._occupancy = OccupancyGrid.for_box(s.cells, s.min_views, self.view_store.box, unknown=2.0 * EMPTY)
         self._clearance = np.zeros(s.cells**3, np.uint8)
         self._ray_scratch = make_ray_scratch(self.pool.threads)
         self._samples, self._bad_rays = np.zeros(s.parts, np.int64), np.zeros(s.parts, np.int64)
@@ -230,10 +221,17 @@ class VoxelField(SteppedField[VoxelSnapshot]):
         key, occupancy, outline = step_key(s.seed, self.step), self._occupancy, np.float32(s.outline)
         if self.step % EVERY == 0 and self.step >= s.prune_from:
             self.pool.run(
-                update_cell_density, self.step // EVERY % OCCUPANCY_PHASES, OCCUPANCY_PHASES,
-                np.float32(FADE), self._voxels, np.float32(1.0 / length), occupancy.cells,
-                occupancy.seen, occupancy.needed, occupancy.density,
-            )  # fmt: skip
+                update_cell_density,
+                self.step // EVERY % OCCUPANCY_PHASES,
+                OCCUPANCY_PHASES,
+                np.float32(FADE),
+                self._voxels,
+                np.float32(1.0 / length),
+                occupancy.cells,
+                occupancy.seen,
+                occupancy.needed,
+                occupancy.density,
+            )
             occupancy.update_occupied(self._prune_density())
             self._update_clearance()
         recipe = RaySampling(
@@ -246,9 +244,20 @@ class VoxelField(SteppedField[VoxelSnapshot]):
             random_background=s.background == "random",
         )
         self.pool.run(
-            train_rays, data, recipe, self._skip_grid(), self._voxels, s.rays, outline, self._ray_scratch,
-            self._gradient, self._dirty, self._samples, self._bad_rays, self._loss,
-        )  # fmt: skip
+            train_rays,
+            data,
+            recipe,
+            self._skip_grid(),
+            self._voxels,
+            s.rays,
+            outline,
+            self._ray_scratch,
+            self._gradient,
+            self._dirty,
+            self._samples,
+            self._bad_rays,
+            self._loss,
+        )
         if self._bad_rays.any():
             self._repair()
         self._updates += 1
@@ -261,22 +270,14 @@ class VoxelField(SteppedField[VoxelSnapshot]):
             correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
         )
         self.pool.run(
-            voxel_adam,
-            self._voxels.table,
-            self._second_moment,
-            self._gradient,
-            self._dirty,
-            rule,
-            self._bad_gradients,
+            voxel_adam, self._voxels.table, self._second_moment, self._gradient, self._dirty, rule, self._bad_gradients
         )
         if diffuse_by > 0.0 and self.step >= s.prune_from:
             # Scaled with the rates, to balance the data. Colors reach 1, densities MAX_DENSITY.
             edge = np.array([MAX_DENSITY, 1.0, 1.0, 1.0], np.float32) * np.float32(s.diffuse_edge)
             diffusion = DiffusionRule(edge, np.float32(decay * diffuse_by / 6.0))
             phase = self.step % DIFFUSE_PHASES
-            self.pool.run(
-                diffuse, phase, DIFFUSE_PHASES, self._voxels, self._clearance, occupancy.cells, diffusion
-            )
+            self.pool.run(diffuse, phase, DIFFUSE_PHASES, self._voxels, self._clearance, occupancy.cells, diffusion)
         self.step += 1
         return float(self._loss.sum()) / (3 * s.rays)
 

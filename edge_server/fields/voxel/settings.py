@@ -22,25 +22,19 @@ class VoxelSettings(FieldSettings):
     rays: int = option(8192, "rays in one training step")
     rate: float = option(0.05, "learning rate of density at the start of a fit")
     rate_color: float = option(0.06, "learning rate of color at the start of a fit")
-    settle: float = option(
-        3.0, "passes over all pixels, after which a fit's rates decay as 1 / steps; 0: never"
-    )
+    settle: float = option(3.0, "passes over all pixels, after which a fit's rates decay as 1 / steps; 0: never")
     warm: float = option(0.3, "share of the rates that a fit uses if it starts from a grid at its final size")
     soften: float = option(0.2, "cap on the optical depth of one step where something moved")
     growth: float = option(20.0, "density x has 1 + growth x times the learning rate ``rate``")
     l1: float = option(0.003, "L1 penalty on density, in learning rates: empties what no image needs")
-    outline: float = option(
-        0.25, "weight of the opacity loss, where alpha or a plain background gives the truth"
-    )
+    outline: float = option(0.25, "weight of the opacity loss, where alpha or a plain background gives the truth")
     diffuse: float = option(
         1.0, "share of the difference to its neighbors' mean that a vertex loses in four steps at full rates"
     )
     diffuse_edge: float = option(
         0.025, "largest difference between neighbors that ``diffuse`` counts, as a share of the range"
     )
-    diffuse_views: int = option(
-        32, "number of viewpoints above which ``diffuse`` falls in inverse proportion to them"
-    )
+    diffuse_views: int = option(32, "number of viewpoints above which ``diffuse`` falls in inverse proportion to them")
     first: float = option(0.1, "initial optical depth of one step")
     prune: float = option(0.2, "optical depth of one step below which a cell counts as empty")
     prune_from: int = option(15, "step from which empty cells are skipped and ``diffuse`` acts")

@@ -46,6 +46,14 @@ class VoxelSnapshot(PixelSnapshot):
     ) -> Pixels:
         """See ``PixelSnapshot``."""
         return run_by_pixel(
-            self.pool, render_rays, self.box, camera_to_world, intrinsics, pixels,
-            self.space, self.voxels, self.background, make_ray_scratch(self.pool.threads),
-        )  # fmt: skip
+            self.pool,
+            render_rays,
+            self.box,
+            camera_to_world,
+            intrinsics,
+            pixels,
+            self.space,
+            self.voxels,
+            self.background,
+            make_ray_scratch(self.pool.threads),
+        )

@@ -95,10 +95,7 @@ class Journal:
         self._files["shown"].write(json.dumps(line, allow_nan=False))
 
     def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
-        line = {
-            "t_s": round(t_s, 4),
-            "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()},
-        }
+        line = {"t_s": round(t_s, 4), "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()}}
         self._files["ages"].write(json.dumps(line))
 
     def poses(self, views: Sequence[View]) -> None:

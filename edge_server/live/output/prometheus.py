@@ -22,9 +22,7 @@ class EdgeCollector:
         self._ingest = ingest
 
     def collect(self) -> Iterator[Metric]:
-        age = GaugeMetricFamily(
-            "freshfield_camera_age_seconds", "age of the newest buffered frame", labels=["camera"]
-        )
+        age = GaugeMetricFamily("freshfield_camera_age_seconds", "age of the newest buffered frame", labels=["camera"])
         delivered = CounterMetricFamily("freshfield_frames_delivered", "frames accepted", labels=["camera"])
         for camera in self._state.cameras():
             if camera.age_ms is not None:
@@ -36,9 +34,7 @@ class EdgeCollector:
         shed = self._ingest.buffer.shed
         yield from (age, delivered, rejected)
         yield CounterMetricFamily("freshfield_frames_shed", "frames left out for lack of time", value=shed)
-        check = GaugeMetricFamily(
-            "freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"]
-        )
+        check = GaugeMetricFamily("freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"])
         for percent in (50, 99):
             value = self._ingest.check_ms.percentile(percent)
             if value is not None:
@@ -57,9 +53,7 @@ class EdgeCollector:
                 yield GaugeMetricFamily(f"freshfield_{name}", about, value=value)
 
 
-def serve_metrics(
-    state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None
-) -> None:
+def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None) -> None:
     """Serve /metrics on a thread until the process ends. Raises TransportError if the port is not available,
     or if the metrics would be open to others (see ``Transport.guard``)."""
     registry = CollectorRegistry()

@@ -71,12 +71,7 @@ class Recorder:
 
     def status(self) -> dict[str, Any]:
         """For edge.json."""
-        return {
-            "file": self.file.name,
-            "written": self.written,
-            "dropped": self.dropped,
-            "failed": self._failed,
-        }
+        return {"file": self.file.name, "written": self.written, "dropped": self.dropped, "failed": self._failed}
 
     def close(self) -> None:
         """Write what is queued, and the index."""
@@ -88,9 +83,7 @@ class Recorder:
     def _decision(self, topic: str, publication: Publication, t_ns: int | None = None) -> None:
         at = publication.published_ns if t_ns is None else t_ns
         values = dataclasses.asdict(publication)
-        self._put(
-            _MESSAGE_BYTES, lambda: self._writer.data(topic, "freshfield.Decision", self._schema, values, at)
-        )
+        self._put(_MESSAGE_BYTES, lambda: self._writer.data(topic, "freshfield.Decision", self._schema, values, at))
 
     def _put(self, size: int, write: Callable[[], None]) -> None:
         with self._changed:

@@ -121,17 +121,13 @@ def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
         )
     until = [path for path in known if number is None or int(path.stem) <= number]
     if not until:
-        raise ValueError(
-            f"{run}: the decision of update {number} is not kept; the oldest kept is {int(known[0].stem)}"
-        )
+        raise ValueError(f"{run}: the decision of update {number} is not kept; the oldest kept is {int(known[0].stem)}")
     path = until[-1]
     arrays, about = checkpoint.load(path, kind=_KIND, most_bytes=stored_bytes(path))
     try:
         actor = Actor.load(path.with_name(Path(about["policy"]).name))
         cameras = tuple(str(camera) for camera in about["cameras"])
-        state = State(
-            arrays["ages_ms"], arrays["poses"], arrays.get("embeddings"), arrays["reported"], cameras
-        )
+        state = State(arrays["ages_ms"], arrays["poses"], arrays.get("embeddings"), arrays["reported"], cameras)
         decision = Decision(
             int(about["number"]), int(about["now_ns"]), state, arrays["action"], float(about["logp"]), actor
         )
@@ -156,8 +152,11 @@ def _as_arrays(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     s = decision.state
     arrays: dict[str, NDArray[Any]] = {
-        "ages_ms": s.ages_ms, "poses": s.poses, "reported": s.reported, "action": decision.action,
-    }  # fmt: skip
+        "ages_ms": s.ages_ms,
+        "poses": s.poses,
+        "reported": s.reported,
+        "action": decision.action,
+    }
     if s.embeddings is not None:
         arrays["embeddings"] = s.embeddings
     for camera, frame in s.frames.items():

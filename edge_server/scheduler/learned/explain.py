@@ -105,13 +105,7 @@ def describe_action(actor: Actor, action: Any, names: Sequence[str]) -> str:
 
 
 def occlusion_map(
-    actor: Actor,
-    state: State,
-    action: Any,
-    camera: int,
-    image: NDArray[np.uint8],
-    embed: EmbedImages,
-    grid: int = GRID,
+    actor: Actor, state: State, action: Any, camera: int, image: NDArray[np.uint8], embed: EmbedImages, grid: int = GRID
 ) -> NDArray[np.float64]:
     """(grid, grid) fall of the action's logit when a region of ``camera``'s image is painted gray: positive
     regions spoke for the action. ValueError where the policy does not look at images."""

@@ -61,9 +61,7 @@ class BanditEnvironment(gymnasium.Env):
         self._problem = problem
         self._spec = spec
         shape = (cameras, spec.layout.width)
-        self.observation_space = gymnasium.spaces.Box(
-            -spec.layout.limit, spec.layout.limit, shape, np.float64
-        )
+        self.observation_space = gymnasium.spaces.Box(-spec.layout.limit, spec.layout.limit, shape, np.float64)
         self.action_space: gymnasium.Space[Any] = (
             gymnasium.spaces.MultiBinary(cameras)
             if spec.action == "select"

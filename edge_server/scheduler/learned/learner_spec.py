@@ -64,9 +64,7 @@ class Spec:
             raise ValueError(f"omegas_ms: expected at most {MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
         if not rising or not all(0 <= o <= LONGEST_MS for o in self.omegas_ms):
-            raise ValueError(
-                f"omegas_ms: expected values from 0 to {LONGEST_MS:.0f}, rising, got {self.omegas_ms}"
-            )
+            raise ValueError(f"omegas_ms: expected values from 0 to {LONGEST_MS:.0f}, rising, got {self.omegas_ms}")
         if self.network not in ("pooled", "flat"):
             raise ValueError(f"network {self.network!r} is not known; choose pooled or flat")
         if (self.network == "flat") != (self.cameras is not None):

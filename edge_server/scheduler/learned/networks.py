@@ -90,14 +90,19 @@ def _init_trunk(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.fl
     if spec.network == "flat":
         assert spec.cameras is not None  # checked by Spec
         return {
-            "in": _orthogonal(rng, spec.cameras * width, hidden, gain), "in_b": zeros.copy(),
-            "mid": _orthogonal(rng, hidden, hidden, gain), "mid_b": zeros.copy(),
-        }  # fmt: skip
+            "in": _orthogonal(rng, spec.cameras * width, hidden, gain),
+            "in_b": zeros.copy(),
+            "mid": _orthogonal(rng, hidden, hidden, gain),
+            "mid_b": zeros.copy(),
+        }
     return {
-        "in": _orthogonal(rng, width, hidden, gain), "in_b": zeros.copy(),
-        "enc": _orthogonal(rng, hidden, hidden, gain), "enc_b": zeros.copy(),
-        "mid": _orthogonal(rng, 2 * hidden + 1, hidden, 1.0), "mid_b": zeros.copy(),
-    }  # fmt: skip
+        "in": _orthogonal(rng, width, hidden, gain),
+        "in_b": zeros.copy(),
+        "enc": _orthogonal(rng, hidden, hidden, gain),
+        "enc_b": zeros.copy(),
+        "mid": _orthogonal(rng, 2 * hidden + 1, hidden, 1.0),
+        "mid_b": zeros.copy(),
+    }
 
 
 def _orthogonal(rng: np.random.Generator, rows: int, columns: int, gain: float) -> NDArray[np.float64]:

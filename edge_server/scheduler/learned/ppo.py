@@ -197,12 +197,7 @@ class Learner:
         return Diagnostics(mean, dropped, **done)
 
     def _passes(
-        self,
-        features: torch.Tensor,
-        actions: torch.Tensor,
-        logps: torch.Tensor,
-        rewards: torch.Tensor,
-        explore: float,
+        self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor, explore: float
     ) -> dict[str, Any]:
         """Pass over the batch in minibatches until the policy has moved by ``target_kl``."""
         spec = self.spec
@@ -237,10 +232,16 @@ class Learner:
                 break
         policy, value, entropy, moved, clipped, gradient_norm = np.mean(seen, axis=0).tolist()
         return {
-            "policy_loss": policy, "value_loss": value, "entropy": entropy, "moved": moved,
-            "clipped": clipped, "gradient": gradient_norm, "explained": explained, "steps": steps,
+            "policy_loss": policy,
+            "value_loss": value,
+            "entropy": entropy,
+            "moved": moved,
+            "clipped": clipped,
+            "gradient": gradient_norm,
+            "explained": explained,
+            "steps": steps,
             "skipped": skipped,
-        }  # fmt: skip
+        }
 
     @staticmethod
     def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:
@@ -327,14 +328,10 @@ class Learner:
         for i, parameter in enumerate(self._parameters):
             if f"adam.{i}.step" in arrays:  # before the first update Adam has no moments
                 step = np.asarray(arrays[f"adam.{i}.step"], np.float32)
-                mean, square = (
-                    _checked_tensor(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq")
-                )
+                mean, square = (_checked_tensor(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq"))
                 if step.shape != () or not 1.0 <= step < np.inf or (square < 0.0).any():
                     raise ValueError("Adam's moments are invalid")
-                self._adam.state[parameter] = {
-                    "step": torch.tensor(step), "exp_avg": mean, "exp_avg_sq": square
-                }  # fmt: skip
+                self._adam.state[parameter] = {"step": torch.tensor(step), "exp_avg": mean, "exp_avg_sq": square}
         self.reward_fields = about.get("taught_by")
         self._mean_features = _checked_tensor(arrays["usual"], torch.tensor(self._mean_features)).numpy()
         self._cameras_seen = int(about["cameras_seen"])

@@ -87,9 +87,7 @@ class StateLayout:
 
     def __post_init__(self) -> None:
         if unknown := set(self.parts) - set(STATE_PARTS):
-            raise ValueError(
-                f"state: no part is called {', '.join(unknown)}; there are {', '.join(STATE_PARTS)}"
-            )
+            raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(STATE_PARTS)}")
         if not self.parts:
             raise ValueError(f"state: no parts; choose some of {', '.join(STATE_PARTS)}")
         require_int("state: dim", self.dim, 0, MAX_DIM)

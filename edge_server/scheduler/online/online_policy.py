@@ -212,10 +212,15 @@ class OnlinePolicy(Policy):
             self.shortened += shortened
             self.kl_from_loaded = mean_kl(self._loaded, actor, batch.features)
         return {
-            "update": self.updates, "decisions": len(rewarded), "reward": diagnostics.reward,
-            "kl_from_acted": diagnostics.moved, "step_kl": mean_kl(before, actor, batch.features),
-            "kl_from_loaded": self.kl_from_loaded, "shortened": shortened, "fallen_back": self.fallen_back,
-        }  # fmt: skip
+            "update": self.updates,
+            "decisions": len(rewarded),
+            "reward": diagnostics.reward,
+            "kl_from_acted": diagnostics.moved,
+            "step_kl": mean_kl(before, actor, batch.features),
+            "kl_from_loaded": self.kl_from_loaded,
+            "shortened": shortened,
+            "fallen_back": self.fallen_back,
+        }
 
     def save(self, path: Path | str) -> None:
         """Write what has been learned, as a checkpoint for ``bandit:FILE``. OSError where it cannot be
@@ -229,11 +234,16 @@ class OnlinePolicy(Policy):
         with self._lock:
             learned, other = self._test.estimates
         return {
-            "updates": self.updates, "shortened": self.shortened, "kl_from_loaded": self.kl_from_loaded,
-            "kl_bound": self.settings.max_kl, "fallen_back": self.fallen_back,
-            "fixed": policy_label(self.fixed), "verdict": self.verdict,
-            "learnt_reward": vars(learned), "fixed_reward": vars(other),
-        }  # fmt: skip
+            "updates": self.updates,
+            "shortened": self.shortened,
+            "kl_from_loaded": self.kl_from_loaded,
+            "kl_bound": self.settings.max_kl,
+            "fallen_back": self.fallen_back,
+            "fixed": policy_label(self.fixed),
+            "verdict": self.verdict,
+            "learnt_reward": vars(learned),
+            "fixed_reward": vars(other),
+        }
 
     def summary(self) -> str:
         """The status in one line for people."""
@@ -242,9 +252,7 @@ class OnlinePolicy(Policy):
         who = "the learned policy decides"
         if self.fallen_back:
             who = f"fallen back, the learned policy was {self.verdict}"
-        return (
-            f"learning: {who}; reward {learned}, {policy_label(self.fixed)} {other}; {self.updates} updates"
-        )
+        return f"learning: {who}; reward {learned}, {policy_label(self.fixed)} {other}; {self.updates} updates"
 
     # --- inside -------------------------------------------------------------------------------------
 
@@ -260,13 +268,9 @@ class OnlinePolicy(Policy):
         log.info("the learned policy is %s: %s", self.verdict, "fallen back" if worse else "it decides again")
 
     def _exploring(self, actor: Actor) -> Actor:
-        return ExploringActor(
-            actor.spec, actor.weights, self.settings.explore, mean_features=actor.mean_features
-        )
+        return ExploringActor(actor.spec, actor.weights, self.settings.explore, mean_features=actor.mean_features)
 
-    def _within_trust_region(
-        self, before: Actor, after: Actor, features: NDArray[np.float64]
-    ) -> tuple[Actor, bool]:
+    def _within_trust_region(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> tuple[Actor, bool]:
         """``after``, or the farthest point on the way to it, by repeated halving, that is within the trust
         region; at worst ``before``. And whether the step was shortened."""
         if self._is_trusted(before, after, features):

@@ -125,11 +125,7 @@ def training_summary(path: Path) -> dict[str, Any]:
 
 
 def choose_reward(
-    action: str,
-    given: str | None,
-    path: Path,
-    lpips_missing: str | None,
-    reward_fields: dict[str, Any] | None = None,
+    action: str, given: str | None, path: Path, lpips_missing: str | None, reward_fields: dict[str, Any] | None = None
 ) -> Reward:
     """The reward to learn by: ``given``, else the training's reward, else the default of ``action``.
 

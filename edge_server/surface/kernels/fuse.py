@@ -124,10 +124,7 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
         if deep < -ball:
             continue
         if not distorted and deep > 2.0 * ball:
-            u, v = (
-                fx * (r00 * x + r10 * y + r20 * z) / deep + cx,
-                fy * (r01 * x + r11 * y + r21 * z) / deep + cy,
-            )
+            u, v = (fx * (r00 * x + r10 * y + r20 * z) / deep + cx, fy * (r01 * x + r11 * y + r21 * z) / deep + cy)
             reach = 2.0 * ball * (fx + fy) / (deep - ball)
             if u < -reach or v < -reach or u > f_width + reach or v > f_height + reach:
                 continue

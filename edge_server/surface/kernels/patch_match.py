@@ -402,10 +402,7 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                 n = np.uint64(((row * width + column) * 64 + trial + 1) * 4)
                 qd, qx, qy, qz = d, nx, ny, nz
                 if trial == 0:
-                    qd, qx = (
-                        np.float64(offered.depth[row, column]),
-                        np.float64(offered.normal[row, column, 0]),
-                    )
+                    qd, qx = (np.float64(offered.depth[row, column]), np.float64(offered.normal[row, column, 0]))
                     qy = np.float64(offered.normal[row, column, 1])
                     qz = np.float64(offered.normal[row, column, 2])
                 elif trial >= 1 and trial <= 8:
@@ -417,11 +414,7 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                     kind = -1 if wide else (trial - search.wide) % 3  # 0: depth, 1: normal, 2: both
                     if kind != 1:
                         drawn = 2.0 * np.float64(uniform(key, n)) - 1.0
-                        qd = (
-                            middle * (1.0 + search.reach * drawn)
-                            if wide
-                            else d * (1.0 + small * search.share * drawn)
-                        )
+                        qd = middle * (1.0 + search.reach * drawn) if wide else d * (1.0 + small * search.share * drawn)
                     if kind != 0:
                         turn = 1.0 if wide else small * search.turn
                         keep = 0.0 if wide else 1.0
@@ -436,9 +429,8 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                 if not abs(qd - middle) <= search.reach * middle:
                     continue
                 cost, shown = plane_cost(
-                    images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts,
-                    search.geometric,
-                )  # fmt: skip
+                    images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts, search.geometric
+                )
                 if shown == 1:
                     cost = min(cost + SINGLE, WORST)
                 if total > np.float32(0.0):
@@ -503,9 +495,21 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
             total, compared = np.float32(0.0), True
             for trial in range(3):
                 cost, shown = plane_cost(
-                    images, view, row, column, d * (1.0 + step * (trial - 1)), nx, ny, nz, across, down,
-                    patch, weight, facts, 0.0,
-                )  # fmt: skip
+                    images,
+                    view,
+                    row,
+                    column,
+                    d * (1.0 + step * (trial - 1)),
+                    nx,
+                    ny,
+                    nz,
+                    across,
+                    down,
+                    patch,
+                    weight,
+                    facts,
+                    0.0,
+                )
                 total += -cost if trial == 1 else np.float32(0.5) * cost
                 compared = compared and shown > 0
             rise[row, column] = total if compared else np.float32(0.0)

@@ -35,9 +35,13 @@ MOMENTS, WEIGHTS = 16, 15
 _PHI = 6
 # Number of the moment that is the product of two parts of phi.
 _PRODUCT = (
-    (0, 1, 2, 3, 4, 5), (1, 3, 4, 6, 7, 8), (2, 4, 5, 7, 8, 9),
-    (3, 6, 7, 10, 11, 12), (4, 7, 8, 11, 12, 13), (5, 8, 9, 12, 13, 14),
-)  # fmt: skip
+    (0, 1, 2, 3, 4, 5),
+    (1, 3, 4, 6, 7, 8),
+    (2, 4, 5, 7, 8, 9),
+    (3, 6, 7, 10, 11, 12),
+    (4, 7, 8, 11, 12, 13),
+    (5, 8, 9, 12, 13, 14),
+)
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
@@ -139,9 +143,21 @@ def _fold(cam, b, base, here, gaussians, ids, projected, lists, pair_sums, sums,
 
 @kernel
 def fisher_information(
-    counter, worker, cams, gaussians, columns, rows, projected, lists, pair_sums, background, memory, saved,
-    moments, information,
-):  # fmt: skip
+    counter,
+    worker,
+    cams,
+    gaussians,
+    columns,
+    rows,
+    projected,
+    lists,
+    pair_sums,
+    background,
+    memory,
+    saved,
+    moments,
+    information,
+):
     """Write the information that each camera's picture has about each Gaussian. Tasks are cameras.
 
     cams: float32 (B, CAMERA), the cameras of ``projected`` and ``lists``.
@@ -171,19 +187,36 @@ def fisher_information(
             bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
             for n in range(STRIPS):
                 done = composite(
-                    strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0),
-                    np.float32(y0 + 2 * n), s, n * STRIP, store, SAVED,
-                )  # fmt: skip
+                    strip_pairs[n],
+                    count[n],
+                    lists.owner[b],
+                    projected[b],
+                    np.float32(x0),
+                    np.float32(y0 + 2 * n),
+                    s,
+                    n * STRIP,
+                    store,
+                    SAVED,
+                )
                 for c in range(3):
                     for k in range(STRIP):
                         behind[c, k] = s[n * STRIP + k] * background[c]
                 _add_moments(
-                    store, done, strip_pairs[n], lists.owner[b], projected[b], x0, y0 + 2 * n, width, height,
-                    behind, square, sums,
-                )  # fmt: skip
+                    store,
+                    done,
+                    strip_pairs[n],
+                    lists.owner[b],
+                    projected[b],
+                    x0,
+                    y0 + 2 * n,
+                    width,
+                    height,
+                    behind,
+                    square,
+                    sums,
+                )
         for base in range(0, total, BLOCK):
             here = min(BLOCK, total - base)
             for j in range(here):
                 ids[j] = base + j
-            _fold(cam, b, base, here, gaussians, ids, projected, lists, pair_sums, sums, block, by_phi,
-                  information)  # fmt: skip
+            _fold(cam, b, base, here, gaussians, ids, projected, lists, pair_sums, sums, block, by_phi, information)

@@ -39,9 +39,7 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _KEPT_CHUNKS = 4
 # What damaged records raise; lz4's errors are plain RuntimeErrors.
-_UNREADABLE = (
-    McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError, MemoryError,
-)  # fmt: skip
+_UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError, MemoryError)
 
 
 class _Location(NamedTuple):

@@ -9,17 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from freshfield.frame import CODEC_NAMES
-from freshfield.session import (
-    CALIBRATION,
-    HEADER,
-    IMAGE,
-    INSTALL,
-    POSE,
-    TRANSFORMS,
-    WORLD,
-    SessionError,
-    topic_of,
-)
+from freshfield.session import CALIBRATION, HEADER, IMAGE, INSTALL, POSE, TRANSFORMS, WORLD, SessionError, topic_of
 from freshfield.v1 import frames_pb2 as pb
 
 try:
@@ -81,18 +71,19 @@ class SessionWriter:
         self._proto(topic_of(camera, HEADER), header, *times)
         self._proto(topic_of(camera, IMAGE), image, *times)
 
-    def data(
-        self, topic: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int
-    ) -> None:
+    def data(self, topic: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int) -> None:
         """Write a JSON message.
 
         name, schema: name and JSON schema of the topic's messages.
         t_ns: log and publish time.
         Raises ValueError for NaN or infinity.
         """
-        self._register(topic, name, MessageEncoding.JSON, lambda: self._mcap.register_schema(
-            name, SchemaEncoding.JSONSchema, json.dumps(schema).encode()
-        ))  # fmt: skip
+        self._register(
+            topic,
+            name,
+            MessageEncoding.JSON,
+            lambda: self._mcap.register_schema(name, SchemaEncoding.JSONSchema, json.dumps(schema).encode()),
+        )
         self._add(topic, json.dumps(values, allow_nan=False).encode(), t_ns, t_ns, 0)
 
     def flush(self) -> None:
@@ -114,9 +105,7 @@ class SessionWriter:
 
     def _proto(self, topic: str, message: Any, log_ns: int, publish_ns: int, sequence: int) -> None:
         name = message.DESCRIPTOR.full_name
-        self._register(
-            topic, name, MessageEncoding.Protobuf, lambda: register_schema(self._mcap, type(message))
-        )
+        self._register(topic, name, MessageEncoding.Protobuf, lambda: register_schema(self._mcap, type(message)))
         self._add(topic, message.SerializeToString(), log_ns, publish_ns, sequence)
 
     def _register(self, topic: str, name: str, encoding: str, new_schema: Callable[[], int]) -> None:

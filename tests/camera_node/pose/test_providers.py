@@ -38,10 +38,7 @@ def test_beyond_the_bound_there_is_no_pose():
             track.at(t_ms * MS)
 
 
-@given(
-    st.lists(st.integers(-(10**12), 10**12), min_size=1, max_size=30, unique=True),
-    st.integers(-(10**12), 10**12),
-)
+@given(st.lists(st.integers(-(10**12), 10**12), min_size=1, max_size=30, unique=True), st.integers(-(10**12), 10**12))
 def test_the_gap_is_the_distance_to_the_nearest_sample(times, t_ns):
     times.sort()
     track = Trajectory(times, [turn(k / 30, k) for k in range(len(times))], max_gap_ns=10**13)

@@ -26,9 +26,7 @@ os.write(1, b"as ever\\n")
 def test_only_what_python_prints_comes_out():
     done = subprocess.run([sys.executable, "-c", SPEAKS], capture_output=True, text=True, check=True)
     assert sorted(done.stdout.split("\n")) == sorted(["before", "the answer", "after", "as ever", ""])
-    assert sorted(done.stderr.split("\n")) == sorted(
-        ["from a library", "held back by one", "from a child", ""]
-    )
+    assert sorted(done.stderr.split("\n")) == sorted(["from a library", "held back by one", "from a child", ""])
 
 
 def test_what_stands_in_for_standard_output_is_left_alone(capsys):

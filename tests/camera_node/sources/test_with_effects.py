@@ -28,13 +28,17 @@ def own_cache(tmp_path, monkeypatch):
 SEEN = {"hot_pixels": {"hot_ppm": 50_000.0}, "occluder": {"sweep_deg": 180.0, "thickness_share": 0.3}}
 
 
-def cameras(
-    effects: dict[str, Any], count: int = 3, scene: str = "tower", seed: int = 5
-) -> dict[str, Camera]:
+def cameras(effects: dict[str, Any], count: int = 3, scene: str = "tower", seed: int = 5) -> dict[str, Camera]:
     source = {
-        "kind": "world", "scene": scene, "width": 24, "height": 16, "fps": 10, "codec": "zstd",
-        "effects": effects, "params": {"supersample": 1},
-    }  # fmt: skip
+        "kind": "world",
+        "scene": scene,
+        "width": 24,
+        "height": 16,
+        "fps": 10,
+        "codec": "zstd",
+        "effects": effects,
+        "params": {"supersample": 1},
+    }
     top = {"seed": seed, "cameras": {"count": count, "held_out": ["cam00"]}, "source": source}
     scenario = parse(top, Path("world.yaml"))
     return {c.name: c for c in build_cameras(scenario, source_config(scenario), scenario.cameras)}
@@ -113,9 +117,7 @@ def test_the_lens_goes_over_the_wire(calibrated):
 
 
 def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name():
-    with pytest.raises(
-        ScenarioError, match=r"^world.yaml: source.effects: effect lens_distortion: k1 -2"
-    ) as error:
+    with pytest.raises(ScenarioError, match=r"^world.yaml: source.effects: effect lens_distortion: k1 -2") as error:
         cameras({"lens_distortion": {"k1": -2.0}})
     assert "\n" not in str(error.value)
 
@@ -131,8 +133,10 @@ def test_recordings_have_lenses_and_weather_of_their_own(tmp_path, name):
 
 def test_a_recording_with_a_wrong_pose_is_sent_as_it_lies(tmp_path):
     data = write_photos(tmp_path, 24)
-    for parameters, repeats in (({}, False), ({"translation_mm": 0.0, "rotation_deg": 0.0,
-                                               "rotation_bias_deg": 2.0}, True)):  # fmt: skip
+    for parameters, repeats in (
+        ({}, False),
+        ({"translation_mm": 0.0, "rotation_deg": 0.0, "rotation_bias_deg": 2.0}, True),
+    ):
         scenario = photo_scenario(data, cameras=3, fps=5, effects={"pose_noise": parameters})
         truth, wrong = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
         assert (wrong.source.contents is not None) == repeats
@@ -146,9 +150,7 @@ def test_a_recording_with_a_wrong_pose_is_sent_as_it_lies(tmp_path):
 
 def test_the_exposure_of_a_recording_drifts_with_its_time(tmp_path):
     drift = {"amplitude_stops": 1.0, "period_s": 2.0, "offset_spread_stops": 0.0}
-    scenario = photo_scenario(
-        write_photos(tmp_path, 1, cameras=2), 2, fps=20, effects={"exposure_drift": drift}
-    )
+    scenario = photo_scenario(write_photos(tmp_path, 1, cameras=2), 2, fps=20, effects={"exposure_drift": drift})
     (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
     means = []
     for tick in range(80):

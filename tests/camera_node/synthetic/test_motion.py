@@ -57,9 +57,7 @@ def test_a_foot_rests_during_its_stance_and_moves_during_its_swing():
 def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
     """Measured independently: middles of all parts, by finite differences over one period in seconds."""
     walk = person.make_walk((0.0, 1.0), (0.74, 0.54), speed)
-    assert (walk.period_s / motion.PERIOD_UNIT_S) == pytest.approx(
-        round(walk.period_s / motion.PERIOD_UNIT_S)
-    )
+    assert (walk.period_s / motion.PERIOD_UNIT_S) == pytest.approx(round(walk.period_s / motion.PERIOD_UNIT_S))
     body = person.walking_person(walk)
     n = 400
     centers = []
@@ -71,9 +69,7 @@ def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
     assert meters / walk.period_s == pytest.approx(speed, rel=0.03)
 
 
-@given(
-    st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3)
-)
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3))
 def test_two_bones_meet_the_joint(root, tip, pole):
     upper, lower = 0.6, 0.5
     joint = np.array(motion.two_bone_ik(root, tip, upper, lower, pole))

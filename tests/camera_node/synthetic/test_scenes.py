@@ -70,9 +70,7 @@ def test_everything_seen_lies_within_the_bounds(name):
 
 
 def test_on_the_bench_the_tile_alone_is_the_object():
-    plain, bench = (
-        make_scene("tile", {"count": 5, "supersample": 1, **SMALL, "bench": b}) for b in (False, True)
-    )
+    plain, bench = (make_scene("tile", {"count": 5, "supersample": 1, **SMALL, "bench": b}) for b in (False, True))
     assert bench.object_parts == plain.object_parts == len(plain.world.static_parts)
     assert len(bench.world.static_parts) > bench.object_parts
     for name, (lens, pose) in plain.cameras.items():
@@ -138,10 +136,7 @@ def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
     small = {**SMALL, "supersample": 1, "movers": "one"}
     known = [make_scene("tower", {**small, "motion_seed": seed}) for seed in range(24)]
     assert all(len(scene.world.moving_bodies) == 1 for scene in known)
-    people = [
-        len(scene.world.moving_bodies[0].parts) != len(known[0].world.moving_bodies[0].parts)
-        for scene in known
-    ]
+    people = [len(scene.world.moving_bodies[0].parts) != len(known[0].world.moving_bodies[0].parts) for scene in known]
     assert 6 <= sum(people) <= 18
     both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.moving_bodies[0]
     like = [body for body in both.world.moving_bodies if len(body.parts) == len(alone.parts)]
@@ -155,9 +150,7 @@ def test_a_person_alone_in_the_tower_walks_on_any_of_four_sides_clear_of_all_tha
     for seed in range(24):
         scene = make_scene("tower", {**SMALL, "supersample": 1, "movers": "person", "motion_seed": seed})
         (person,) = scene.world.moving_bodies
-        path = np.stack(
-            [person.matrices(t)[:, :3, 3].mean(axis=0) for t in np.linspace(0, scene.period_s, 25)]
-        )
+        path = np.stack([person.matrices(t)[:, :3, 3].mean(axis=0) for t in np.linspace(0, scene.period_s, 25)])
         angle = np.rad2deg(np.arctan2(*path[:, 1::-1].T))
         side = round(float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle)).mean())) / 90.0)) % 4
         sides.add(side)

@@ -31,9 +31,7 @@ def signed_distance(shape: object) -> Callable[[Array], Array]:
     if isinstance(shape, Box):
         return lambda p: _box(np.abs(p) - np.array(shape.half)[:, None])
     if isinstance(shape, Cylinder):
-        return lambda p: _box(
-            np.stack([np.hypot(p[0], p[1]) - shape.radius, np.abs(p[2]) - shape.half_height])
-        )
+        return lambda p: _box(np.stack([np.hypot(p[0], p[1]) - shape.radius, np.abs(p[2]) - shape.half_height]))
     if isinstance(shape, RoundCone):
         return lambda p: _round_cone(shape, p)
     raise TypeError(shape)

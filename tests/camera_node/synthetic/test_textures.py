@@ -43,9 +43,7 @@ def test_checker_alternates():
     assert not np.allclose(colors[:, 0], colors[:, 1])
 
 
-@pytest.mark.parametrize(
-    "texture", [tx.Checker(RED, BLUE, 0.5, soft=0.05), tx.Stripes(RED, BLUE, 0.5, soft=0.05)]
-)
+@pytest.mark.parametrize("texture", [tx.Checker(RED, BLUE, 0.5, soft=0.05), tx.Stripes(RED, BLUE, 0.5, soft=0.05)])
 def test_edges_are_as_soft_as_asked(texture):
     """No step between neighbors is steeper than a smoothstep of that width (slope 1.5 / width)."""
     u = np.linspace(-2, 2, 8001)

@@ -11,9 +11,13 @@ from channel_emu.virtual.simulate import OUTCOMES, simulate
 
 
 def write_trace(
-    path: Path, section: dict, seed: int = 1, cameras: int = 2, seconds: float = 120.0,
+    path: Path,
+    section: dict,
+    seed: int = 1,
+    cameras: int = 2,
+    seconds: float = 120.0,
     frame_period_ms: float | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """A trace of frames made by the arrivals (or periodic ones that the arrivals sample)."""
     config = channel_from_mapping(section)
     names = [f"cam{i:02d}" for i in range(cameras)]

@@ -35,8 +35,14 @@ GILBERT = {
 }
 GILBERT_TRUE = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500, "mean_1_ms": 20.0, "mean_2_ms": 120.0}
 # The thesis's chapter 6, where a state lasts no longer than a frame's gap.
-CH6_TRUE = {"mu1_per_ms": 1 / 30, "mu2_per_ms": 1 / 30, "mean_1_ms": 30.0, "mean_2_ms": 60.0,
-            "rate_1_per_ms": 1 / 120, "rate_2_per_ms": 1 / 30}  # fmt: skip
+CH6_TRUE = {
+    "mu1_per_ms": 1 / 30,
+    "mu2_per_ms": 1 / 30,
+    "mean_1_ms": 30.0,
+    "mean_2_ms": 60.0,
+    "rate_1_per_ms": 1 / 120,
+    "rate_2_per_ms": 1 / 30,
+}
 SLOW_TRUE = {**CH6_TRUE, "mu1_per_ms": 1 / 3000, "mu2_per_ms": 1 / 3000}
 
 
@@ -82,8 +88,7 @@ def test_recovers_the_thesis_channel_from_delays_and_arrivals(
 @pytest.mark.slow  # 5 s
 def test_recovers_rates_from_frames_that_arrivals_sampled(tmp_path: Path) -> None:
     """As on a live link: cameras offer every 33 ms, the arrivals take the newest frame or none."""
-    path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6-slow"}, 4, cameras=2, seconds=120,
-                       frame_period_ms=33.3)  # fmt: skip
+    path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6-slow"}, 4, cameras=2, seconds=120, frame_period_ms=33.3)
     found = fit(path)
     assert found.recording.sampled
     check(found, SLOW_TRUE)
@@ -120,12 +125,16 @@ def test_recorded_states_are_not_used(tmp_path: Path) -> None:
     assert fit(path).parameters == fit(blind).parameters
 
 
-@pytest.mark.parametrize("section", [
-    {"preset": "ch5"},
-    {"preset": "ch6-high"},
-    {"preset": "ch6-low"},
-    {"preset": "ch5", "service": {"law": "gamma", "mean_ms": 60.0, "shape": 2.0}},
-], ids=["ch5", "ch6-high", "ch6-low", "gamma"])  # fmt: skip
+@pytest.mark.parametrize(
+    "section",
+    [
+        {"preset": "ch5"},
+        {"preset": "ch6-high"},
+        {"preset": "ch6-low"},
+        {"preset": "ch5", "service": {"law": "gamma", "mean_ms": 60.0, "shape": 2.0}},
+    ],
+    ids=["ch5", "ch6-high", "ch6-low", "gamma"],
+)
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), 3])
 def test_one_state_is_not_made_two(tmp_path: Path, section: dict, seed: int) -> None:
     found = fit(write_trace(tmp_path / "t.jsonl", section, seed, cameras=2, seconds=45))
@@ -165,9 +174,12 @@ def test_rows_of_any_link_give_the_same_channel(tmp_path: Path) -> None:
 
 
 def test_losses_and_their_runs(tmp_path: Path) -> None:
-    section = {"arrivals": {"process": "periodic", "period_ms": 10.0}, "discipline": "parallel",
-               "service": {"law": "exponential", "mean_ms": 5.0},
-               "faults": {"loss": {"probability": 0.2}}}  # fmt: skip
+    section = {
+        "arrivals": {"process": "periodic", "period_ms": 10.0},
+        "discipline": "parallel",
+        "service": {"law": "exponential", "mean_ms": 5.0},
+        "faults": {"loss": {"probability": 0.2}},
+    }
     found = fit(write_trace(tmp_path / "t.jsonl", section, 8, cameras=2, seconds=60))
     low, high = found.bursts["lost_share"].interval or (0, 0)
     assert low < 0.2 < high and high - low < 0.04
@@ -326,9 +338,7 @@ def test_the_maximum_is_flat_and_higher_than_all_around_it(tmp_path: Path) -> No
 
 
 def test_timelines_count_who_is_waiting(tmp_path: Path) -> None:
-    path = write_trace(
-        tmp_path / "t.jsonl", {"preset": "ch6"}, 1, cameras=3, seconds=20, frame_period_ms=33.0
-    )
+    path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6"}, 1, cameras=3, seconds=20, frame_period_ms=33.0)
     recording = recordings.read_recording(path)
     (line,) = recordings.timelines(recording, True, True)
     assert line.waiting.min() >= 0 and line.waiting[line.span_ms > 0].max() == 3
@@ -338,9 +348,7 @@ def test_timelines_count_who_is_waiting(tmp_path: Path) -> None:
     assert len(recordings.timelines(recording, False, True)) == 3
 
 
-@pytest.mark.parametrize(
-    "seed", [*range(6), *(pytest.param(s, marks=pytest.mark.slow) for s in range(6, 40))]
-)
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(s, marks=pytest.mark.slow) for s in range(6, 40))])
 def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: int) -> None:
     """Frames in one instant or in bursts, delays over sixteen decades, of two values, or of none; nine in ten
     lost. Nothing overflows on the way, and what comes out is a channel."""
@@ -354,8 +362,10 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
         rng.exponential(50, n) * 1e-7,
     )[seed % 4]
     lost = rng.random(n) < (0.0, 0.3, 0.9)[seed // 3 % 3]
-    rows = [f"{float(o)!r},{'' if gone else repr(float(o + d))},c{i % 2}\n"
-            for i, (o, d, gone) in enumerate(zip(np.cumsum(gaps), delays, lost))]  # fmt: skip
+    rows = [
+        f"{float(o)!r},{'' if gone else repr(float(o + d))},c{i % 2}\n"
+        for i, (o, d, gone) in enumerate(zip(np.cumsum(gaps), delays, lost))
+    ]
     path = tmp_path / "rows.csv"
     path.write_text("".join(rows))
     discipline = FITTED_DISCIPLINES[seed % 4]
@@ -376,12 +386,7 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
 def test_faults_leave_the_estimates_alone(tmp_path: Path) -> None:
     """Frames lost, doubled, damaged and cut off by resets, on a link whose arrivals sample frames."""
     chance = {"probability": 0.1}
-    faults = {
-        "loss": chance,
-        "duplication": chance,
-        "corruption": chance,
-        "reset": {"mean_interval_ms": 4000.0},
-    }
+    faults = {"loss": chance, "duplication": chance, "corruption": chance, "reset": {"mean_interval_ms": 4000.0}}
     section = {"preset": "ch6-slow", "faults": faults}
     found = fit(write_trace(tmp_path / "t.jsonl", section, 6, cameras=2, seconds=120, frame_period_ms=33.3))
     check(found, SLOW_TRUE)
@@ -404,8 +409,14 @@ def test_a_live_recording_is_fitted_to_the_channel_that_made_it(tmp_path: Path) 
     asyncio.run(live())
     found = fit(tmp_path / "t.jsonl")
     assert found.states == 2 and found.recording.sampled
-    true = {"mu1_per_ms": 1 / 400, "mu2_per_ms": 1 / 400, "mean_1_ms": 5.0, "mean_2_ms": 10.0,
-            "rate_1_per_ms": 1 / 20, "rate_2_per_ms": 1 / 5}  # fmt: skip
+    true = {
+        "mu1_per_ms": 1 / 400,
+        "mu2_per_ms": 1 / 400,
+        "mean_1_ms": 5.0,
+        "mean_2_ms": 10.0,
+        "rate_1_per_ms": 1 / 20,
+        "rate_2_per_ms": 1 / 5,
+    }
     for name, value in true.items():
         # Offers fall as the machine lets them, so this is no fixed sample: four standard deviations.
         assert holds(found.parameters[name], value, 2.0), (name, found.parameters[name])

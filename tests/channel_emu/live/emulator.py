@@ -81,11 +81,7 @@ class Edge:
         self._ledger = Ledger(self._out, "edge", "edge", clock.now_ns())
         self._clock = clock
         self.ingest = Ingest(
-            clock,
-            FrameBuffer(training),
-            self._held_out,
-            self._ledger,
-            lambda f: self.truth.append((f, clock.now_ns())),
+            clock, FrameBuffer(training), self._held_out, self._ledger, lambda f: self.truth.append((f, clock.now_ns()))
         )
         self._server = self._transport.aio_server()
         self.ingest.add_to_server(self._server)

@@ -95,8 +95,20 @@ def test_the_command_says_so_and_exits_1(tmp_path: Path) -> None:
 
     async def live() -> None:
         edge = await Peer().start()
-        words = ["-m", "channel_emu.cli", "run", str(scenario), "--listen", f"127.0.0.1:{port}", "--to",
-                 edge.address, "--out", str(out), "--trace", str(FULL)]  # fmt: skip
+        words = [
+            "-m",
+            "channel_emu.cli",
+            "run",
+            str(scenario),
+            "--listen",
+            f"127.0.0.1:{port}",
+            "--to",
+            edge.address,
+            "--out",
+            str(out),
+            "--trace",
+            str(FULL),
+        ]
         process = await asyncio.create_subprocess_exec(sys.executable, *words, stderr=asyncio.subprocess.PIPE)
         camera = Camera("cam00", port, Transport(), False, Ledger(tmp_path, "node", "n", 1))
         try:
@@ -180,9 +192,7 @@ def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -
     run(live())
 
 
-def test_without_an_edge_they_are_let_in_a_moment_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 0.2)
 
     async def live() -> None:

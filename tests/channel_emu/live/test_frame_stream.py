@@ -53,7 +53,7 @@ SECTIONS = {
     "newest waits, one line": {**SHARED, "discipline": "newest-waits", "server": {"shared": True}},
     "fcfs, one line": {**SHARED, "discipline": "fcfs", "server": {"shared": True}},
     "preempt, one line": {**SHARED, "discipline": "lcfs-preempt", "server": {"shared": True}},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS.keys())
@@ -263,9 +263,7 @@ def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path:
     run(live())
 
 
-def test_what_is_inside_the_links_is_bounded_in_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 20_000)
 
     async def live() -> None:

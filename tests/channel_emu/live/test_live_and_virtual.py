@@ -30,18 +30,14 @@ async def record(out: Path, section: dict, period_s: float, frames: int, **optio
 
 def late_ms(records: list[Record]) -> np.ndarray:
     """The emulator's delay error, frame by frame."""
-    return np.array(
-        [(r.actual_ns - r.ended_ns) / 1e6 for r in records if r.actual_ns is not None and r.ended_ns]
-    )
+    return np.array([(r.actual_ns - r.ended_ns) / 1e6 for r in records if r.actual_ns is not None and r.ended_ns])
 
 
 # Losses by state, and a line that lets 20 packets go every 4 ms.
 LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "mahimahi": [4] * 20}}
 
 
-@pytest.mark.parametrize(
-    "section", [FAST, CHAPTER_5, PARALLEL, LOSSY], ids=["ch6", "ch5", "parallel", "lossy"]
-)
+@pytest.mark.parametrize("section", [FAST, CHAPTER_5, PARALLEL, LOSSY], ids=["ch6", "ch5", "parallel", "lossy"])
 def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path, section: dict) -> None:
     """The trace's offers in virtual time deliver each frame when it is due, live a moment later: the age is
     greater by that moment, weighted by what the frame was worth."""

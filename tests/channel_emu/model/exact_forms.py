@@ -65,9 +65,7 @@ def mg1_preemptive(lam: float, shape: float, mean: float) -> float:
     return (1 + lam * mean / shape) ** shape / lam
 
 
-def dg1_drop_new(
-    period: float, mean: float, survival: Callable[[np.ndarray], np.ndarray]
-) -> tuple[float, float]:
+def dg1_drop_new(period: float, mean: float, survival: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
     """Mean and peak age; survival(t) = P(S > t) of an array. E[K], E[K²] are sums of P(K > k) = P(S > kC)."""
     above = survival(period * np.arange(2000))
     first, second = above.sum(), ((2 * np.arange(2000) + 1) * above).sum()
@@ -165,9 +163,7 @@ def incorrect_without_delay(lam: float, away: float, back: float) -> float:
     return float(share[1] / (back + lam) + share[3] / (away + lam))
 
 
-def gilbert_elliott(
-    a: float, b: float, loss: tuple[float, float], period: float, delay: float
-) -> tuple[float, float]:
+def gilbert_elliott(a: float, b: float, loss: tuple[float, float], period: float, delay: float) -> tuple[float, float]:
     """Mean and peak age of periodic frames that each take ``delay``, lost with the probability of the state.
 
     N frames from one delivery to the next: with P the chain's change over a period, F = P diag(loss) and

@@ -60,9 +60,7 @@ def two_states(away: float, back: float, seconds: float) -> np.ndarray:
 def test_age_of_incorrect_information_of_poisson_updates(rate: float, away: float, back: float) -> None:
     """They arrive at once, on a source of two states."""
     changes = two_states(away, back, 1500)
-    found = ages.incorrect_age_ms(
-        path(1490, arrivals=f"poisson:{rate}"), changes, np.arange(len(changes) + 1) % 2
-    )
+    found = ages.incorrect_age_ms(path(1490, arrivals=f"poisson:{rate}"), changes, np.arange(len(changes) + 1) % 2)
     assert found == near(exact.incorrect_without_delay(rate, away, back))
     if away == back:
         assert found == near(away / (2 * away + rate) / (away + rate))
@@ -115,9 +113,12 @@ def test_urgency() -> None:
 def test_losses_by_state() -> None:
     """Gilbert and Elliott's channel: the mean age and peak age that bursts of losses leave."""
     section: dict = {
-        "arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel",
-        "chain": "mu1=1/200,mu2=1/70", "faults": {"loss": [0.05, 0.7]},
-    }  # fmt: skip
+        "arrivals": "periodic:30ms",
+        "service": "det:20ms",
+        "discipline": "parallel",
+        "chain": "mu1=1/200,mu2=1/70",
+        "faults": {"loss": [0.05, 0.7]},
+    }
     age, peak = exact.gilbert_elliott(1 / 200, 1 / 70, (0.05, 0.7), 30.0, 20.0)
     assert metric("age", 15_000, **section) == near(age)
     assert metric("peak", 15_000, **section) == near(peak)

@@ -68,9 +68,7 @@ def test_stiff_transition_matrices_keep_their_digits(span_ms: float) -> None:
             values, vectors = mpmath.eig(exact_q)
             decay = mpmath.diag([mpmath.exp(value * mpmath.mpf(span_ms)) for value in values])
             exact = (vectors * decay * vectors**-1).apply(mpmath.re)
-            expected = np.array(
-                [[float(exact[i, j]) for j in range(len(generator))] for i in range(len(generator))]
-            )
+            expected = np.array([[float(exact[i, j]) for j in range(len(generator))] for i in range(len(generator))])
         np.testing.assert_allclose(transition_matrix(generator, span_ms), expected, rtol=1e-10, atol=1e-30)
 
 
@@ -185,7 +183,5 @@ def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
     for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
         chain = Chain(np.array(generator), CounterRng(9, "", "channel.chain"), None, slot_ms)
         key = np.array(CounterRng(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(
-            chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11
-        )
+        starts, states = kernel.chain_path(chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11)
         assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

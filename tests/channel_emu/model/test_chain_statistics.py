@@ -34,9 +34,7 @@ def draw(generator: np.ndarray, sojourns: int, slot_ms: float | None = None) -> 
     chain = Chain(generator, CounterRng(1, "", "channel.chain"), None, slot_ms)
     rate = -stationary(generator) @ np.diag(generator)
     key = np.array(CounterRng(1, "", "channel.chain").key, np.uint64)
-    return chain_path(
-        chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS)
-    )
+    return chain_path(chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS))
 
 
 def at_multiples(path: Path, span_ms: float) -> np.ndarray:
@@ -94,12 +92,10 @@ CHECKS: list[tuple[str, Callable[..., bool], np.ndarray, np.ndarray, int]] = [
     ("sojourns in two states", sojourns, TWO, one_rate_off(TWO, 0, 1), 1_000_000),
     ("sojourns in three states", sojourns, THREE, OFF * THREE, 1_500_000),
     ("autocorrelation", autocorrelation, EVEN, OFF * EVEN, 1_500_000),
-]  # fmt: skip
+]
 
 
-@pytest.mark.parametrize(
-    ("check", "generator", "off", "count"), [c[1:] for c in CHECKS], ids=[c[0] for c in CHECKS]
-)
+@pytest.mark.parametrize(("check", "generator", "off", "count"), [c[1:] for c in CHECKS], ids=[c[0] for c in CHECKS])
 def test_chain_in_continuous_time(
     check: Callable[..., bool], generator: np.ndarray, off: np.ndarray, count: int
 ) -> None:

@@ -59,22 +59,30 @@ CASES = [
     ("M/M/1/2", poisson(0.7), exponential(1.0), "fcfs", exact.mm12(0.7, 1.0), {"queue_limit": 1}),
     ("M/G/1 blocking", poisson(1.0), gamma(1.0, 2.0), "drop-new", exact.mg1_blocking(1.0, 1.0, 1.5)),
     ("M/G/1 preemptive", poisson(1.0), gamma(1.0, 2.0), "lcfs-preempt", exact.mg1_preemptive(1.0, 2.0, 1.0)),
-    ("D/G/1/0 gamma", periodic(1.0), gamma(1.5, 2.0), "drop-new",
-     exact.dg1_drop_new(1.0, 1.5, stats.gamma(2.0, scale=0.75).sf)[0]),
-    ("D/G/1/0 lognormal", periodic(1.0), {"law": "lognormal", "mean_ms": 1.5, "sigma": 0.8}, "drop-new",
-     exact.dg1_drop_new(1.0, 1.5, stats.lognorm(0.8, scale=1.5 * math.exp(-0.32)).sf)[0]),
+    (
+        "D/G/1/0 gamma",
+        periodic(1.0),
+        gamma(1.5, 2.0),
+        "drop-new",
+        exact.dg1_drop_new(1.0, 1.5, stats.gamma(2.0, scale=0.75).sf)[0],
+    ),
+    (
+        "D/G/1/0 lognormal",
+        periodic(1.0),
+        {"law": "lognormal", "mean_ms": 1.5, "sigma": 0.8},
+        "drop-new",
+        exact.dg1_drop_new(1.0, 1.5, stats.lognorm(0.8, scale=1.5 * math.exp(-0.32)).sf)[0],
+    ),
     ("M/M/1 newest waits", poisson(1.0), exponential(1.0), "newest-waits", exact.mm1_newest_waits(1.0, 1.0)),
-    ("M/M/1 newest waits, busy", poisson(4.0), exponential(1.0), "newest-waits",
-     exact.mm1_newest_waits(4.0, 1.0)),
+    ("M/M/1 newest waits, busy", poisson(4.0), exponential(1.0), "newest-waits", exact.mm1_newest_waits(4.0, 1.0)),
     ("M/M/1 preemptive", poisson(1.0), exponential(1.0), "lcfs-preempt", exact.mm1_preemptive(1.0, 1.0)),
     ("M/D/1 preemptive", poisson(1.0), deterministic(1.0), "lcfs-preempt", exact.md1_preemptive(1.0, 1.0)),
     ("D/M/1 drop-new, C=.5", periodic(0.5), exponential(1.0), "drop-new", exact.dm1_drop_new(0.5, 1.0)),
     ("D/M/1 drop-new, C=1", periodic(1.0), exponential(1.0), "drop-new", exact.dm1_drop_new(1.0, 1.0)),
     ("D/M/1 drop-new, C=2", periodic(2.0), exponential(1.0), "drop-new", exact.dm1_drop_new(2.0, 1.0)),
-    ("D/M/1 drop-new, thesis", periodic(30.0), exponential(60.0), "drop-new",
-     exact.dm1_drop_new(30.0, 1 / 60)),
+    ("D/M/1 drop-new, thesis", periodic(30.0), exponential(60.0), "drop-new", exact.dm1_drop_new(30.0, 1 / 60)),
     ("D/M/inf, thesis", periodic(30.0), exponential(60.0), "parallel", exact.dm1_parallel(30.0, 1 / 60)),
-]  # fmt: skip
+]
 
 
 def seconds_for(arrivals: dict) -> float:
@@ -127,9 +135,13 @@ def test_drop_new_with_constant_delay_is_exact() -> None:
 def test_modulated_service(a: float, b: float, good: float, bad: float, period: float) -> None:
     chain = {"mu1_per_ms": a, "mu2_per_ms": b}
     age = mean_age(
-        periodic(period), exponential([1 / good, 1 / bad]), "drop-new", 1000 * period, chain=chain,
+        periodic(period),
+        exponential([1 / good, 1 / bad]),
+        "drop-new",
+        1000 * period,
+        chain=chain,
         service_state="modulated",
-    )  # fmt: skip
+    )
     theory = exact.modulated_drop_new(a, b, good, bad, period)
     assert age == pytest.approx(theory, rel=TOLERANCE)
     # The package's own form, for any number of states and without scipy, is the same.
@@ -185,10 +197,15 @@ def _unequal(discipline: str, rates: tuple[float, float]) -> list[float]:
     """Mean ages of two sources of these rates. Cameras of one channel share their rate, so the first source
     is two of five cameras and the second three: what several cameras deliver is one source's deliveries."""
     each = rates[0] / 2
-    config = channel_from_mapping({
-        "arrivals": poisson(each), "service": exponential(1.0), "discipline": discipline,
-        "server": {"shared": True}, "queue_limit": 10**6,
-    })  # fmt: skip
+    config = channel_from_mapping(
+        {
+            "arrivals": poisson(each),
+            "service": exponential(1.0),
+            "discipline": discipline,
+            "server": {"shared": True},
+            "queue_limit": 10**6,
+        }
+    )
     runs = simulate(config, 5, 3000, seed=5, engine="kernel").runs
     merged = []
     for group in (runs[:2], runs[2:]):
@@ -210,13 +227,10 @@ def test_many_cameras_share_a_server(discipline: str) -> None:
         "drop-new": exact.shared_mg1_blocking(lam, 17 * lam, 1.0, 2.0),
         "fcfs": exact.shared_mm1_fcfs(lam, 17 * lam, 1.0),
     }[discipline]
-    config = channel_from_mapping({
-        "arrivals": poisson(lam), "service": exponential(1.0), "discipline": discipline,
-        "server": {"shared": True},
-    })  # fmt: skip
-    assert simulate(config, 18, 4000, seed=3, engine="kernel").mean_age_ms() == pytest.approx(
-        expected, rel=TOLERANCE
+    config = channel_from_mapping(
+        {"arrivals": poisson(lam), "service": exponential(1.0), "discipline": discipline, "server": {"shared": True}}
     )
+    assert simulate(config, 18, 4000, seed=3, engine="kernel").mean_age_ms() == pytest.approx(expected, rel=TOLERANCE)
 
 
 def test_slotted_age_differs_by_what_theory_says() -> None:

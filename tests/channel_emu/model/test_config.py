@@ -90,10 +90,7 @@ def test_keys_beside_a_preset_override_it() -> None:
         ("{queue_limit: 0}", "queue_limit: expected 1"),
         ("{queue_limit: 1.5}", "queue_limit: expected a whole number"),
         ("{faults: {rain: {}}}", "channel.faults.rain: unknown fault; expected one of loss"),
-        (
-            "{faults: {loss: [0.1, 0.2]}}",
-            "channel: faults.loss.probability: expected one number or one a state",
-        ),
+        ("{faults: {loss: [0.1, 0.2]}}", "channel: faults.loss.probability: expected one number or one a state"),
         ("{preset: ch6, faults: {loss: [0.1, 2]}}", "probability: expected a probability"),
         ("{faults: {mahimahi: [3, 1]}}", "channel.faults.mahimahi: opportunities_ms: expected ascending"),
         ("{preset: 'mahimahi:/no/such'}", "/no/such: cannot be read"),
@@ -122,21 +119,22 @@ def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) 
     [
         ("{arrivals: 'periodic:30ms'}", "{arrivals: {process: periodic, period_ms: 30}}"),
         ("{preset: ch5, arrivals: periodic}", "{preset: ch5}"),
-        ("{arrivals: mmpp, chain: 'mu1=1/30,mu2=1/30'}",
-         "{preset: ch6, service: none, discipline: drop-new, chain: {states: []}}"),
-        ("{preset: ch5, service: 'gamma:5ms:2'}",
-         "{preset: ch5, service: {law: gamma, mean_ms: 5, shape: 2}}"),
+        (
+            "{arrivals: mmpp, chain: 'mu1=1/30,mu2=1/30'}",
+            "{preset: ch6, service: none, discipline: drop-new, chain: {states: []}}",
+        ),
+        ("{preset: ch5, service: 'gamma:5ms:2'}", "{preset: ch5, service: {law: gamma, mean_ms: 5, shape: 2}}"),
         ("{preset: ch6, service: 'exp:30ms,exp:60ms', discipline: newest-waits}", "{preset: ch6}"),
         ("{service: 'trace:delays.csv'}", "{service: {law: trace, delays_ms: [1.5, 20, 3]}}"),
-        ("{faults: {loss: 0.2, reset: 5000}}",
-         "{faults: {loss: {probability: 0.2}, reset: {mean_interval_ms: 5000}}}"),
+        ("{faults: {loss: 0.2, reset: 5000}}", "{faults: {loss: {probability: 0.2}, reset: {mean_interval_ms: 5000}}}"),
         ("{preset: ch6, faults: {loss: [0, 0.4]}}", "{preset: ch6, faults: {loss: {probability: [0, 0.4]}}}"),
-        ("{preset: gilbert-elliott, faults: {corruption: 0.1}}",
-         "{preset: gilbert-elliott, faults: {loss: [0.01, 0.5], corruption: {probability: 0.1}}}"),
-        ("{preset: 'mahimahi:a.trace'}",
-         "{discipline: fcfs, faults: {mahimahi: {opportunities_ms: [0, 2, 2, 10]}}}"),
+        (
+            "{preset: gilbert-elliott, faults: {corruption: 0.1}}",
+            "{preset: gilbert-elliott, faults: {loss: [0.01, 0.5], corruption: {probability: 0.1}}}",
+        ),
+        ("{preset: 'mahimahi:a.trace'}", "{discipline: fcfs, faults: {mahimahi: {opportunities_ms: [0, 2, 2, 10]}}}"),
     ],
-)  # fmt: skip
+)
 def test_short_spellings_stand_for_sections(tmp_path: Path, short: str, long: str) -> None:
     """Files are relative to the given folder; the preset's name alone may differ."""
     (tmp_path / "delays.csv").write_text("# a link\ntime_s,delay_us\n0.1,1500\n0.2,20000\n0.3,3000\n")
@@ -149,11 +147,12 @@ def test_a_profile_of_errant(tmp_path: Path) -> None:
     """Half the round trip each way, and as many packets of 1500 bytes as the upload has."""
     head = "operator,country,rat,signal_quality,download_kbps,upload_kbps,latency_ms_avg,latency_ms_stdev\n"
     (tmp_path / "p.csv").write_text(
-        head + "one,here,4G,good,9000,2400,80,20\none,here,3G,bad,900,130,200,50\n"
-        "one,here,3G,endless,900,1e9,200,50\n"
+        head + "one,here,4G,good,9000,2400,80,20\none,here,3G,bad,900,130,200,50\none,here,3G,endless,900,1e9,200,50\n"
     )
-    good, bad = [channel_from_mapping({"preset": f"errant:p.csv:one/here/{name}"}, "t", tmp_path)
-                 for name in ("4g/good", "3G/bad")]  # fmt: skip
+    good, bad = [
+        channel_from_mapping({"preset": f"errant:p.csv:one/here/{name}"}, "t", tmp_path)
+        for name in ("4g/good", "3G/bad")
+    ]
     assert (good.service.law, good.service.mean_ms, good.service.shape) == ("gamma", 40.0, 16.0)
     for config, kbps in ((good, 2400), (bad, 130)):
         times_ms = config.faults["mahimahi"].opportunities_ms

@@ -85,12 +85,7 @@ def test_bandwidth_adds_the_time_of_the_bytes() -> None:
 
 
 def test_losses_follow_the_state_in_which_transmission_starts() -> None:
-    section = {
-        "preset": "ch6",
-        "arrivals": "as-offered",
-        "discipline": "parallel",
-        "faults": {"loss": [0.1, 0.6]},
-    }
+    section = {"preset": "ch6", "arrivals": "as-offered", "discipline": "parallel", "faults": {"loss": [0.1, 0.6]}}
     transits = offer_many(Channel(channel_from_mapping(section), 3).link("a"), 6000)
     for state, chance in ((0, 0.1), (1, 0.6)):
         lost = [t.outcome is EventKind.LOST for t in transits if t.state == state]
@@ -103,15 +98,7 @@ def test_packets_leave_at_recorded_instants() -> None:
     section = {"discipline": "fcfs", "faults": {"mahimahi": [2, 2, 5, 10]}}
     subject = Channel(channel_from_mapping(section), 1).link("a")
     # When it is offered, its bytes, when it leaves.
-    frames = [
-        (0, 1500, 2),
-        (0, 1501, 5),
-        (6, 0, 10),
-        (10, 3000, 12),
-        (12, 10, 15),
-        (20, 1, 20),
-        (40, 3000, 42),
-    ]
+    frames = [(0, 1500, 2), (0, 1501, 5), (6, 0, 10), (10, 3000, 12), (12, 10, 15), (20, 1, 20), (40, 3000, 42)]
     transits = [subject.offer(at * MS, None, size)[0] for at, size, _ in frames]
     subject.advance(100 * MS)
     assert [t.due_ns for t in transits] == [at * MS for *_, at in frames]

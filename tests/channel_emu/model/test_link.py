@@ -33,36 +33,55 @@ def play(subject: Link, offers_ms: list[float], until_ms: float = 1000) -> list[
 
 def test_drop_new_discards_while_busy_and_takes_the_frame_of_the_boundary() -> None:
     assert play(link("drop-new", [10, 5, 5, 5]), [0, 4, 10, 30]) == [
-        ("started", 0, 0), ("dropped_busy", 4, 1), ("delivered", 10, 0),
-        ("started", 10, 2), ("delivered", 15, 2), ("started", 30, 3), ("delivered", 35, 3),
-    ]  # fmt: skip
+        ("started", 0, 0),
+        ("dropped_busy", 4, 1),
+        ("delivered", 10, 0),
+        ("started", 10, 2),
+        ("delivered", 15, 2),
+        ("started", 30, 3),
+        ("delivered", 35, 3),
+    ]
 
 
 def test_newest_waits_keeps_one_and_the_newest() -> None:
     assert play(link("newest-waits", [10, 5, 7, 5]), [0, 2, 4]) == [
-        ("started", 0, 0), ("superseded", 4, 1), ("delivered", 10, 0),
-        ("started", 10, 2), ("delivered", 17, 2),
-    ]  # fmt: skip
+        ("started", 0, 0),
+        ("superseded", 4, 1),
+        ("delivered", 10, 0),
+        ("started", 10, 2),
+        ("delivered", 17, 2),
+    ]
 
 
 def test_fcfs_serves_all_in_order_up_to_its_limit() -> None:
     assert play(link("fcfs", [10, 5, 7, 5], queue_limit=2), [0, 1, 2, 3]) == [
-        ("started", 0, 0), ("dropped_busy", 3, 3), ("delivered", 10, 0), ("started", 10, 1),
-        ("delivered", 15, 1), ("started", 15, 2), ("delivered", 22, 2),
-    ]  # fmt: skip
+        ("started", 0, 0),
+        ("dropped_busy", 3, 3),
+        ("delivered", 10, 0),
+        ("started", 10, 1),
+        ("delivered", 15, 1),
+        ("started", 15, 2),
+        ("delivered", 22, 2),
+    ]
 
 
 def test_lcfs_preempts_the_frame_in_service() -> None:
     assert play(link("lcfs-preempt", [10, 5]), [0, 2]) == [
-        ("started", 0, 0), ("superseded", 2, 0), ("started", 2, 1), ("delivered", 7, 1),
-    ]  # fmt: skip
+        ("started", 0, 0),
+        ("superseded", 2, 0),
+        ("started", 2, 1),
+        ("delivered", 7, 1),
+    ]
 
 
 def test_parallel_frames_overtake() -> None:
     assert play(link("parallel", [10, 5], queue_limit=2), [0, 2, 3]) == [
-        ("started", 0, 0), ("started", 2, 1), ("dropped_busy", 3, 2), ("delivered", 7, 1),
+        ("started", 0, 0),
+        ("started", 2, 1),
+        ("dropped_busy", 3, 2),
+        ("delivered", 7, 1),
         ("delivered", 10, 0),
-    ]  # fmt: skip
+    ]
 
 
 def test_a_fault_that_delays_nothing_leaves_the_delay_to_the_nanosecond() -> None:
@@ -159,12 +178,19 @@ def stories(draw: st.DrawFn, faults: bool = True) -> Story:
     if draw(st.booleans()):
         section["arrivals"] = {"process": "poisson", "rate_per_ms": draw(st.sampled_from([1e-9, 0.2, 1e9]))}
     if faults:
-        section["faults"] = draw(st.fixed_dictionaries({}, optional={
-            "loss": st.just({"probability": 0.3}), "duplication": st.just({"probability": 0.3}),
-            "corruption": st.just({"probability": 0.5}), "reset": st.just({"mean_interval_ms": 40.0}),
-            "blackout": st.just({"every_ms": 20.0, "for_ms": 3.0}),
-            "bandwidth": st.just({"megabits_per_s": 8.0}),
-        }))  # fmt: skip
+        section["faults"] = draw(
+            st.fixed_dictionaries(
+                {},
+                optional={
+                    "loss": st.just({"probability": 0.3}),
+                    "duplication": st.just({"probability": 0.3}),
+                    "corruption": st.just({"probability": 0.5}),
+                    "reset": st.just({"mean_interval_ms": 40.0}),
+                    "blackout": st.just({"every_ms": 20.0, "for_ms": 3.0}),
+                    "bandwidth": st.just({"megabits_per_s": 8.0}),
+                },
+            )
+        )
     gaps = draw(st.lists(st.sampled_from([0, 1, MS, 5 * MS, 33 * MS, 400 * MS]), min_size=1, max_size=40))
     offers = [sum(gaps[: i + 1]) for i in range(len(gaps))]
     looks = draw(st.lists(st.integers(0, offers[-1] + 100 * MS), max_size=8))
@@ -191,9 +217,7 @@ def tell(story: Story) -> tuple[list, list[Event]]:
 def test_every_frame_ends_exactly_once(story: Story) -> None:
     transits, events = tell(story)
     subject = story.subject
-    ends = Counter(
-        e.transit.number for e in events if e.kind not in (EventKind.STARTED, EventKind.DUPLICATED)
-    )
+    ends = Counter(e.transit.number for e in events if e.kind not in (EventKind.STARTED, EventKind.DUPLICATED))
     assert max(ends.values(), default=0) <= 1
     assert len(transits) == sum(ends.values()) + subject.in_flight == subject.offered
     assert {t.number for t in subject.pending()} == {t.number for t in transits} - set(ends)

@@ -19,8 +19,12 @@ MS = 10**6
 
 
 def shared(discipline: str, delays_ms: list[float], **more: object) -> dict[str, Link]:
-    section = {"service": {"law": "trace", "delays_ms": delays_ms}, "discipline": discipline,
-               "server": {"shared": True}, **more}  # fmt: skip
+    section = {
+        "service": {"law": "trace", "delays_ms": delays_ms},
+        "discipline": discipline,
+        "server": {"shared": True},
+        **more,
+    }
     channel = Channel(channel_from_mapping(section), 0)
     return {camera: channel.link(camera) for camera in "cab"}  # joined in any order
 
@@ -50,8 +54,14 @@ def started(lines: list[str]) -> list[str]:
 
 def test_drop_new_discards_whoever_finds_the_line_busy() -> None:
     lines = play(shared("drop-new", [10]), [("a", 0), ("b", 4), ("a", 5), ("b", 10)])
-    assert lines == ["a0 started 0", "b0 dropped_busy 4", "a1 dropped_busy 5", "a0 delivered 10",
-                     "b1 started 10", "b1 delivered 20"]  # fmt: skip
+    assert lines == [
+        "a0 started 0",
+        "b0 dropped_busy 4",
+        "a1 dropped_busy 5",
+        "a0 delivered 10",
+        "b1 started 10",
+        "b1 delivered 20",
+    ]
 
 
 def test_a_new_frame_of_any_camera_preempts() -> None:
@@ -139,9 +149,14 @@ def test_kernel_and_link_decide_alike(section: dict) -> None:
         ({"chain": {"scope": "per-camera"}, "service_state": "modulated"}, 33.0),
         ({"arrivals": {"process": "periodic", "period_ms": 30.0, "spread": True}}, None),
         ({"service": {"mean_ms": [1e300, 0.0]}}, None),  # stuck, or through at once
-        ({"arrivals": {"process": "periodic", "period_ms": 30.0}, "service": {"law": "deterministic",
-                                                                             "mean_ms": 10.0}}, None),
-    ):  # fmt: skip
+        (
+            {
+                "arrivals": {"process": "periodic", "period_ms": 30.0},
+                "service": {"law": "deterministic", "mean_ms": 10.0},
+            },
+            None,
+        ),
+    ):
         kernel_and_link({**section, **more}, cameras, 5, period_ms)
 
 
@@ -164,15 +179,15 @@ def test_a_shared_line_for_one_camera_is_a_line_of_its_own(discipline: str) -> N
     st.booleans(),
 )
 def test_every_frame_ends_once_and_looking_changes_nothing(
-    section: dict,
-    delays_ms: list[float],
-    gaps: list[tuple[str, int]],
-    looks: list[tuple[str, int]],
-    faults: bool,
+    section: dict, delays_ms: list[float], gaps: list[tuple[str, int]], looks: list[tuple[str, int]], faults: bool
 ) -> None:
     chance = {"loss": {"probability": 0.3}, "reset": {"mean_interval_ms": 40.0}}
-    section = {"service": {"law": "trace", "delays_ms": delays_ms}, "queue_limit": 3,
-               "faults": chance if faults else {}, **section}  # fmt: skip
+    section = {
+        "service": {"law": "trace", "delays_ms": delays_ms},
+        "queue_limit": 3,
+        "faults": chance if faults else {},
+        **section,
+    }
     fates = []
     for extra in ([], looks):
         channel = Channel(channel_from_mapping(section), 1)

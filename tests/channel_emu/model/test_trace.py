@@ -115,9 +115,7 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
         (1, '"bytes":', '"bytes":1' + "0" * 400, "line 2: bytes: expected a message's size"),
     ],
 )
-def test_damaged_traces_are_refused_with_the_place(
-    tmp_path: Path, line: int, old: str, new: str, why: str
-) -> None:
+def test_damaged_traces_are_refused_with_the_place(tmp_path: Path, line: int, old: str, new: str, why: str) -> None:
     path = tmp_path / "t.jsonl"
     record(path, channel_from_mapping({"preset": "ch5"}), frames=20)
     lines = path.read_text().split("\n")

@@ -65,22 +65,14 @@ def test_commands_print_json(capsys, monkeypatch) -> None:
     monkeypatch.setattr("channel_emu.virtual.benchmark.bench_cost", lambda: [{"what": "x"}])
     assert main(["bench", "--cost", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"what": "x"}]
-    words = [
-        "simulate",
-        "--preset",
-        "ch5",
-        "--discipline",
-        "newest-waits",
-        "--spread",
-        "--cameras",
-        "6",
-        "--json",
-    ]
+    words = ["simulate", "--preset", "ch5", "--discipline", "newest-waits", "--spread", "--cameras", "6", "--json"]
     ages = []
     for more in ([], ["--shared-server"]):
         assert main([*words, "--seconds", "60", *more]) == 0
         ages.append(json.loads(capsys.readouterr().out)["mean_age_ms"])
     assert ages[1] > 2 * ages[0]  # six cameras wait for one line
-    assert main(["simulate", "--preset", "ch6", "--chain", "mu1=1/30,mu2=1/30,slots=5ms", "--seconds", "20",
-                 "--json"]) == 0  # fmt: skip
+    assert (
+        main(["simulate", "--preset", "ch6", "--chain", "mu1=1/30,mu2=1/30,slots=5ms", "--seconds", "20", "--json"])
+        == 0
+    )
     assert sum(json.loads(capsys.readouterr().out)["state_share"].values()) == pytest.approx(1)

@@ -28,27 +28,45 @@ def same(a: LinkRun, b: LinkRun) -> None:
 
 
 CHANNELS = [
-    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow", "swing",
-                              "gilbert-elliott")),
-    *({"preset": "ch6", "discipline": d, "service_state": s}
-      for d in DISCIPLINES for s in ("at-start", "modulated")),
-    *({"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
-      for d in ("fcfs", "parallel")),
-    *({"preset": "ch6", "discipline": "fcfs", "service_state": s,
-       "chain": {"sampled": "slots", "slot_ms": slot_ms, **more}}
-      for s in ("at-start", "modulated") for slot_ms, more in ((1.0, {}), (7.3, {"scope": "per-camera"}))),
+    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow", "swing", "gilbert-elliott")),
+    *({"preset": "ch6", "discipline": d, "service_state": s} for d in DISCIPLINES for s in ("at-start", "modulated")),
+    *(
+        {"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
+        for d in ("fcfs", "parallel")
+    ),
+    *(
+        {
+            "preset": "ch6",
+            "discipline": "fcfs",
+            "service_state": s,
+            "chain": {"sampled": "slots", "slot_ms": slot_ms, **more},
+        }
+        for s in ("at-start", "modulated")
+        for slot_ms, more in ((1.0, {}), (7.3, {"scope": "per-camera"}))
+    ),
     {"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 1e9, "sampled": "slots", "slot_ms": 0.5}},
-    {"preset": "ch6", "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low", "sampled": "slots",
-                                "slot_ms": 2.0}},
+    {
+        "preset": "ch6",
+        "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low", "sampled": "slots", "slot_ms": 2.0},
+    },
     {"preset": "ch5", "arrivals": {"spread": True}},
-    *({"preset": "ch6", "discipline": d, "faults": {"loss": [0.1, 0.6]}, "chain": {"scope": "per-camera"}}
-      for d in ("drop-new", "newest-waits")),
+    *(
+        {"preset": "ch6", "discipline": d, "faults": {"loss": [0.1, 0.6]}, "chain": {"scope": "per-camera"}}
+        for d in ("drop-new", "newest-waits")
+    ),
     {"preset": "ch6", "server": {"shared": True}, "faults": {"loss": 0.3}},
-    *({"preset": "ch6", "service": s} for s in (
-        {"law": "gamma", "mean_ms": [10, 30], "shape": 0.5}, {"law": "gamma", "mean_ms": 30, "shape": 2.5},
-        {"law": "lognormal", "mean_ms": [10, 30], "sigma": 0.5}, {"law": "deterministic", "mean_ms": 10},
-        {"law": "trace", "delays_ms": [1, 200, 33]}, {"law": "exponential", "mean_ms": 0.0})),
-]  # fmt: skip
+    *(
+        {"preset": "ch6", "service": s}
+        for s in (
+            {"law": "gamma", "mean_ms": [10, 30], "shape": 0.5},
+            {"law": "gamma", "mean_ms": 30, "shape": 2.5},
+            {"law": "lognormal", "mean_ms": [10, 30], "sigma": 0.5},
+            {"law": "deterministic", "mean_ms": 10},
+            {"law": "trace", "delays_ms": [1, 200, 33]},
+            {"law": "exponential", "mean_ms": 0.0},
+        )
+    ),
+]
 
 
 @pytest.mark.parametrize("section", CHANNELS, ids=str)
@@ -112,9 +130,7 @@ def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
     assert [t.due_ns or -1 for t in transits] == run.due_ns.tolist()
 
 
-@pytest.mark.parametrize(
-    "section", [{"preset": "ch5"}, {"preset": "ch6", "chain": {"scope": "per-camera"}}], ids=str
-)
+@pytest.mark.parametrize("section", [{"preset": "ch5"}, {"preset": "ch6", "chain": {"scope": "per-camera"}}], ids=str)
 def test_the_number_of_threads_changes_nothing(section: dict) -> None:
     pytest.importorskip("numba")
     config = channel_from_mapping(section)
@@ -154,9 +170,7 @@ def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
         held = buffer.newest()
         assert [held[c].generated_ns if c in held else -1 for c in buffer.cameras] == found[row].tolist()
     assert (found[0] == -1).all() and (found[-1] > 0).all()
-    np.testing.assert_array_equal(
-        result.ages_ms(at), np.where(found < 0, np.nan, (at[:, None] - found) / 1e6)
-    )
+    np.testing.assert_array_equal(result.ages_ms(at), np.where(found < 0, np.nan, (at[:, None] - found) / 1e6))
 
 
 def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,9 +183,13 @@ def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(
     ("more", "why"),
-    [({"cameras": 0}, "cameras"), ({"seconds": 0}, "seconds"), ({"engine": "gpu"}, "engine"),
-     ({"engine": "kernel"}, "python engine only")],
-)  # fmt: skip
+    [
+        ({"cameras": 0}, "cameras"),
+        ({"seconds": 0}, "seconds"),
+        ({"engine": "gpu"}, "engine"),
+        ({"engine": "kernel"}, "python engine only"),
+    ],
+)
 def test_impossible_requests_are_refused(more: dict, why: str) -> None:
     config = channel_from_mapping({"faults": {"duplication": {"probability": 0.5}}})
     with pytest.raises(SimulationError, match=why):

@@ -13,16 +13,24 @@ CHANNELS = 6
 
 
 def save(
-    path: Path, nodes, images: list, output: tuple[str, list | None], constants: dict[str, np.ndarray],
-    weights: tuple[onnx.TensorProto, ...] = (), opset: int = 17, meta: dict[str, str] | None = None,
+    path: Path,
+    nodes,
+    images: list,
+    output: tuple[str, list | None],
+    constants: dict[str, np.ndarray],
+    weights: tuple[onnx.TensorProto, ...] = (),
+    opset: int = 17,
+    meta: dict[str, str] | None = None,
     further: tuple[tuple[str, list], ...] = (),
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a graph from ``images`` (of this shape) to ``output`` (name and shape), and ``further`` ones."""
     graph = helper.make_graph(
-        nodes, path.stem, [helper.make_tensor_value_info("images", TensorProto.FLOAT, images)],
+        nodes,
+        path.stem,
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, images)],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in (output, *further)],
         [*(numpy_helper.from_array(value, name) for name, value in constants.items()), *weights],
-    )  # fmt: skip
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
     helper.set_model_props(model, meta or {})
     path.write_bytes(model.SerializeToString())
@@ -30,10 +38,15 @@ def save(
 
 
 def detector(
-    path: Path, size: int | None = 32, batch: int | None = None, gain: float = 1.0, neck: bool = True,
-    extra: tuple[onnx.NodeProto, ...] = (), weights: tuple[onnx.TensorProto, ...] = (),
+    path: Path,
+    size: int | None = 32,
+    batch: int | None = None,
+    gain: float = 1.0,
+    neck: bool = True,
+    extra: tuple[onnx.NodeProto, ...] = (),
+    weights: tuple[onnx.TensorProto, ...] = (),
     meta: dict[str, str] | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Two convolutions, and where ``neck``, an enlargement that is joined with the finer map.
 
     size, batch: None makes them free. gain: factor on the second map. extra: nodes behind the backbone's
@@ -52,17 +65,18 @@ def detector(
     last = extra[-1].output[0] if extra else "end"
     if neck:
         nodes += [
-            helper.make_node(
-                "Resize", [last, "", "scales"], ["large"], mode="nearest", name="/model.2/Resize"
-            ),
+            helper.make_node("Resize", [last, "", "scales"], ["large"], mode="nearest", name="/model.2/Resize"),
             helper.make_node("Concat", ["large", "fine"], ["joined"], axis=1, name="/model.3/Concat"),
             # A head that cannot run shows that it is not run.
             helper.make_node("Reshape", ["joined", "impossible"], ["output0"], name="/model.4/Reshape"),
         ]
     constants = {
-        "a": first, "b": second, "gain": np.float32(gain), "scales": np.array([1, 1, 2, 2], np.float32),
+        "a": first,
+        "b": second,
+        "gain": np.float32(gain),
+        "scales": np.array([1, 1, 2, 2], np.float32),
         "impossible": np.array([7, 11, 13], np.int64),
-    }  # fmt: skip
+    }
     images, output = [batch or "n", 3, size or "h", size or "w"], "output0" if neck else last
     return save(path, nodes, images, (output, None), constants, weights, meta=meta)
 

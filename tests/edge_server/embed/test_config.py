@@ -20,17 +20,13 @@ def scenario(**edge) -> Scenario:
 def test_defaults_and_values():
     assert read_config(load("room")).embedding is None
     assert read_config(scenario(embedding={})).embedding == EmbeddingConfig()
-    found = read_config(
-        scenario(embedding={"dim": 16, "provider": "cpu", "size": 320, "tap": "model.9"})
-    ).embedding
+    found = read_config(scenario(embedding={"dim": 16, "provider": "cpu", "size": 320, "tap": "model.9"})).embedding
     assert (found.dim, found.provider, found.size, found.tap) == (16, "cpu", 320, "model.9")
     assert model_path(EmbeddingConfig().model).name == "detector_int8.onnx"
 
 
 def test_a_model_is_relative_to_the_scenario():
-    assert (
-        read_config(scenario(embedding={"model": "m/yolo.onnx"})).embedding.model == "/somewhere/m/yolo.onnx"
-    )
+    assert read_config(scenario(embedding={"model": "m/yolo.onnx"})).embedding.model == "/somewhere/m/yolo.onnx"
     assert read_config(scenario(embedding={"model": "/a/yolo.onnx"})).embedding.model == "/a/yolo.onnx"
     assert read_config(scenario(embedding={"model": "default"})).embedding.model == "default"
 

@@ -59,9 +59,7 @@ def test_the_projection_keeps_lengths_and_is_the_same_in_every_process(tmp_path)
     made, smaller = embedder(path), embedder(path, dim=3)
     images = [image(32, 32) for _ in range(4)]
     whole = made.embed(images)
-    assert np.linalg.norm(whole, axis=1) == pytest.approx(
-        np.linalg.norm(made.pooled(images), axis=1), rel=1e-5
-    )
+    assert np.linalg.norm(whole, axis=1) == pytest.approx(np.linalg.norm(made.pooled(images), axis=1), rel=1e-5)
     assert smaller.embed(images).shape == (4, 3)
     assert (embedder(path).embed(images) == whole).all(), "bit for bit"
     with pytest.raises(EmbeddingError, match=f"dim: end has {CHANNELS} channels, 7 numbers"):
@@ -85,8 +83,7 @@ def test_the_size_is_the_files_or_the_scenarios_or_the_exporters(tmp_path):
 def test_names_tell_embeddings_apart(tmp_path):
     path = detector(tmp_path / "d.onnx", size=None)
     other = detector(tmp_path / "e.onnx", size=None, gain=2.0)
-    made = [embedder(path, size=64), embedder(path, size=96), embedder(path, size=64, dim=4),
-            embedder(other, size=64)]  # fmt: skip
+    made = [embedder(path, size=64), embedder(path, size=96), embedder(path, size=64, dim=4), embedder(other, size=64)]
     assert len({m.name for m in made}) == 4
     assert embedder(path, size=64).name == made[0].name
 

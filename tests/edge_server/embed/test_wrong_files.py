@@ -59,9 +59,7 @@ def test_every_kind_of_damage_ends_in_one_line(tmp_path):
             data[at] = rng.integers(0, 256)
         path.write_bytes(data)
         try:
-            rows = make_embedder(EmbeddingConfig(str(path), 4, provider="cpu")).embed(
-                [np.zeros((9, 9, 3), np.uint8)]
-            )
+            rows = make_embedder(EmbeddingConfig(str(path), 4, provider="cpu")).embed([np.zeros((9, 9, 3), np.uint8)])
         except EmbeddingError as error:
             assert "\n" not in str(error)
             refusals += 1
@@ -80,8 +78,11 @@ def test_a_classifier_and_a_plain_enlargement_are_no_detectors(tmp_path):
 
 def test_inputs_of_another_kind(tmp_path):
     model = onnx.load(str(detector(tmp_path / "d.onnx")))
-    for shape, kind in (([1, 1, 32, 32], TensorProto.FLOAT), ([1, 3, 32], TensorProto.FLOAT),
-                        ([1, 3, 32, 32], TensorProto.INT64)):  # fmt: skip
+    for shape, kind in (
+        ([1, 1, 32, 32], TensorProto.FLOAT),
+        ([1, 3, 32], TensorProto.FLOAT),
+        ([1, 3, 32, 32], TensorProto.INT64),
+    ):
         model.graph.input[0].CopyFrom(helper.make_tensor_value_info("images", kind, shape))
         onnx.save(model, str(tmp_path / "i.onnx"))
         refused(tmp_path / "i.onnx", "input images is not")
@@ -119,13 +120,15 @@ def empty_claims(path: Path, dims: tuple[int, ...]) -> None:
 # What would take more memory than there is, and how it is refused.
 BOMBS = {
     "image": (partial(detector, size=1_000_000), "1000000 x 1000000 are not within"),
-    **{kind: (partial(memory_from_nothing, kind=kind), f"backbone holds {kind}, which no YOLO backbone does")
-       for kind in ("Expand", "Tile")},
+    **{
+        kind: (partial(memory_from_nothing, kind=kind), f"backbone holds {kind}, which no YOLO backbone does")
+        for kind in ("Expand", "Tile")
+    },
     "concat": (joined_with_themselves, "larger than any backbone's"),
     "padding": (padding, "larger than any backbone's"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
     "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BOMBS)

@@ -14,9 +14,15 @@ from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
 
 # Enough of a field to learn a small scene in a second; results do not depend on threads.
 SMALL: dict[str, Any] = {
-    "device": "cpu", "levels": 4, "log2_table": 12, "finest_resolution": 64, "batch_samples": 8192,
-    "rays": 2048, "samples": 64, "cells": 32,
-}  # fmt: skip
+    "device": "cpu",
+    "levels": 4,
+    "log2_table": 12,
+    "finest_resolution": 64,
+    "batch_samples": 8192,
+    "rays": 2048,
+    "samples": 64,
+    "cells": 32,
+}
 SMALL_WORDS = [word for key, value in SMALL.items() for word in ("--option", f"{key}={value}")]
 
 
@@ -59,7 +65,6 @@ def _write(path: Path, image: Any) -> None:
 
 
 def _save(path: Path, lens: Pinhole, frames: list[dict[str, Any]]) -> Path:
-    facts = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width,
-             "h": lens.height}  # fmt: skip
+    facts = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width, "h": lens.height}
     path.write_text(json.dumps({**facts, "frames": frames}))
     return path

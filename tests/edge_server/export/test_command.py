@@ -49,10 +49,26 @@ def export(*words) -> int:
 def test_everything_at_once(run, tmp_path, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     status = export(
-        run, "--mesh", tmp_path / "m.ply", "--splats", tmp_path / "s.ply", "--points", tmp_path / "p.ply",
-        "--colmap", tmp_path / "colmap", "--transforms", tmp_path / "nerf",
-        "--trajectory", tmp_path / "t.tum", "--voxel", 10, "--count", 500, "--min-weight", 0,
-    )  # fmt: skip
+        run,
+        "--mesh",
+        tmp_path / "m.ply",
+        "--splats",
+        tmp_path / "s.ply",
+        "--points",
+        tmp_path / "p.ply",
+        "--colmap",
+        tmp_path / "colmap",
+        "--transforms",
+        tmp_path / "nerf",
+        "--trajectory",
+        tmp_path / "t.tum",
+        "--voxel",
+        10,
+        "--count",
+        500,
+        "--min-weight",
+        0,
+    )
     said = capsys.readouterr().out
     assert status == 0, said
     for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json", "t.tum"):
@@ -101,8 +117,7 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
 
 # nerfacto and tensorf are written as ngp is, and take the longest.
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("nerfacto", "tensorf"))) for n in field_names()],
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("nerfacto", "tensorf"))) for n in field_names()]
 )
 def test_every_representation_comes_back_as_it_was(tmp_path, name):
     field = saved(tmp_path, name)
@@ -121,9 +136,7 @@ def test_a_camera_that_moved_has_its_whole_way(run, tmp_path, capsys):
     poses = [Pose.from_matrix(look_at((0.3, 0.1 * k, 0.4), (0, 0, 0))) for k in range(4)]
     rows = [("arm", 10**9 + k, pose) for k, pose in enumerate(poses)] + [("still", 5, poses[0])]
     (folder / "poses.jsonl").write_text(
-        "\n".join(
-            json.dumps({"camera": c, "ns": t, "q": p.quaternion, "t_m": p.translation_m}) for c, t, p in rows
-        )
+        "\n".join(json.dumps({"camera": c, "ns": t, "q": p.quaternion, "t_m": p.translation_m}) for c, t, p in rows)
         + '\n{"camera": "ar'
     )
     assert poses_of(open_source(folder))["arm"] == [(10**9 + k, pose) for k, pose in enumerate(poses)]
@@ -140,10 +153,7 @@ def test_a_run_writes_down_where_its_cameras_were(tmp_path):
     places = [(0.3, 0.0, 0.4), (0.3, 0.0, 0.4), (0.3, 0.1, 0.4)]
     journal = Journal(tmp_path, dict)
     for k, place in enumerate(places):
-        views = [
-            View("arm", picture, look_at(place, (0, 0, 0)), lens, k),
-            View("wall", picture, np.eye(4), lens, k),
-        ]
+        views = [View("arm", picture, look_at(place, (0, 0, 0)), lens, k), View("wall", picture, np.eye(4), lens, k)]
         journal.poses(views)
     journal.close()
     rows = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
@@ -162,7 +172,7 @@ def test_a_run_writes_down_where_its_cameras_were(tmp_path):
         (("--points", "p.ply", "--count", "0"), "--count 0"),
         (("--mesh", "m.ply", "--voxel", "10", "--bounds", *["1", "1", "1", "0", "0", "0"]), "lower corner"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_said_in_a_line(run, tmp_path, capsys, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     assert export(run, *words) == 2
@@ -172,8 +182,7 @@ def test_what_cannot_be_is_said_in_a_line(run, tmp_path, capsys, monkeypatch, wo
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
-    [(("--measure", "nope"), "shipped scenarios: "), ((), "pip install 'freshfield[surface]'")],
+    ("words", "said"), [(("--measure", "nope"), "shipped scenarios: "), ((), "pip install 'freshfield[surface]'")]
 )
 def test_what_a_mesh_needs_is_asked_for_before_the_run_is_opened(tmp_path, capsys, monkeypatch, words, said):
     if not words:

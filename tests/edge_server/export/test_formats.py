@@ -30,10 +30,7 @@ def shots(count: int = 4) -> list[PosedImage]:
     maps = ball_maps(count)
     lenses = [LENS, DISTORTED_LENS]
     pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
-    return [
-        PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k))
-        for k, m in enumerate(maps)
-    ]
+    return [PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k)) for k, m in enumerate(maps)]
 
 
 def cloud(of: list[PosedImage]) -> Cloud:
@@ -83,9 +80,7 @@ def test_colmap_text_keeps_every_bit(tmp_path):
     np.testing.assert_array_equal(np.array([row[1:4] for row in rows], dtype=float), points.points)
     lines = (tmp_path / "images.txt").read_text().splitlines()[3:]
     pose = np.array(lines[0].split()[1:8], dtype=float)
-    np.testing.assert_allclose(
-        quaternion_to_matrix(pose[:4]), se3_inverse(of[0].camera_to_world)[:3, :3], atol=1e-12
-    )
+    np.testing.assert_allclose(quaternion_to_matrix(pose[:4]), se3_inverse(of[0].camera_to_world)[:3, :3], atol=1e-12)
     assert len(lines) == 2 * len(of)
     cameras = (tmp_path / "cameras.txt").read_text().splitlines()[2:]
     assert [line.split()[1] for line in cameras] == ["PINHOLE", "OPENCV"]
@@ -114,9 +109,7 @@ def test_transparent_pictures_stay_transparent(tmp_path):
 
 
 def test_trajectories_keep_nanoseconds(tmp_path):
-    poses = [
-        (1_763_000_000_123_456_789 + k, Pose.from_matrix(s.camera_to_world)) for k, s in enumerate(shots())
-    ]
+    poses = [(1_763_000_000_123_456_789 + k, Pose.from_matrix(s.camera_to_world)) for k, s in enumerate(shots())]
     assert write_tum(tmp_path / "path.tum", reversed(poses)) == 4
     rows = [line.split() for line in (tmp_path / "path.tum").read_text().splitlines()[1:]]
     for row, (t_ns, pose) in zip(rows, poses):
@@ -137,18 +130,30 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, harmonics):
     data = read_floats(tmp_path / "s.ply")
     rest = [f"f_rest_{k}" for k in range(3 * (harmonics - 1))]
     assert list(data) == [
-        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
-        "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
-    ]  # fmt: skip
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *rest,
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     position = np.stack([data[n] for n in "xyz"], axis=-1)
-    np.testing.assert_array_equal(
-        position, (params[:, :3] * np.float64(2.5) + (1.0, -2.0, 0.5)).astype(np.float32)
-    )
+    np.testing.assert_array_equal(position, (params[:, :3] * np.float64(2.5) + (1.0, -2.0, 0.5)).astype(np.float32))
     np.testing.assert_array_equal(data["opacity"], params[:, 10])
     np.testing.assert_allclose(
-        np.exp(np.stack([data[f"scale_{k}"] for k in range(3)], axis=-1)),
-        2.5 * np.exp(params[:, 3:6]),
-        rtol=1e-5,
+        np.exp(np.stack([data[f"scale_{k}"] for k in range(3)], axis=-1)), 2.5 * np.exp(params[:, 3:6]), rtol=1e-5
     )
     # The color a viewer works out is ours, from any side: its basis has the other sign for odd orders.
     way = RNG.normal(size=3)
@@ -159,9 +164,7 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, harmonics):
             harmonic(k, x, y, z) * params[:, 14 + 3 * (k - 1) + c] for k in range(1, harmonics)
         )
         shown = 0.5 + Y0 * data[f"f_dc_{c}"]
-        shown = shown + sum(
-            theirs[k] * data[f"f_rest_{c * (harmonics - 1) + k}"] for k in range(harmonics - 1)
-        )
+        shown = shown + sum(theirs[k] * data[f"f_rest_{c * (harmonics - 1) + k}"] for k in range(harmonics - 1))
         np.testing.assert_allclose(shown, ours, atol=1e-5)
 
 
@@ -169,10 +172,15 @@ def kerbl(x: float, y: float, z: float) -> list[float]:
     """Spherical harmonics 1 to 8 as the reference implementation of Kerbl et al. has them."""
     c1, c2 = 0.4886025119029199, (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
     return [
-        -c1 * y, c1 * z, -c1 * x,
-        c2[0] * x * y, -c2[0] * y * z, c2[1] * (2 * z * z - x * x - y * y), -c2[0] * x * z,
+        -c1 * y,
+        c1 * z,
+        -c1 * x,
+        c2[0] * x * y,
+        -c2[0] * y * z,
+        c2[1] * (2 * z * z - x * x - y * y),
+        -c2[0] * x * z,
         c2[2] * (x * x - y * y),
-    ]  # fmt: skip
+    ]
 
 
 def read_floats(path: Path) -> dict[str, np.ndarray]:

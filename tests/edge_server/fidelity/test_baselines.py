@@ -41,9 +41,7 @@ def test_a_view_of_another_size_is_resampled():
 
 def test_both_together_and_none_without_views():
     truth = np.full((16, 24, 3), 128, np.uint8)
-    found = baseline(
-        [view("a", (2, 0, 0)), view("b", (0, 2, 0), truth)], truth, look_at((0, 2.1, 0), (0, 0, 0))
-    )
+    found = baseline([view("a", (2, 0, 0)), view("b", (0, 2, 0), truth)], truth, look_at((0, 2.1, 0), (0, 0, 0)))
     assert found.nearest_view_db == PSNR_CEILING_DB
     assert found.mean_colour_db == pytest.approx(-20 * np.log10(64 / 255))
     empty = baseline([], truth, np.eye(4))

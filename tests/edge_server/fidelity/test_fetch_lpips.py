@@ -13,13 +13,7 @@ from edge_server.fidelity.fetch_lpips import FetchError, convert
 from edge_server.fidelity.lpips_weights import open_lpips
 
 # (name, (out, in, kernel)) of torchvision's convolutions.
-ALEX = (
-    ("0", (64, 3, 11)),
-    ("3", (192, 64, 5)),
-    ("6", (384, 192, 3)),
-    ("8", (256, 384, 3)),
-    ("10", (256, 256, 3)),
-)
+ALEX = (("0", (64, 3, 11)), ("3", (192, 64, 5)), ("6", (384, 192, 3)), ("8", (256, 384, 3)), ("10", (256, 256, 3)))
 ALEX_LINS = (64, 192, 384, 256, 256)
 
 
@@ -36,8 +30,16 @@ def random_weights(convolutions, lins):
 def squeeze():
     """SqueezeNet 1.1's convolutions and the widths of LPIPS's slices."""
     found, c_in = [("0", (64, 3, 3))], 64
-    for number, (s, e) in {3: (16, 64), 4: (16, 64), 6: (32, 128), 7: (32, 128), 9: (48, 192), 10: (48, 192),
-                           11: (64, 256), 12: (64, 256)}.items():  # fmt: skip
+    for number, (s, e) in {
+        3: (16, 64),
+        4: (16, 64),
+        6: (32, 128),
+        7: (32, 128),
+        9: (48, 192),
+        10: (48, 192),
+        11: (64, 256),
+        12: (64, 256),
+    }.items():
         found += [
             (f"{number}.squeeze", (s, c_in, 1)),
             (f"{number}.expand1x1", (e, s, 1)),

@@ -13,14 +13,7 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 
 from edge_server.embed import MODELS
 from edge_server.fidelity.images import ImageError
-from edge_server.fidelity.perceptual import (
-    COEFFICIENTS,
-    DETECTOR,
-    MINIMUM_SIDE,
-    Layers,
-    Perceptual,
-    open_perceptual,
-)
+from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, MINIMUM_SIDE, Layers, Perceptual, open_perceptual
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 
 RNG = np.random.default_rng(8)
@@ -66,10 +59,7 @@ def test_more_of_one_distortion_is_farther(metric):
 
     truth = (picture(128, 128) * 255).astype(np.uint8)
     blurred = [metric(cv2.GaussianBlur(truth, (0, 0), s), truth) for s in (0.5, 1, 2, 4, 8)]
-    noisy = [
-        metric(np.clip(truth / 255 + RNG.normal(0, s, truth.shape), 0, 1), truth)
-        for s in (0.02, 0.05, 0.1, 0.2)
-    ]
+    noisy = [metric(np.clip(truth / 255 + RNG.normal(0, s, truth.shape), 0, 1), truth) for s in (0.02, 0.05, 0.1, 0.2)]
     for series in (blurred, noisy):
         assert series == sorted(series) and series[0] > 0
 

@@ -18,9 +18,7 @@ def test_a_known_error_gives_the_value_of_3_31():
 def test_8_bit_and_floating_images_agree():
     truth = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
     rendering = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
-    assert psnr((rendering / 255).astype(np.float32), truth) == pytest.approx(
-        psnr(rendering, truth), abs=1e-4
-    )
+    assert psnr((rendering / 255).astype(np.float32), truth) == pytest.approx(psnr(rendering, truth), abs=1e-4)
 
 
 def test_alpha_is_laid_over_the_background():

@@ -16,7 +16,10 @@ def run_with_bounds_checks(code: str, folder: Path, request: pytest.FixtureReque
     kernels = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(folder)
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": kernels}
     out = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
+        [sys.executable, "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
         cwd=Path(__file__).resolve().parents[3],
-    )  # fmt: skip
+    )
     assert out.returncode == 0 and "kept" in out.stdout, out.stderr[-2000:]

@@ -19,9 +19,8 @@ def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float
 
 
 def seen(
-    camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M,
-    radius_m: float = RADIUS_M,
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:  # fmt: skip
+    camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M, radius_m: float = RADIUS_M
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """The picture (H, W, 3), and how far away in meters what it shows is (H, W), inf for the sky."""
     origin, rays = world_rays(camera, pose)
     color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
@@ -44,9 +43,7 @@ def seen(
     return np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8), away_m
 
 
-def ring(
-    count: int, size: int = 48, ball_m: NDArray[np.float64] = BALL_M, distance_m: float = 2.5
-) -> list[View]:
+def ring(count: int, size: int = 48, ball_m: NDArray[np.float64] = BALL_M, distance_m: float = 2.5) -> list[View]:
     """``count`` cameras around the scene, at two heights, all looking at its middle."""
     camera = Pinhole.from_fov(size, size, 50.0)
     views = []

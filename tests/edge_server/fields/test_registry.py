@@ -27,7 +27,7 @@ from tests.edge_server.fields.small import CLASSES, every_field
         ("splat", {"gaussians": 99, "start": 9}, {"gaussians": 99, "start": 9}),
         ("voxel", {"sizes": [16, 24], "refine_at": [10]}, {"sizes": (16, 24), "refine_at": (10,)}),
     ],
-)  # fmt: skip
+)
 def test_make_field_passes_options_and_seed(name: str, options: dict, expected: dict) -> None:
     field: Any = make_field(name, options, seed=5)
     assert type(field) is CLASSES[name] and field.settings.seed == 5
@@ -36,32 +36,46 @@ def test_make_field_passes_options_and_seed(name: str, options: dict, expected: 
 
 # In every representation that has the option.
 REFUSED_ANYWHERE: list[tuple[str, Any, str]] = [
-    ("rays", "many", "a whole number"), ("gaussians", 100.5, "a whole number"),
-    ("cells", 64.0, "a whole number"), ("nice", "x", "a whole number"), ("seed", True, "a whole number"),
-    ("contracted", "yes", "true or false"), ("exposure", "no", "true or false"),
-    ("rate_end", float("nan"), "a finite number"), ("epsilon", "small", "a number"),
-    ("background", 3, "text"), ("centre_m", [1, 2], "a list of 3 numbers"),
-    ("centre_m", 5, "a list of 3 numbers"), ("effort", ["high"], "a name"),
+    ("rays", "many", "a whole number"),
+    ("gaussians", 100.5, "a whole number"),
+    ("cells", 64.0, "a whole number"),
+    ("nice", "x", "a whole number"),
+    ("seed", True, "a whole number"),
+    ("contracted", "yes", "true or false"),
+    ("exposure", "no", "true or false"),
+    ("rate_end", float("nan"), "a finite number"),
+    ("epsilon", "small", "a number"),
+    ("background", 3, "text"),
+    ("centre_m", [1, 2], "a list of 3 numbers"),
+    ("centre_m", 5, "a list of 3 numbers"),
+    ("effort", ["high"], "a name"),
     ("effort", "heroic", "one of low, medium, high"),
-    ("rate", -1.0, "in 0.0..10.0"), ("rate_net", -1.0, "in 0.0..10.0"),
-    ("rate_color", -1.0, "in 0.0..10.0"), ("rate_end", 0.0, "in 0.0001..1.0"),
+    ("rate", -1.0, "in 0.0..10.0"),
+    ("rate_net", -1.0, "in 0.0..10.0"),
+    ("rate_color", -1.0, "in 0.0..10.0"),
+    ("rate_end", 0.0, "in 0.0001..1.0"),
     ("rate_end", -0.1, "in 0.0001..1.0"),
-    ("epsilon", 0.0, "in 1e-10..1000.0"), ("epsilon", -1.0, "in 1e-10..1000.0"),
-    ("changed_share", 7.0, "in 0.0..1.0"), ("distortion", -5.0, "in 0.0..1000.0"),
+    ("epsilon", 0.0, "in 1e-10..1000.0"),
+    ("epsilon", -1.0, "in 1e-10..1000.0"),
+    ("changed_share", 7.0, "in 0.0..1.0"),
+    ("distortion", -5.0, "in 0.0..1000.0"),
     ("depth_guide", -1.0, "in 0.0..1000.0"),
     ("guide_steps", 0, "in 1..1073741824"),
     ("decay", -1.0, "in 0.0..1000.0"),
-    ("smooth", -1.0, "in 0.0..1000.0"), ("levels_start", 0, "in 1..24"),
-    ("prune_from", -1, "in 0..1073741824"), ("batch_samples", 2049, "a multiple of 2048"),
-    ("threads", 0, "in 1..1024"), ("nice", -1, "in 0..19"), ("seed", -1, "in 0..9223372036854775807"),
-]  # fmt: skip
+    ("smooth", -1.0, "in 0.0..1000.0"),
+    ("levels_start", 0, "in 1..24"),
+    ("prune_from", -1, "in 0..1073741824"),
+    ("batch_samples", 2049, "a multiple of 2048"),
+    ("threads", 0, "in 1..1024"),
+    ("nice", -1, "in 0..19"),
+    ("seed", -1, "in 0..9223372036854775807"),
+]
 
 
 @pytest.mark.parametrize(
     ("name", "option", "value", "text"),
-    [(name, *row) for name in field_names() for row in REFUSED_ANYWHERE
-     if row[0] in ("effort", *option_help(name))],
-)  # fmt: skip
+    [(name, *row) for name in field_names() for row in REFUSED_ANYWHERE if row[0] in ("effort", *option_help(name))],
+)
 def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: Any, text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(f"{name}: {option} must be {text}, not {value!r}")):
         make_field(name, {option: value})
@@ -106,7 +120,7 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         ("ngp", {"device": "cuda", "refine_m": 0.03}, "refine_m needs device cpu"),
         ("ngp", {"device": "cuda", "depth_guide": 0.1}, "depth_guide needs device cpu"),
     ],
-)  # fmt: skip
+)
 def test_what_one_field_cannot_work_with_is_refused(name: str, options: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         make_field(name, options)
@@ -124,9 +138,7 @@ def test_efforts_are_ordered_and_can_be_overridden(name: str) -> None:
     assert medium == type(medium)() == settings_of(name)
     for found, preset in zip((low, medium, high), efforts_of(name).values()):
         assert found == replace(medium, **preset)
-    for option in {"ngp": ("samples", "batch_samples"), "splat": ("gaussians",), "voxel": ()}.get(
-        name, ("samples",)
-    ):
+    for option in {"ngp": ("samples", "batch_samples"), "splat": ("gaussians",), "voxel": ()}.get(name, ("samples",)):
         assert getattr(low, option) < getattr(medium, option) < getattr(high, option)
     assert settings_of(name, {"effort": "high", "threads": 33}) == replace(high, threads=33)
 

@@ -61,8 +61,12 @@ def save_orange_detector(
     ]
     spread = np.zeros((1, kinds, 1), np.float32)
     spread[0, 1] = 1.0
-    constants = {"weight": weight, "flat": np.array([1, 1, grid * grid], np.int64), "spread": spread,
-                 "boxes": boxes[None].astype(np.float32)}  # fmt: skip
+    constants = {
+        "weight": weight,
+        "flat": np.array([1, 1, grid * grid], np.int64),
+        "spread": spread,
+        "boxes": boxes[None].astype(np.float32),
+    }
     if masks:
         constants |= {"ones": np.ones((1, 1, grid * grid), np.float32), "half": np.float32([0.17])}
         nodes += [
@@ -75,8 +79,7 @@ def save_orange_detector(
     names = {k: name for k, name in enumerate(["apple", "orange", "pear"][:kinds])}
     meta = {"names": str(names)}
     further = (("output1", [1, 1, side // 4, side // 4]),) if masks else ()
-    return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta,
-                further=further)  # fmt: skip
+    return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta, further=further)
 
 
 def save_segmenter(path: Path) -> Path:
@@ -97,11 +100,20 @@ def save_memory_bomb(path: Path, kind: str) -> Path:
     from tests.edge_server.embed.graphs import save
 
     constants = {
-        "shape": np.array([2**33, 3, 64, 64]), "times": np.array([2**33, 1, 1, 1]), "none": np.array(0),
-        "one": np.array(1), "end": np.array(2**46), "weight": np.ones((1, 3, 1, 1), np.float32),
-    }  # fmt: skip
-    read = {"Expand": ["images", "shape"], "Tile": ["images", "times"], "ConstantOfShape": ["shape"],
-            "Range": ["none", "end", "one"], "Conv": ["images", "weight"]}[kind]  # fmt: skip
+        "shape": np.array([2**33, 3, 64, 64]),
+        "times": np.array([2**33, 1, 1, 1]),
+        "none": np.array(0),
+        "one": np.array(1),
+        "end": np.array(2**46),
+        "weight": np.ones((1, 3, 1, 1), np.float32),
+    }
+    read = {
+        "Expand": ["images", "shape"],
+        "Tile": ["images", "times"],
+        "ConstantOfShape": ["shape"],
+        "Range": ["none", "end", "one"],
+        "Conv": ["images", "weight"],
+    }[kind]
     nodes = [
         helper.make_node(kind, read, ["large"], **({"pads": [5_000_000] * 4} if kind == "Conv" else {})),
         helper.make_node("Cast", ["large"], ["floats"], to=1),
@@ -127,6 +139,8 @@ def save_endless_loop(path: Path) -> Path:
     )
     weight = np.ones((1, 3, 1, 1), np.float32)
     constants = {"rounds": np.array(2**62), "true": np.array(True), "weight": weight}
-    nodes = [helper.make_node("Loop", ["rounds", "true", "images"], ["turned"], body=body),
-             helper.make_node("Conv", ["turned", "weight"], ["map"])]  # fmt: skip
+    nodes = [
+        helper.make_node("Loop", ["rounds", "true", "images"], ["turned"], body=body),
+        helper.make_node("Conv", ["turned", "weight"], ["map"]),
+    ]
     return save(path, nodes, image, ("map", [1, 1, 64, 64]), constants, opset=13)

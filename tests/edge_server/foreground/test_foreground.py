@@ -87,14 +87,14 @@ def test_what_is_cut_out_within_the_box_supervises_as_much_as_it_is_trusted():
 def test_the_loop_fits_to_cut_views(tmp_path):
     """From the scenario to what the field is given, in virtual time."""
     data = {
-        "name": "cut", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]},
+        "name": "cut",
+        "seed": 3,
+        "cameras": {"count": 3, "held_out": ["cam00"]},
         "source": {"kind": "world", "scene": "tile", "width": 32, "height": 32, "fps": 5},
         "channel": {"preset": "ch5"},
         "edge": {"field": "voxel", "foreground": {"box": [0.25, 0.25, 0.75, 0.75], "segment": "box"}},
-    }  # fmt: skip
-    deployment = build_deployment(
-        parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None)
-    )
+    }
+    deployment = build_deployment(parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None))
     deployment.run(0.8)
     decoder = deployment.updates.decoder
     assert deployment.publications and decoder.foreground.counts.masked >= 2
@@ -137,8 +137,13 @@ def test_detector_and_grabcut_together(tmp_path):
     blue = np.full_like(picture, (40, 70, 160))
     assert cut.apply("cam00", blue)[0] is blue
     assert vars(cut.counts) == {
-        "masked": 1, "not_detected": 1, "empty_box": 0, "empty_mask": 0, "full_mask": 0, "failed": 0,
-    }  # fmt: skip
+        "masked": 1,
+        "not_detected": 1,
+        "empty_box": 0,
+        "empty_mask": 0,
+        "full_mask": 0,
+        "failed": 0,
+    }
     assert cut.status()["ms_per_image"] > 0
 
 

@@ -27,9 +27,14 @@ def cut(confidence: float = 0.25) -> Foreground:
 
 
 def seen(
-    distance_m: float, azimuth: float, elevation: float, fov_deg: float, bench: bool = True,
-    aim=(0.0, 0.0, 0.03), size=(128, 128),
-):  # fmt: skip
+    distance_m: float,
+    azimuth: float,
+    elevation: float,
+    fov_deg: float,
+    bench: bool = True,
+    aim=(0.0, 0.0, 0.03),
+    size=(128, 128),
+):
     """(image, true mask) of the tile from somewhere."""
     scene = make_scene("tile", {"count": 1, "bench": bench})
     lens, pose = Pinhole.from_fov(*size, fov_deg), on_sphere(aim, distance_m, azimuth, elevation)
@@ -86,9 +91,7 @@ def test_a_picture_without_the_tile_is_used_whole_and_this_is_said_once(caplog):
     foreground = cut(read_config(load("scan")).foreground.confidence)
     with caplog.at_level(logging.WARNING):
         for azimuth in (-30, 60, 150):
-            image = empty.view(
-                Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)
-            ).image(0)
+            image = empty.view(Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)).image(0)
             out, weight = foreground.apply("hand", image)
             assert out is image and weight is None, "nothing is lost"
     assert foreground.counts.not_detected == 3 == sum(vars(foreground.counts).values())

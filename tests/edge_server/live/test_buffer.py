@@ -243,9 +243,7 @@ def test_a_camera_that_comes_back_goes_first():
     buffer.keep_every_frame(True)
     for sequence in range(LONGEST_WAIT + 1):
         for camera in buffer.cameras[:2]:
-            buffer.put(
-                frame(camera, sequence=sequence, generated_ns=100 * sequence * MS), 100 * sequence * MS
-            )
+            buffer.put(frame(camera, sequence=sequence, generated_ns=100 * sequence * MS), 100 * sequence * MS)
         buffer.take(list(buffer.newest().values()), most=1)
     at_ns = 100 * (LONGEST_WAIT + 1) * MS
     for k, camera in enumerate(buffer.cameras):

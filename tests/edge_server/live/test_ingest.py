@@ -86,9 +86,21 @@ def bad(kind: str) -> pb.PushRequest:
     return to_request(dataclasses.replace(base, **changes))
 
 
-KINDS = ["crc_mismatch", "bad_pose", "unknown_camera", "wrong_role", "bad_id", "from_future", "too_old",
-         "size_mismatch", "bad_payload", "bad_intrinsics", "unknown_codec", "bad_header",
-         "too_large"]  # fmt: skip
+KINDS = [
+    "crc_mismatch",
+    "bad_pose",
+    "unknown_camera",
+    "wrong_role",
+    "bad_id",
+    "from_future",
+    "too_old",
+    "size_mismatch",
+    "bad_payload",
+    "bad_intrinsics",
+    "unknown_codec",
+    "bad_header",
+    "too_large",
+]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -87,8 +87,9 @@ def test_turning_and_another_lens_make_another_viewpoint():
     kept = Keyframes(KeyframesConfig(apart_m=10.0, apart_deg=5.0))
     kept.with_earlier([view("hand", 0, 0)])
     assert len(kept.with_earlier([view("hand", 30, 1)])) == 2
-    zoomed = View("hand", np.zeros((8, 8, 3), np.uint8), view("", 30, 0).camera_to_world,
-                  Pinhole.from_fov(8, 8, 30.0), 2_000_000)  # fmt: skip
+    zoomed = View(
+        "hand", np.zeros((8, 8, 3), np.uint8), view("", 30, 0).camera_to_world, Pinhole.from_fov(8, 8, 30.0), 2_000_000
+    )
     assert len(kept.with_earlier([zoomed])) == 3
 
 

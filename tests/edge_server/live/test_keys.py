@@ -60,17 +60,13 @@ def test_a_certificate_lets_its_process_do_its_own_part(keys):
         return found, tokens
 
     found, tokens = asyncio.run(scene())
-    assert found == {
-        "cam00": "forbidden_camera", "emulator": "taken", "viewer": "looks", "edge": "UNAUTHENTICATED",
-    }  # fmt: skip
+    assert found == {"cam00": "forbidden_camera", "emulator": "taken", "viewer": "looks", "edge": "UNAUTHENTICATED"}
     assert tokens.keys() == {"operator", "viewer"} and len(set(tokens.values())) == 2
 
 
 def test_a_key_of_another_certificate_is_named(keys):
     async def scene():
-        mixed = Transport(
-            cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem"
-        )
+        mixed = Transport(cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem")
         with pytest.raises(TransportError, match=r"cannot use --tls-cert .* with its --tls-key"):
             mixed.bind(mixed.aio_server(), "127.0.0.1:0")
 
@@ -86,8 +82,10 @@ def test_the_health_check_passes_mutual_tls(keys):
         health_pb2_grpc.add_HealthServicer_to_server(health.aio.HealthServicer(), server)
         port = transport.bind(server, "127.0.0.1:0")
         await server.start()
-        words = [f"--tls-{part}={keys / 'emulator' / file}" for part, file in
-                 (("cert", "cert.pem"), ("key", "key.pem"), ("ca", "ca.pem"))]  # fmt: skip
+        words = [
+            f"--tls-{part}={keys / 'emulator' / file}"
+            for part, file in (("cert", "cert.pem"), ("key", "key.pem"), ("ca", "ca.pem"))
+        ]
         with_it = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}", *words)
         without = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}")
         await server.stop(None)

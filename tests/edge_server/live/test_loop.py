@@ -143,9 +143,14 @@ class Running:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
         self.loop = UpdateLoop(
-            u, self.clock, budget or UpdateBudget(100.0), grace_ms,
-            lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append,
-        )  # fmt: skip
+            u,
+            self.clock,
+            budget or UpdateBudget(100.0),
+            grace_ms,
+            lambda p, r, v: self.published.append((p, r)),
+            self.lines.append,
+            self.saved.append,
+        )
 
     def until(self, condition, seconds: float = 60.0) -> None:
         deadline = time.perf_counter() + seconds

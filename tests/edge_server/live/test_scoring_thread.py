@@ -49,18 +49,13 @@ def _publication(number: int, at_ns: int) -> Publication:
 
 
 def _run(
-    publications: list[int],
-    frames: list[int],
-    scored: list[Publication] | None = None,
-    scorer: Scorer | None = None,
+    publications: list[int], frames: list[int], scored: list[Publication] | None = None, scorer: Scorer | None = None
 ) -> list[tuple[Score, Publication]]:
     """Scores of what was shown, of publications and held-out frames at given instants in ns. scored: takes
     publications with their scores."""
     shown: list[tuple[Score, Publication]] = []
     taken = [] if scored is None else scored
-    thread = ScoringThread(
-        ["cam00"], scorer or Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of)
-    )
+    thread = ScoringThread(["cam00"], scorer or Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of))
     events = [(at, 0, n) for n, at in enumerate(publications)] + [(at, 1, n) for n, at in enumerate(frames)]
     thread.start()
     for at_ns, kind, number in sorted(events):
@@ -90,9 +85,7 @@ def test_nothing_was_shown_before_the_first_publication() -> None:
     assert _run([500 * MS], [k * 10 * MS for k in range(50)]) == []
 
 
-def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(
-    monkeypatch: Any,
-) -> None:
+def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
     monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 0.5)
     scored: list[Publication] = []
     frames = [k * 10 * MS for k in range(90)]

@@ -65,10 +65,17 @@ class Feed(threading.Thread):
                 image[6:18, 10:22] = (200, 40 + sequence % 100, 30)
                 yield wire.to_request(
                     wire.Frame(
-                        camera, "s", sequence, time.time_ns(), Pose.from_matrix(look_at(eye, [0, 0, 0])),
-                        CAMERA, "jpeg", payload.encode(image), held_out=camera in self.held_out,
+                        camera,
+                        "s",
+                        sequence,
+                        time.time_ns(),
+                        Pose.from_matrix(look_at(eye, [0, 0, 0])),
+                        CAMERA,
+                        "jpeg",
+                        payload.encode(image),
+                        held_out=camera in self.held_out,
                     )
-                )  # fmt: skip
+                )
 
     def run(self) -> None:
         stub = frames_pb2_grpc.FrameStreamServiceStub(self.channel)
@@ -91,9 +98,7 @@ def serve(tmp_path):
     def start(made=None, **options):
         made = made or tiny_scenario(tmp_path)
         port = free_port()
-        server = EdgeServer(
-            made, read_config(made), ServerOptions(f"127.0.0.1:{port}", tmp_path / "out", **options)
-        )
+        server = EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{port}", tmp_path / "out", **options))
         thread = threading.Thread(target=server.run)
         thread.start()
         started.append((server, thread))
@@ -333,9 +338,7 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
 
     def server(**options):
         ports = {"page_host": "0.0.0.0", "open_page": lambda state: pytest.fail("opened"), "metrics_port": 0}
-        return EdgeServer(
-            made, read_config(made), ServerOptions("0.0.0.0:0", tmp_path / "o", **ports, **options)
-        )
+        return EdgeServer(made, read_config(made), ServerOptions("0.0.0.0:0", tmp_path / "o", **ports, **options))
 
     with pytest.raises(TransportError, match=r"cannot listen: gRPC on 0\.0\.0\.0"):
         server().run()

@@ -33,9 +33,7 @@ def server_of(tmp_path, layout, embedding=True, port=None):
         edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS, "provider": "cpu"}
     data = {"name": "tiny", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]}, "edge": edge}
     made = scenario.parse(data, tmp_path / "tiny.yaml")
-    return EdgeServer(
-        made, read_config(made), ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
-    )
+    return EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out"))
 
 
 def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_path, capsys):

@@ -87,10 +87,13 @@ def frontier_point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
 
 
 POINTS = [
-    frontier_point("low", 1.0, 100.0, 20.0, 18.0), frontier_point("low", 1.0, 400.0, 21.0, 17.5),
-    frontier_point("medium", 1.0, 400.0, 24.0, 17.0), frontier_point("medium", 1.0, 2000.0, 24.5, 14.0),
-    frontier_point("low", 4.0, 100.0, 19.0, 17.0), frontier_point("low", 4.0, 400.0, 19.0, 13.0),
-]  # fmt: skip
+    frontier_point("low", 1.0, 100.0, 20.0, 18.0),
+    frontier_point("low", 1.0, 400.0, 21.0, 17.5),
+    frontier_point("medium", 1.0, 400.0, 24.0, 17.0),
+    frontier_point("medium", 1.0, 2000.0, 24.5, 14.0),
+    frontier_point("low", 4.0, 100.0, 19.0, 17.0),
+    frontier_point("low", 4.0, 400.0, 19.0, 13.0),
+]
 
 
 def test_the_best_point_that_fits_is_chosen():
@@ -121,14 +124,19 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
     with pytest.raises(ValueError, match=r"missing\.json"):
         read_frontier(tmp_path / "missing.json", "ngp")
     row = {
-        "field": "splat", "effort": "low", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1,
-        "psnr_db": 30.0, "psnr_moving_db": 20.0, "shown_psnr_db": 25.0, "shown_psnr_moving_db": 15.0,
-    }  # fmt: skip
+        "field": "splat",
+        "effort": "low",
+        "options": {},
+        "speed_m_per_s": 1.0,
+        "update_s": 0.1,
+        "psnr_db": 30.0,
+        "psnr_moving_db": 20.0,
+        "shown_psnr_db": 25.0,
+        "shown_psnr_moving_db": 15.0,
+    }
     layers = row | {"effort": "layers", "options": {"layers": True}, "shown_psnr_db": 29.0}
     (tmp_path / "f.json").write_text(json.dumps({"updates": [row, layers]}))
-    (plain,), (layered,) = (
-        read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True)
-    )
+    (plain,), (layered,) = (read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True))
     assert plain.psnr_db == 25.0 and plain.mean_db == 20.0, "by what was shown"
     assert layered.psnr_db == 29.0 and layered.effort == "layers"
     with pytest.raises(ValueError, match="for ngp in layers"):
@@ -146,9 +154,7 @@ def burn(stop) -> None:
 @pytest.mark.slow
 def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
     buffer = FrameBuffer(("cam01", "cam02"))
-    updates = FieldUpdater(
-        buffer, make_policy("all", None, np.random.default_rng(0)), tiny_field(), start_ns=0
-    )
+    updates = FieldUpdater(buffer, make_policy("all", None, np.random.default_rng(0)), tiny_field(), start_ns=0)
     updates.field.warm_up()
     for camera in buffer.cameras:
         buffer.put(frame(camera, generated_ns=0), 1)

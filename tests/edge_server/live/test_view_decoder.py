@@ -73,5 +73,6 @@ def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
             continue
         whole = view.whole()
         assert whole.image.shape[:2] == (24, 32) and whole.whole is None
-        np.testing.assert_allclose(view.intrinsics.rays([[1.0, 2.0]]), whole.intrinsics.rays(
-            [[32 / size[1], 2.0 * 24 / size[0]]]))  # fmt: skip
+        np.testing.assert_allclose(
+            view.intrinsics.rays([[1.0, 2.0]]), whole.intrinsics.rays([[32 / size[1], 2.0 * 24 / size[0]]])
+        )

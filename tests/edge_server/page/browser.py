@@ -96,19 +96,19 @@ class Browser:
         self._profile = tempfile.mkdtemp(prefix="freshfield-browser-")
         self._socket: websocket.WebSocket | None = None
         self._process = subprocess.Popen(
-            [chromium(), *FLAGS, f"--window-size={width},{height}",
-             f"--user-data-dir={self._profile}", "about:blank"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
+            [chromium(), *FLAGS, f"--window-size={width},{height}", f"--user-data-dir={self._profile}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         try:
-            self._socket = websocket.create_connection(
-                self._debugger(), timeout=timeout_s, suppress_origin=True
-            )
+            self._socket = websocket.create_connection(self._debugger(), timeout=timeout_s, suppress_origin=True)
             for domain in ("Page", "Runtime", "Network", "Log"):
                 self.call(f"{domain}.enable")
             # The window's own decorations would eat into the size asked for.
-            self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-                      deviceScaleFactor=1, mobile=False)  # fmt: skip
+            self.call(
+                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+            )
             self.call("Page.navigate", url=url)
         except BaseException:
             self.close()
@@ -209,19 +209,16 @@ class Browser:
     def click(self, x: float, y: float) -> None:
         self.hover(x, y)
         for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left",
-                      clickCount=1)  # fmt: skip
+            self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", clickCount=1)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
         """Press at ``start``, move to ``end``, release: turns the view."""
-        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1],
-                  button="left", clickCount=1)  # fmt: skip
+        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)
         for i in range(1, steps + 1):
             x, y = (a + (b - a) * i / steps for a, b in zip(start, end))
             self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
             time.sleep(0.03)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1],
-                  button="left", clickCount=1)  # fmt: skip
+        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
 
     def click_text(self, wanted: str) -> None:
         """Click in the middle of the smallest visible thing that shows ``wanted``."""
@@ -238,8 +235,9 @@ class Browser:
         query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() == {option!r})"
         shown = f"!!({query})?.checkVisibility()"  # it may stay in the page while the list is closed
         self.wait_for(lambda: self.evaluate(shown), f"the option {option!r}")
-        middle = (f"(() => {{const r = {query}.getBoundingClientRect();"
-                  "return [r.x + r.width / 2, r.y + r.height / 2]})()")  # fmt: skip
+        middle = (
+            f"(() => {{const r = {query}.getBoundingClientRect();return [r.x + r.width / 2, r.y + r.height / 2]}})()"
+        )
         box: list[float] = []
 
         def rests() -> bool:
@@ -273,9 +271,7 @@ class Browser:
 
     def close_notices(self) -> None:
         """Click away every notification, such as the one that WebGL runs in software."""
-        self.evaluate(
-            "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
-        )
+        self.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
         gone = "!document.querySelector('.mantine-Notification-root')"
         self.wait_for(lambda: self.evaluate(gone), "the end of the notifications")
 

@@ -42,9 +42,7 @@ class BallScene:
 
     def __init__(self, t_s: float) -> None:
         angle = 2 * np.pi * t_s / PERIOD_S
-        self.center = np.array(
-            [ORBIT_RADIUS_M * np.cos(angle), ORBIT_RADIUS_M * np.sin(angle), BALL_RADIUS_M]
-        )
+        self.center = np.array([ORBIT_RADIUS_M * np.cos(angle), ORBIT_RADIUS_M * np.sin(angle), BALL_RADIUS_M])
         self.spin = 3.0 * angle
 
     def at(self, present_ns: int) -> BallScene:
@@ -159,8 +157,13 @@ class Preview:
         """The channel's status, as the emulator writes it."""
         state = "high" if self._congested else "low"
         forwarded = sum(self._delivered.values())
-        return {"preset": "toy", "discipline": "parallel", "states": ["low", "high"], "state": state,
-                "counts": {"forwarded": forwarded}}  # fmt: skip
+        return {
+            "preset": "toy",
+            "discipline": "parallel",
+            "states": ["low", "high"],
+            "state": state,
+            "counts": {"forwarded": forwarded},
+        }
 
     # --- cameras and network --------------------------------------------------------------------
 
@@ -176,8 +179,17 @@ class Preview:
             if self._rng.random() < 0.02:
                 self._congested = not self._congested
             image = _uint8(self._scene(now_ns).render(self._poses[name], LENS))
-            frame = Frame(name, "preview", number, now_ns, Pose.from_matrix(self._poses[name]), LENS, "jpeg",
-                          payload.encode(image), held_out=name == self._held_out)  # fmt: skip
+            frame = Frame(
+                name,
+                "preview",
+                number,
+                now_ns,
+                Pose.from_matrix(self._poses[name]),
+                LENS,
+                "jpeg",
+                payload.encode(image),
+                held_out=name == self._held_out,
+            )
             mean_ms = 0.0 if frame.held_out else (700.0 if self._congested else 90.0)
             self._in_flight.append((now_ns + round(1e6 * self._rng.exponential(mean_ms)), frame))
 
@@ -220,14 +232,20 @@ class Preview:
             now_ns = self._clock.now_ns()
             ages = tuple(float(a) for a in (now_ns - captured_ns) / 1e6)
             publication = Publication(
-                number, self.state.now_s(), now_ns, plan.omega_ms, selected, ages, float(np.mean(ages)),
-                (now_ns - decided_ns) / 1e6, scored_on=self._held_out,
-            )  # fmt: skip
+                number,
+                self.state.now_s(),
+                now_ns,
+                plan.omega_ms,
+                selected,
+                ages,
+                float(np.mean(ages)),
+                (now_ns - decided_ns) / 1e6,
+                scored_on=self._held_out,
+            )
             self.state.status_line = f"used {len(selected)} views of {len(newest)}"
             self.state.publish(publication, renderer)
             self.state.scored(
-                replace(publication, psnr_db=psnr(shown, truth)),
-                Comparison(self._held_out, truth, shown, number),
+                replace(publication, psnr_db=psnr(shown, truth)), Comparison(self._held_out, truth, shown, number)
             )
             number += 1
 

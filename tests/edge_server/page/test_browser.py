@@ -36,9 +36,20 @@ def shown(tmp_path_factory):
 
 def test_the_page_says_what_is_going_on_and_stays_live(shown):
     preview, _, browser = shown
-    for part in ("live", "preview", "analytic", "mean age", "worst age", "8/9", "Age of the newest frames",
-                 "Fidelity at the present", "truth at the present", "no frame yet", "held out",
-                 "Cameras send frames over a bad network"):  # fmt: skip
+    for part in (
+        "live",
+        "preview",
+        "analytic",
+        "mean age",
+        "worst age",
+        "8/9",
+        "Age of the newest frames",
+        "Fidelity at the present",
+        "truth at the present",
+        "no frame yet",
+        "held out",
+        "Cameras send frames over a bad network",
+    ):
         browser.wait_for_text(part)
     _until_updates(browser, after=len(preview.state.publications()))
 
@@ -139,8 +150,7 @@ def test_clicking_a_camera_looks_through_it(shown):
     time.sleep(1.0)  # the viewer notes what is under the pointer at its next image
     browser.click(*at)
     browser.wait_for(
-        lambda: np.allclose(client.camera.position, poses[i, :3, 3], atol=1e-3),
-        f"standing at {frames[i].camera}",
+        lambda: np.allclose(client.camera.position, poses[i, :3, 3], atol=1e-3), f"standing at {frames[i].camera}"
     )
     # The viewer reports the position first, while it still looks at where it looked before.
     browser.wait_for(

@@ -256,12 +256,20 @@ def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
         before = {label: (h.value, h.visible, h.disabled) for label, h in handles.items()}
         told = other.counts["GuiUpdateMessage"]
         for label, updates in (
-            ("field", {"visible": False}), ("field", {"removed": True}), ("field", {"disabled": True}),
-            ("field", {"value": "pause", "visible": False}), ("field", {"value": "format the disk"}),
-            ("field", {"options": []}), ("view", {"value": "<script>"}), ("view", {"value": ["points"]}),
-            ("occlusion", {"value": 7}), ("occlusion", {"value": "yes"}), ("value", {"value": float("nan")}),
-            ("value", {"value": None}), ("field", {}),
-        ):  # fmt: skip
+            ("field", {"visible": False}),
+            ("field", {"removed": True}),
+            ("field", {"disabled": True}),
+            ("field", {"value": "pause", "visible": False}),
+            ("field", {"value": "format the disk"}),
+            ("field", {"options": []}),
+            ("view", {"value": "<script>"}),
+            ("view", {"value": ["points"]}),
+            ("occlusion", {"value": 7}),
+            ("occlusion", {"value": "yes"}),
+            ("value", {"value": float("nan")}),
+            ("value", {"value": None}),
+            ("field", {}),
+        ):
             visitor.send("GuiUpdateMessage", uuid=handles[label]._impl.uuid, updates=updates)
             time.sleep(0.06)
         visitor.send("GuiUpdateMessage", uuid="another", updates={"value": True})
@@ -283,13 +291,26 @@ def test_viewpoints_that_nobody_can_have_are_not_rendered() -> None:
         visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
         (client,) = page._server.get_clients().values()
         good = {
-            "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1], "fov": 0.9, "near": 0.01, "far": 1e3,
-            "image_height": 600, "image_width": 800, "look_at": [0.0, 0, 0], "up_direction": [0.0, 0, 1],
-        }  # fmt: skip
+            "wxyz": [1.0, 0, 0, 0],
+            "position": [0.0, 0, 1],
+            "fov": 0.9,
+            "near": 0.01,
+            "far": 1e3,
+            "image_height": 600,
+            "image_width": 800,
+            "look_at": [0.0, 0, 0],
+            "up_direction": [0.0, 0, 1],
+        }
         for wrong in (
-            {"image_width": 10**9}, {"image_height": 0}, {"fov": 0.0}, {"fov": 4.0}, {"wxyz": [0.0, 0, 0, 0]},
-            {"position": [float("nan"), 0, 0]}, {"position": [1.0]}, {"more": 1},
-        ):  # fmt: skip
+            {"image_width": 10**9},
+            {"image_height": 0},
+            {"fov": 0.0},
+            {"fov": 4.0},
+            {"wxyz": [0.0, 0, 0, 0]},
+            {"position": [float("nan"), 0, 0]},
+            {"position": [1.0]},
+            {"more": 1},
+        ):
             visitor.send("ViewerCameraMessage", **(good | wrong))
         visitor.send("ViewerCameraMessage", **(good | {"position": [0.0, 0, 2]}))
         wait_until(lambda: client.camera.position[2] == 2, "the good one did not arrive")
@@ -301,12 +322,15 @@ def test_nothing_is_uploaded() -> None:
         visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
         uuid = control(page, "field")._impl.uuid
         visitor.send(
-            "FileTransferStartUpload", source_component_uuid=uuid, transfer_uuid="t", filename="f",
-            mime_type="x", part_count=2, size_bytes=3 * 10**8,
-        )  # fmt: skip
-        visitor.send(
-            "FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part=0, content=bytes(1000)
+            "FileTransferStartUpload",
+            source_component_uuid=uuid,
+            transfer_uuid="t",
+            filename="f",
+            mime_type="x",
+            part_count=2,
+            size_bytes=3 * 10**8,
         )
+        visitor.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part=0, content=bytes(1000))
         at = door_of(page)
         wait_until(lambda: sum(at.refused.values()) == 2, "they were not refused")
         assert not page._server.gui._current_file_upload_states
@@ -410,9 +434,7 @@ def test_clicks_come_no_faster_than_a_persons() -> None:
         visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
         (client,) = page._server.get_clients().values()
         for _ in range(500):
-            visitor.send(
-                "GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": "snapshot"}
-            )
+            visitor.send("GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": "snapshot"})
         visitor.wait_for(lambda: sum(door_of(page).refused.values()) > 400, "refusals")
         client.add_notification("last", "one")
         visitor.wait_for(lambda: visitor.counts["NotificationShowMessage"], "a notification")

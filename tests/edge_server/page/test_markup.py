@@ -16,9 +16,21 @@ from freshfield.scenario import ScenarioError, parse
 
 
 def summary(**changes) -> markup.Summary:
-    values = dict(scenario="room", field="ngp", doing="fitting", condition="live", updates=41,
-                  update_ms=812.4, psnr_db=25.31, scored_on="cam00", mean_age_ms=130.2, worst_age_ms=411.0,
-                  reporting=12, cameras=13, t_s=75.0)  # fmt: skip
+    values = dict(
+        scenario="room",
+        field="ngp",
+        doing="fitting",
+        condition="live",
+        updates=41,
+        update_ms=812.4,
+        psnr_db=25.31,
+        scored_on="cam00",
+        mean_age_ms=130.2,
+        worst_age_ms=411.0,
+        reporting=12,
+        cameras=13,
+        t_s=75.0,
+    )
     return markup.Summary(**(values | changes))
 
 
@@ -38,15 +50,15 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
     assert parts == pytest.approx({"network": 50.0, "waiting": 30.0, "computing": 20.0, "display": 25.0})
     html = markup.status(summary(age_parts_ms=parts))
     assert "125 ms" in html and "width:40.0%" in html
-    assert (
-        age_parts_ms([publication(0.0, 50.0)]) == age_parts_ms([publication(t, None) for t in (0, 1)]) == {}
-    )
+    assert age_parts_ms([publication(0.0, 50.0)]) == age_parts_ms([publication(t, None) for t in (0, 1)]) == {}
     assert "age of what is shown" not in markup.status(summary())
 
 
 def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
-    points = tuple(FrontierPoint(e, {}, 1.0, ms, db, db - 4.0) for e, ms, db in
-                   (("low", 50.0, 20.0), ("low", 800.0, 24.0), ("high", 200.0, 28.0)))  # fmt: skip
+    points = tuple(
+        FrontierPoint(e, {}, 1.0, ms, db, db - 4.0)
+        for e, ms, db in (("low", 50.0, 20.0), ("low", 800.0, 24.0), ("high", 200.0, 28.0))
+    )
     found = Frontier(points, 1.0, "f.json, at <1> m/s")
     html = markup.frontier(found, "low", None)
     assert html.count("<polyline") == 4 and html.count('stroke-width="1.8"') == 2 and "<circle" not in html
@@ -100,8 +112,7 @@ def test_the_table_marks_age_truth_use_and_refusals():
 
 
 def test_the_channels_state_stands_out_among_all_its_states():
-    channel = {"state": "high", "states": ["low", "high<"], "uptime_s": 12.5,
-               "series": [[3.0, "low"], [9.0, "high"]]}  # fmt: skip
+    channel = {"state": "high", "states": ["low", "high<"], "uptime_s": 12.5, "series": [[3.0, "low"], [9.0, "high"]]}
     html = markup.channel_state(channel | {"states": ["low", "high"]})
     low, high = html.split("</span>")[:2]
     assert "high" in high and "600" in high and "600" not in low and "for 3.5 s" in html
@@ -111,8 +122,13 @@ def test_the_channels_state_stands_out_among_all_its_states():
 
 def test_the_scores_of_policies_say_where_they_are_from():
     row = {"own_seed": {"psnr_db": 27.96, "views": 12.0}, "psnr_db_over_all": [-0.03, -0.11, 0.05]}
-    scores = {"policies": {"all": row, "<learnt>": row}, "seconds": 10.0, "seed": 7, "seeds": 12,
-              "machine": {"cpu": "a machine", "cores": 2}}  # fmt: skip
+    scores = {
+        "policies": {"all": row, "<learnt>": row},
+        "seconds": 10.0,
+        "seed": 7,
+        "seeds": 12,
+        "machine": {"cpu": "a machine", "cores": 2},
+    }
     html = markup.policy_scores(scores)
     for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learnt&gt;"):
         assert part in html
@@ -120,8 +136,7 @@ def test_the_scores_of_policies_say_where_they_are_from():
 
 
 ROW = {"own_seed": {"psnr_db": None, "views": 12.0}}
-SCORES = {"policies": {"all": ROW}, "seconds": 8.0, "seed": 7, "seeds": 12,
-          "machine": {"cpu": "a machine", "cores": 2}}  # fmt: skip
+SCORES = {"policies": {"all": ROW}, "seconds": 8.0, "seed": 7, "seeds": 12, "machine": {"cpu": "a machine", "cores": 2}}
 
 
 @pytest.mark.parametrize(
@@ -146,8 +161,14 @@ def test_scores_that_the_page_cannot_show_are_refused_when_read(tmp_path, change
 
 
 def test_the_channel_line_shows_only_what_the_emulator_reports():
-    line = markup.channel_line({"preset": "ch5", "discipline": "drop-new", "drawn_delay_ms": {"mean": 60.4},
-                                "counts": {"forwarded": 481, "dropped_busy": 12, "lost": 0}})  # fmt: skip
+    line = markup.channel_line(
+        {
+            "preset": "ch5",
+            "discipline": "drop-new",
+            "drawn_delay_ms": {"mean": 60.4},
+            "counts": {"forwarded": 481, "dropped_busy": 12, "lost": 0},
+        }
+    )
     for part in ("ch5", "drop-new", "mean delay 60 ms", "481 forwarded", "12 dropped busy"):
         assert part in line
     assert "lost" not in line

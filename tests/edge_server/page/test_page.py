@@ -75,10 +75,15 @@ def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
         raise ValueError("no policies here")
 
     return EdgeState(
-        scenario="bare", policies=(), controls=Controls("all", None), cameras=lambda: cameras or [],
-        start_ns=0, now_ns=time.monotonic_ns, set_policy=refuse,
+        scenario="bare",
+        policies=(),
+        controls=Controls("all", None),
+        cameras=lambda: cameras or [],
+        start_ns=0,
+        now_ns=time.monotonic_ns,
+        set_policy=refuse,
         save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
-    )  # fmt: skip
+    )
 
 
 def publication(number: int) -> Publication:
@@ -144,9 +149,8 @@ def test_effort_and_deadline_are_controls_where_the_field_has_them():
     asked = []
     frontier = Frontier((FrontierPoint("low", {}, 1.0, 50.0, 20.0, 16.0),), 1.0, "f.json")
     state = replace(
-        bare_state(), frontier=frontier, efforts=("low", "high"),
-        set_effort=asked.append, set_deadline=asked.append,
-    )  # fmt: skip
+        bare_state(), frontier=frontier, efforts=("low", "high"), set_effort=asked.append, set_deadline=asked.append
+    )
     state.controls.effort = "low"
     gui = MagicMock()
     for kind in (gui.add_number, gui.add_html):

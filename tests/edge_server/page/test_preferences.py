@@ -20,10 +20,7 @@ from tests.edge_server.page.browser import Browser
 
 COUNT, FRAMES, COLUMNS, SIDE = 6, 6, 3, 48
 NEW = PreferenceSession(
-    "tile",
-    tuple((k, k + 1) for k in range(COUNT)),
-    np.random.default_rng(0).normal(size=(COUNT, 3)),
-    wanted=9,
+    "tile", tuple((k, k + 1) for k in range(COUNT)), np.random.default_rng(0).normal(size=(COUNT, 3)), wanted=9
 )
 
 
@@ -44,9 +41,7 @@ def asked():
 
 def request(url, method, path, body=None, **headers):
     connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=10)
-    connection.request(
-        method, path, body if body is None or isinstance(body, bytes) else json.dumps(body), headers
-    )
+    connection.request(method, path, body if body is None or isinstance(body, bytes) else json.dumps(body), headers)
     answer = connection.getresponse()
     return answer.status, answer.read(), answer
 
@@ -74,8 +69,20 @@ def test_answers_are_of_the_pair_that_was_shown_and_nothing_is_answered_twice(as
 def test_the_page_is_blind(asked):
     """Neither addresses nor state say which reconstructions are shown, or that a pair is a repeated one."""
     _, url, _ = asked
-    expected = {"turn", "answered", "wanted", "open", "agreed", "repeated", "says", "finished", "plan",
-                "frames", "columns", "may_change"}  # fmt: skip
+    expected = {
+        "turn",
+        "answered",
+        "wanted",
+        "open",
+        "agreed",
+        "repeated",
+        "says",
+        "finished",
+        "plan",
+        "frames",
+        "columns",
+        "may_change",
+    }
     turns = set()
     for _ in range(9):
         now = state(url)
@@ -88,11 +95,14 @@ def test_the_page_is_blind(asked):
 @pytest.mark.parametrize(
     ("path", "body", "status"),
     [
-        ("/answer", b"no json", 400), ("/answer", b"[1]", 400), ("/answer", {"choice": "left"}, 409),
-        ("/import", b"{}", 400), ("/import", b"x" * 16 * MAX_BODY_BYTES, 413),
+        ("/answer", b"no json", 400),
+        ("/answer", b"[1]", 400),
+        ("/answer", {"choice": "left"}, 409),
+        ("/import", b"{}", 400),
+        ("/import", b"x" * 16 * MAX_BODY_BYTES, 413),
         ("/answer", b"[" * 90_000, 400),
     ],
-)  # fmt: skip
+)
 def test_bad_requests_change_nothing(asked, path, body, status):
     _, url, kept = asked
     found, text, _ = request(url, "POST", path, body)
@@ -155,8 +165,10 @@ def press(browser, key, code):
 
 
 def swipe(browser, dx):
-    box = browser.evaluate("(({x, y, width, height}) => [x + width / 2, y + height / 2])"
-                           "(document.getElementById('pair').getBoundingClientRect())")  # fmt: skip
+    box = browser.evaluate(
+        "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
+        "(document.getElementById('pair').getBoundingClientRect())"
+    )
     points = [{"x": box[0] + share * dx, "y": box[1]} for share in (0, 0.5, 1)]
     browser.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=points[:1])
     for point in points[1:]:
@@ -182,9 +194,7 @@ def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
 
         def ready(answered):
             browser.wait_for_text(f"{answered} of 9 answered")
-            browser.wait_for(
-                lambda: not browser.evaluate("document.getElementById('left').disabled"), "a pair"
-            )
+            browser.wait_for(lambda: not browser.evaluate("document.getElementById('left').disabled"), "a pair")
             asked = page.session.question
             assert gray(browser) == [asked.left, asked.right]
 
@@ -246,9 +256,7 @@ def test_a_whole_session_by_keys_and_touch(asked, tmp_path, width, height):
         browser.click_text("Finish and plan")
         browser.wait_for_text("Finished")
         assert page.finished.is_set() and len(page.session.answers) == 5 and browser.errors == []
-        page.show_plan(
-            ["candidate 3: the nearest"], cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
-        )
+        page.show_plan(["candidate 3: the nearest"], cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
         browser.wait_for_text("candidate 3: the nearest")
         assert page.seen.wait(5.0) and "Where to look" in browser.text()
         assert all(address.startswith(url) for address in browser.requests)

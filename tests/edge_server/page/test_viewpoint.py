@@ -86,9 +86,7 @@ def test_the_visitor_sees_the_rig_from_behind_and_above(spread_deg, share):
     assert 1.2 < np.linalg.norm(view.position - TARGET) / view.radius_m < 2.3
     camera = look_at(view.position, view.look_at, view.up)
     local = (eyes - camera[:3, 3]) @ camera[:3, :3]
-    seen = (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all(axis=1) & (
-        local[:, 2] > 0
-    )
+    seen = (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all(axis=1) & (local[:, 2] > 0)
     assert seen.mean() >= share
 
 

@@ -26,9 +26,13 @@ class Visitor:
     renderings; ``image``: the last one, encoded."""
 
     def __init__(
-        self, port: int, position: tuple[float, float, float] = (4.0, 0.0, 3.0), reads: bool = True,
-        size: tuple[int, int] = (800, 600), headers: Sequence[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        port: int,
+        position: tuple[float, float, float] = (4.0, 0.0, 3.0),
+        reads: bool = True,
+        size: tuple[int, int] = (800, 600),
+        headers: Sequence[str] = (),
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self.bytes = 0
         self.images = 0
@@ -36,10 +40,12 @@ class Visitor:
         self._size = size
         self._closing = False
         self._socket = websocket.create_connection(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], timeout=20,
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            timeout=20,
             header=list(headers),
             sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
-        )  # fmt: skip
+        )
         self.stand_at(position)
         self._thread = threading.Thread(target=self._read, daemon=True)
         if reads:
@@ -65,10 +71,17 @@ class Visitor:
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         self.send(
-            "ViewerCameraMessage", wxyz=list(viser.transforms.SO3.from_matrix(axes).wxyz), position=list(p),
-            fov=0.9, near=0.01, far=1000.0, image_width=self._size[0], image_height=self._size[1],
-            look_at=[0.0, 0.0, 0.0], up_direction=[0.0, 0.0, 1.0],
-        )  # fmt: skip
+            "ViewerCameraMessage",
+            wxyz=list(viser.transforms.SO3.from_matrix(axes).wxyz),
+            position=list(p),
+            fov=0.9,
+            near=0.01,
+            far=1000.0,
+            image_width=self._size[0],
+            image_height=self._size[1],
+            look_at=[0.0, 0.0, 0.0],
+            up_direction=[0.0, 0.0, 1.0],
+        )
 
     def send(self, kind: str, **fields: Any) -> None:
         data = msgspec.msgpack.encode(fields | {"type": kind}, enc_hook=float)

@@ -17,12 +17,17 @@ from tests.edge_server.report.ledgers import write
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
 SECONDS = 40.0
 EDGE = {
-    "scenario": "sample", "seed": 7, "field": "ngp", "policy": "threshold", "value": 120.0,
+    "scenario": "sample",
+    "seed": 7,
+    "field": "ngp",
+    "policy": "threshold",
+    "value": 120.0,
     "uptime_s": SECONDS,
     "updates": {"count": 50, "ms_p50": 800.0, "ms_p95": 900.0, "first_ms": 3100.0, "undecodable": 1},
-    "baseline": {"mean_colour_db": 14.5, "nearest_view_db": 13.8}, "lpips_missing": None,
+    "baseline": {"mean_colour_db": 14.5, "nearest_view_db": 13.8},
+    "lpips_missing": None,
     "lpips_network": "alex",
-}  # fmt: skip
+}
 CHANNEL = {
     "state_share": {"high": 0.4, "low": 0.6},
     "drawn_delay_ms": {
@@ -47,13 +52,23 @@ def publication(number: int) -> Publication:
     scored = number % 10 != 9
     psnr = 26.0 - 10.0 * 0.9**number
     return Publication(
-        number=number, t_s=t_s, published_ns=round(t_s * 1e9), omega_ms=120.0,
-        selected=CAMERAS[: 2 + number % 3], ages_ms=(80.0,) * (2 + number % 3), aaoi_ms=80.0 + number % 7,
-        steps=40, update_ms=740.0 + 3 * (number % 11), psnr_db=psnr if scored else None,
-        psnr_moving_db=psnr - 4 if scored else None, ssim=psnr / 30 if scored else None,
-        lpips=0.6 - psnr / 60 if scored else None, truth_gap_ms=3.0 if scored else None,
-        scored_on="cam00" if scored else None, refused=("cam02",) if number % 20 == 5 else (),
-    )  # fmt: skip
+        number=number,
+        t_s=t_s,
+        published_ns=round(t_s * 1e9),
+        omega_ms=120.0,
+        selected=CAMERAS[: 2 + number % 3],
+        ages_ms=(80.0,) * (2 + number % 3),
+        aaoi_ms=80.0 + number % 7,
+        steps=40,
+        update_ms=740.0 + 3 * (number % 11),
+        psnr_db=psnr if scored else None,
+        psnr_moving_db=psnr - 4 if scored else None,
+        ssim=psnr / 30 if scored else None,
+        lpips=0.6 - psnr / 60 if scored else None,
+        truth_gap_ms=3.0 if scored else None,
+        scored_on="cam00" if scored else None,
+        refused=("cam02",) if number % 20 == 5 else (),
+    )
 
 
 def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
@@ -88,10 +103,7 @@ def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
     write(out, "edge", edge)
     rows = [
         {"t_s": 2.0 * i}
-        | {
-            "edge": {"rss_mb": 600.0 + i, "cpu": 1.4, "pid": 2},
-            "emulator": {"rss_mb": 60.0, "cpu": 0.1, "pid": 3},
-        }
+        | {"edge": {"rss_mb": 600.0 + i, "cpu": 1.4, "pid": 2}, "emulator": {"rss_mb": 60.0, "cpu": 0.1, "pid": 3}}
         | {f"node-{c}": {"rss_mb": 90.0, "cpu": 0.02, "pid": 4} for c in CAMERAS}
         for i in range(20)
     ]

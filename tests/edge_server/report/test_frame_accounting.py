@@ -38,42 +38,85 @@ def test_counts_balance_only_if_both_sums_hold():
 RUNS = {
     "every end of a frame": (
         [*sent(*range(9)), (10, "captured"), (10, "replaced"), (11, "captured"), (11, "waiting")],
-        [*((i, "received") for i in range(9)), (0, "skipped"), (1, "dropped_busy"), (2, "superseded"),
-         (3, "lost"), (4, "broken"), (5, "rejected", "crc"), (6, "forwarded"), (7, "forwarded"),
-         (8, "in_flight")],
+        [
+            *((i, "received") for i in range(9)),
+            (0, "skipped"),
+            (1, "dropped_busy"),
+            (2, "superseded"),
+            (3, "lost"),
+            (4, "broken"),
+            (5, "rejected", "crc"),
+            (6, "forwarded"),
+            (7, "forwarded"),
+            (8, "in_flight"),
+        ],
         [(6, "delivered"), (7, "rejected", "time_reversed")],
-        {"captured": 11, "replaced": 1, "waiting": 1, "sent": 9, "skipped": 1, "dropped_busy": 1,
-         "superseded": 1, "lost": 1, "broken": 1, "delivered": 1,
-         "rejected": {"crc": 1, "time_reversed": 1}, "in_flight": 1},
+        {
+            "captured": 11,
+            "replaced": 1,
+            "waiting": 1,
+            "sent": 9,
+            "skipped": 1,
+            "dropped_busy": 1,
+            "superseded": 1,
+            "lost": 1,
+            "broken": 1,
+            "delivered": 1,
+            "rejected": {"crc": 1, "time_reversed": 1},
+            "in_flight": 1,
+        },
         "1 in flight, last written by ledger-emulator",
     ),
     "each copy": (
         sent(0, 1, 2),
-        [*((i, event) for i in range(3) for event in ("received", "duplicated", "forwarded")),
-         (0, "forwarded"), (1, "broken"), (2, "in_flight")],
+        [
+            *((i, event) for i in range(3) for event in ("received", "duplicated", "forwarded")),
+            (0, "forwarded"),
+            (1, "broken"),
+            (2, "in_flight"),
+        ],
         [(0, "delivered"), (0, "rejected", "replayed_sequence"), (1, "delivered"), (2, "delivered")],
-        {"captured": 3, "sent": 3, "duplicated": 3, "delivered": 3, "rejected": {"replayed_sequence": 1},
-         "broken": 1, "in_flight": 1}, "",
+        {
+            "captured": 3,
+            "sent": 3,
+            "duplicated": 3,
+            "delivered": 3,
+            "rejected": {"replayed_sequence": 1},
+            "broken": 1,
+            "in_flight": 1,
+        },
+        "",
     ),
     "a node without emulator": (
-        sent(0, 1), None, [(0, "delivered"), (1, "rejected", "too_old")],
-        {"captured": 2, "sent": 2, "delivered": 1, "rejected": {"too_old": 1}}, "",
+        sent(0, 1),
+        None,
+        [(0, "delivered"), (1, "rejected", "too_old")],
+        {"captured": 2, "sent": 2, "delivered": 1, "rejected": {"too_old": 1}},
+        "",
     ),
     "a delivery at the edge outranks a broken stream": (
-        [*sent(0, 1), (0, "broken"), (1, "broken")], [(0, "received"), (0, "forwarded"), (0, "broken")],
-        [(0, "delivered")], {"captured": 2, "sent": 2, "delivered": 1, "broken": 1}, "",
+        [*sent(0, 1), (0, "broken"), (1, "broken")],
+        [(0, "received"), (0, "forwarded"), (0, "broken")],
+        [(0, "delivered")],
+        {"captured": 2, "sent": 2, "delivered": 1, "broken": 1},
+        "",
     ),
     "an answer, where the emulator's ledger is elsewhere": (
-        [*sent(0, 1, 2), (0, "answered", "dropped-busy"), (1, "answered", "rejected:crc"),
-         (2, "answered", "accepted")], None, [(2, "delivered")],
-        {"captured": 3, "sent": 3, "dropped_busy": 1, "delivered": 1, "rejected": {"crc": 1}}, "",
+        [*sent(0, 1, 2), (0, "answered", "dropped-busy"), (1, "answered", "rejected:crc"), (2, "answered", "accepted")],
+        None,
+        [(2, "delivered")],
+        {"captured": 3, "sent": 3, "dropped_busy": 1, "delivered": 1, "rejected": {"crc": 1}},
+        "",
     ),
     "an unknown event": (
-        [*sent(0), (0, "teleported")], None, [(0, "delivered")], {"captured": 1, "sent": 1, "delivered": 1},
+        [*sent(0), (0, "teleported")],
+        None,
+        [(0, "delivered")],
+        {"captured": 1, "sent": 1, "delivered": 1},
         "teleported",
     ),
     "nothing": (None, None, None, {}, ""),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -194,23 +237,40 @@ LOST, DELIVERED = (0, "lost"), (0, "delivered")
 @pytest.mark.parametrize(
     "node, emulator, edge, message, expected",
     [
-        (sent(0), [(0, "received"), (0, "dropped_busy")], [DELIVERED],
-         "reached the edge 1 times but was forwarded 0", {"delivered": 1, "dropped_busy": 1}),
-        (sent(0), [(0, "received"), (0, "forwarded")], [DELIVERED, DELIVERED],
-         "reached the edge 2 times but only 1", {"delivered": 2}),
-        ([(0, "captured"), (0, "replaced")], [(0, "received"), LOST], [],
-         "replaced at the node, yet sent", {"lost": 1}),
+        (
+            sent(0),
+            [(0, "received"), (0, "dropped_busy")],
+            [DELIVERED],
+            "reached the edge 1 times but was forwarded 0",
+            {"delivered": 1, "dropped_busy": 1},
+        ),
+        (
+            sent(0),
+            [(0, "received"), (0, "forwarded")],
+            [DELIVERED, DELIVERED],
+            "reached the edge 2 times but only 1",
+            {"delivered": 2},
+        ),
+        (
+            [(0, "captured"), (0, "replaced")],
+            [(0, "received"), LOST],
+            [],
+            "replaced at the node, yet sent",
+            {"lost": 1},
+        ),
         ([(0, "captured")], [], [DELIVERED], "never wrote that it was sent", {"delivered": 1}),
-        (sent(0), [(0, "received"), LOST, (0, "skipped")], [],
-         "1 copies, but 0 forwarded and 2", {"lost": 1, "skipped": 1}),
-        (sent(0), [(0, "received"), LOST, (0, "forwarded")], [],
-         "1 forwarded and 1 ended before", {"lost": 1}),
+        (
+            sent(0),
+            [(0, "received"), LOST, (0, "skipped")],
+            [],
+            "1 copies, but 0 forwarded and 2",
+            {"lost": 1, "skipped": 1},
+        ),
+        (sent(0), [(0, "received"), LOST, (0, "forwarded")], [], "1 forwarded and 1 ended before", {"lost": 1}),
         ([(0, "sent")], [], [DELIVERED], "wrote captured 0 times", {"delivered": 1}),
     ],
-)  # fmt: skip
-def test_contradictions_are_listed_and_every_end_counts_as_written(
-    tmp_path, node, emulator, edge, message, expected
-):
+)
+def test_contradictions_are_listed_and_every_end_counts_as_written(tmp_path, node, emulator, edge, message, expected):
     write(tmp_path, "node", node)
     if emulator:
         write(tmp_path, "emulator", emulator)
@@ -233,8 +293,11 @@ def test_many_contradictions_are_counted_but_not_all_listed(tmp_path):
 def test_counts_by_camera_add_up_to_the_total(tmp_path):
     lines = [(c, "s", i, e) for c in ("a", "b") for i in range(5) for e in ("captured", "sent")]
     write(tmp_path, "node", lines)
-    write(tmp_path, "emulator", [(c, "s", i, "in_flight") for c, end in (("a", 1), ("b", 2))
-                                 for i in range(5) if i != end])  # fmt: skip
+    write(
+        tmp_path,
+        "emulator",
+        [(c, "s", i, "in_flight") for c, end in (("a", 1), ("b", 2)) for i in range(5) if i != end],
+    )
     write(tmp_path, "edge", [("a", "s", 1, "delivered"), ("b", "s", 2, "rejected", "crc")])
     found = account_frames(tmp_path).as_dict()
     assert found["by_camera"]["a"]["delivered"] == 1 and found["by_camera"]["b"]["rejected"] == {"crc": 1}
@@ -272,8 +335,7 @@ def test_lines_lost_to_a_full_disk_are_no_contradiction_and_do_not_close(tmp_pat
 
 def test_a_long_run_is_joined_in_little_memory(tmp_path):
     frames = 50_000
-    files = {"node": ("captured", "sent", "answered"), "emulator": ("received", "forwarded"),
-             "edge": ("delivered",)}  # fmt: skip
+    files = {"node": ("captured", "sent", "answered"), "emulator": ("received", "forwarded"), "edge": ("delivered",)}
     for role, events in files.items():
         path = write(tmp_path, role, [], closed=False)
         with path.open("a") as file:

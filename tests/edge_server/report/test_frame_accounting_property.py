@@ -15,11 +15,19 @@ from tests.edge_server.report.ledgers import write
 EVENTS = {
     "node": ["captured", "replaced", "waiting", "sent", "broken", "answered"],
     "emulator": [
-        "received", "skipped", "dropped_busy", "superseded", "lost", "rejected", "forwarded", "duplicated",
-        "broken", "in_flight",
+        "received",
+        "skipped",
+        "dropped_busy",
+        "superseded",
+        "lost",
+        "rejected",
+        "forwarded",
+        "duplicated",
+        "broken",
+        "in_flight",
     ],
     "edge": ["delivered", "rejected"],
-}  # fmt: skip
+}
 
 
 def lines_of(role):
@@ -52,9 +60,21 @@ def test_terms_of_any_ledgers_are_as_written(ledgers, closed):
 
 # What really becomes of one frame.
 FATES = st.sampled_from(
-    ["waiting", "replaced", "sent", "received", "skipped", "dropped_busy", "superseded", "lost", "forwarded",
-     "delivered", "rejected", "doubled"]
-)  # fmt: skip
+    [
+        "waiting",
+        "replaced",
+        "sent",
+        "received",
+        "skipped",
+        "dropped_busy",
+        "superseded",
+        "lost",
+        "forwarded",
+        "delivered",
+        "rejected",
+        "doubled",
+    ]
+)
 
 
 def ledger_lines(fate):
@@ -97,9 +117,7 @@ def test_counts_are_true_even_if_every_process_is_killed(fates, data):
             lines = [line for line in written[:alive] if line[1] == role]
             torn = lines[-1:] if role == torn_role else []
             lines = lines[: len(lines) - len(torn)]
-            path = write(
-                Path(folder), role, [(i, e, d) for i, _, e, d in lines], closed=alive == len(written)
-            )
+            path = write(Path(folder), role, [(i, e, d) for i, _, e, d in lines], closed=alive == len(written))
             if torn:
                 with path.open("ab") as file:
                     file.write(b"99\ta\ts\t" + str(torn[0][0]).encode())

@@ -87,9 +87,16 @@ def fit_console(folder: Path, on: str) -> str:
 
 
 PLACES = (
-    page_tile, page_pair, page_chart, report_page, report_figure, console_table, console_summary, metrics,
+    page_tile,
+    page_pair,
+    page_chart,
+    report_page,
+    report_figure,
+    console_table,
+    console_summary,
+    metrics,
     fit_console,
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)

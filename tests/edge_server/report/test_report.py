@@ -29,14 +29,31 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     assert json.loads((out / "report.json").read_text()) == report
     assert (report["scenario"], report["seed"], report["seconds"]) == ("sample", 7, SECONDS)
     assert set(report["frames"]) >= {
-        "captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
-        "duplicated", "delivered", "rejected", "in_flight",
-    }  # fmt: skip
+        "captured",
+        "replaced",
+        "waiting",
+        "sent",
+        "skipped",
+        "dropped_busy",
+        "superseded",
+        "lost",
+        "broken",
+        "duplicated",
+        "delivered",
+        "rejected",
+        "in_flight",
+    }
     assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
     assert set(report["updates"]) == {
-        "count", "ms_p50", "ms_p95", "first_ms", "undecodable", "shed", "without_step",
+        "count",
+        "ms_p50",
+        "ms_p95",
+        "first_ms",
+        "undecodable",
+        "shed",
+        "without_step",
         "refused",
-    }  # fmt: skip
+    }
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
     assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
     assert report["fidelity"]["lpips_missing"] is None
@@ -56,8 +73,12 @@ def test_frames_close(run):
 def test_what_was_shown_and_what_its_age_consists_of(run):
     shown = run[1]["fidelity"]["shown"]
     assert [shown[k] for k in ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")] == [
-        24.0, 17.0, 26.0, 0.8, None,
-    ]  # fmt: skip
+        24.0,
+        17.0,
+        26.0,
+        0.8,
+        None,
+    ]
     late = [p for i in range(49) if (p := publication(i)).t_s + 0.1 >= 0.8 * SECONDS]
     age = shown["age_ms"]
     assert shown["count"] == len(late) and age["network"] == 50.0
@@ -130,8 +151,15 @@ def test_the_report_says_of_how_many_images_the_object_was_cut_out_and_why_not_o
     write_run(tmp_path)
     assert "cut out of" not in (build_report(tmp_path) and (tmp_path / "report.html").read_text())
     edge = json.loads((tmp_path / "edge.json").read_text())
-    cut = {"masked": 41, "not_detected": 3, "empty_box": 0, "empty_mask": 0, "full_mask": 1, "failed": 0,
-           "ms_per_image": 2.4}  # fmt: skip
+    cut = {
+        "masked": 41,
+        "not_detected": 3,
+        "empty_box": 0,
+        "empty_mask": 0,
+        "full_mask": 1,
+        "failed": 0,
+        "ms_per_image": 2.4,
+    }
     (tmp_path / "edge.json").write_text(json.dumps(edge | {"foreground": cut}))
     assert build_report(tmp_path)["foreground"] == cut
     page = (tmp_path / "report.html").read_text()
@@ -150,8 +178,14 @@ def test_every_figure_is_drawn_and_inside_the_page(run):
 
 def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
     assert "mesh" not in run[1] and "<h2>Mesh" not in (run[0] / "report.html").read_text()
-    measured = {"chamfer_mm": 6.926, "complete": 0.6074, "accuracy_median_mm": 1.1, "within_mm": 3.0,
-                "target_chamfer_mm": 1.5, "target_complete": 0.95}  # fmt: skip
+    measured = {
+        "chamfer_mm": 6.926,
+        "complete": 0.6074,
+        "accuracy_median_mm": 1.1,
+        "within_mm": 3.0,
+        "target_chamfer_mm": 1.5,
+        "target_complete": 0.95,
+    }
     mesh = {
         "file": "tile.ply",
         "triangles": 19794,
@@ -173,8 +207,7 @@ def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "torn",
-    ['{"file": "a.ply"}', '{"file": "a.ply", "measured": {}, "stages_s": [], "triangles": 1}', "{", "[]"],
+    "torn", ['{"file": "a.ply"}', '{"file": "a.ply", "measured": {}, "stages_s": [], "triangles": 1}', "{", "[]"]
 )
 def test_a_damaged_mesh_file_adds_a_note(tmp_path, torn):
     write_run(tmp_path)
@@ -183,9 +216,7 @@ def test_a_damaged_mesh_file_adds_a_note(tmp_path, torn):
     assert "mesh" not in report and any("mesh.json left out" in note for note in report["notes"])
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"mesh": "../tile.ply"}, {"mesh": "tile.obj"}, {"mesh": "a.ply", "voxel_mm": 0}]
-)
+@pytest.mark.parametrize("wrong", [{"mesh": "../tile.ply"}, {"mesh": "tile.obj"}, {"mesh": "a.ply", "voxel_mm": 0}])
 def test_an_export_that_cannot_be_made_is_refused_when_the_scenario_is_read(wrong):
     with pytest.raises(ValueError, match=next(reversed(wrong))):
         ExportConfig(**wrong)
@@ -282,7 +313,7 @@ DEEP = "[" * 100_000
         ("processes.jsonl", '{"t_s": {}, "edge": {"cpu": 1}}', "processes.jsonl: 1 of 1 lines"),
         ("processes.jsonl", '{"t_s": 1, "edge": {"cpu": "x"}}', "processes.jsonl: 1 of 1 lines"),
     ],
-)  # fmt: skip
+)
 def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
     write_run(tmp_path, publications=2, ages=2)
     (tmp_path / file).write_text(text)

@@ -54,9 +54,7 @@ def test_wait_counts_only_what_was_generated_after_the_decision():
 def test_wait_arrived_counts_what_came_in_meanwhile_however_old():
     policy = make_policy("wait-arrived", 60, np.random.default_rng(0))
     window = policy.plan(AT)
-    assert (window.wait_until_ns, window.generated_after_ns, window.received_after_ns) == (
-        260 * MS, None, 200 * MS,
-    )  # fmt: skip
+    assert (window.wait_until_ns, window.generated_after_ns, window.received_after_ns) == (260 * MS, None, 200 * MS)
     at = replace(epoch(260, a=100, b=201, c=150), received_ns={"a": 220 * MS, "b": 230 * MS, "c": 200 * MS})
     assert policy.select(at, window) == ("a", "b")
 
@@ -83,9 +81,7 @@ def test_whittle_serves_whom_the_field_knows_least_of_and_counts_what_it_used():
     def ask(at: Epoch) -> tuple[str, ...]:
         return policy.select(at, policy.plan(at))
 
-    assert ask(epoch(10, a=8, b=9)) == ("a",) and ask(epoch(10, a=8, b=9)) == (
-        "b",
-    )  # once each, unseen first
+    assert ask(epoch(10, a=8, b=9)) == ("a",) and ask(epoch(10, a=8, b=9)) == ("b",)  # once each, unseen first
     assert ask(epoch(20, a=8, b=9)) == ("a",)  # nothing new: no gain anywhere, ties go by order
     assert ask(epoch(20, a=8, b=19)) == ("b",)
     # Known 12 and 1 old, to become 10 and 0.
@@ -174,11 +170,18 @@ def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, no
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("threshold", -1), ("wait", float("nan")), ("freshest-k", 0), ("round-robin", 2.5), ("random", 0),
-        ("wait", 1e308), ("wait-arrived", float("inf")), ("periodic", 3.7e6), ("round-robin", float("inf")),
+        ("threshold", -1),
+        ("wait", float("nan")),
+        ("freshest-k", 0),
+        ("round-robin", 2.5),
+        ("random", 0),
+        ("wait", 1e308),
+        ("wait-arrived", float("inf")),
+        ("periodic", 3.7e6),
+        ("round-robin", float("inf")),
         ("random", float("nan")),
     ],
-)  # fmt: skip
+)
 def test_a_value_out_of_range_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match="expected"):
         make_policy(name, value, np.random.default_rng(0))
@@ -186,10 +189,11 @@ def test_a_value_out_of_range_is_refused_by_name(name, value):
 
 def test_an_unknown_policy_lists_the_known_ones():
     for name, why in (
-        ("best", "'best' is not known; choose one of .*freshest-k"), ("wait+", r"'wait\+' is not known"),
+        ("best", "'best' is not known; choose one of .*freshest-k"),
+        ("wait+", r"'wait\+' is not known"),
         ("best+mask", "'best' is not known"),
         ("wait+best", "no treatment 'best'; .* choose one of mask, freshen"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=why):
             make_policy(name, None, np.random.default_rng(0))
 

@@ -73,9 +73,7 @@ def test_all_that_is_offered_can_be_made_and_has_help():
     assert TREATMENTS["mask"][2] in policy_help("threshold+mask")
 
 
-@pytest.mark.parametrize(
-    ("name", "treatment"), [("threshold", None), ("mask", "mask"), ("all+freshen", "freshen")]
-)
+@pytest.mark.parametrize(("name", "treatment"), [("threshold", None), ("mask", "mask"), ("all+freshen", "freshen")])
 def test_only_the_treatment_asked_for_is_imported(name, treatment):
     script = (
         "import sys, numpy as np; from edge_server.scheduler import make_policy;"

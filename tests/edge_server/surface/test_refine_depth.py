@@ -75,10 +75,7 @@ def trench(pose, half_m=0.012, deep_m=0.03) -> tuple[np.ndarray, np.ndarray]:
 
 
 def maps_of(shown, wrong=1.0) -> tuple[list[DepthMap], list[np.ndarray]]:
-    maps = [
-        depth_map((d * wrong).astype(np.float32), picture, pose, LENS)
-        for (d, picture), pose in zip(shown, POSES)
-    ]
+    maps = [depth_map((d * wrong).astype(np.float32), picture, pose, LENS) for (d, picture), pose in zip(shown, POSES)]
     return maps, [picture for _, picture in shown]
 
 
@@ -198,9 +195,7 @@ def test_a_camera_without_overlap_changes_nothing(rig):
 
 def test_depth_that_no_map_confirms_is_hardly_trusted(rig):
     maps, pictures, _ = rig
-    noise = [
-        np.random.default_rng(k).integers(0, 255, p.shape, dtype=np.uint8) for k, p in enumerate(pictures)
-    ]
+    noise = [np.random.default_rng(k).integers(0, 255, p.shape, dtype=np.uint8) for k, p in enumerate(pictures)]
     trust = np.concatenate([m.trust[before.seen] for m, before in zip(refine_depth(maps, noise, POOL), maps)])
     assert np.mean(trust <= 0.1) > 0.8
 

@@ -65,9 +65,7 @@ def test_geometric_selectors_take_the_budget_once_each_and_repeat_by_seed(name):
 
 
 def test_spread_selectors_spread_and_travel_weight_shortens_the_path():
-    orders = {
-        name: plan_capture(DOME, make_selector(name), Budget(views=9), take, seed=1) for name in GEOMETRIC
-    }
+    orders = {name: plan_capture(DOME, make_selector(name), Budget(views=9), take, seed=1) for name in GEOMETRIC}
     for name in ("uniform", "farthest", "coverage"):
         assert smallest_angle(orders[name].order) > 1.5 * smallest_angle(orders["random"].order)
     short = plan_capture(DOME, make_selector("uniform"), Budget(views=9), take, seed=1, travel_weight=0.5)

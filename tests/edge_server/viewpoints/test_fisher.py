@@ -90,9 +90,7 @@ def test_fisher_works_on_a_field_that_is_being_captured():
     lens = Pinhole.from_fov(32, 32, 50.0)
     candidates = half_hemisphere((0, 0, 0), 2.0, lens, 6)
     rng = np.random.default_rng(0)
-    views = [
-        View(f"v{k}", rng.integers(0, 255, (32, 32, 3), np.uint8), candidates.poses[k], lens) for k in (0, 3)
-    ]
+    views = [View(f"v{k}", rng.integers(0, 255, (32, 32, 3), np.uint8), candidates.poses[k], lens) for k in (0, 3)]
     field = SplatField(TINY)
     field.fit(views, Budget(steps=5))
     state = CaptureState(candidates, 4, rng, lambda given: field, [0, 3], views)

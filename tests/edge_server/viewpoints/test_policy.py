@@ -77,11 +77,7 @@ def test_embeddings_of_captured_pictures_are_part_of_the_state():
     embeddings = np.random.default_rng(0).normal(size=(30, 3))
     short = PolicyConfig(views=4, updates=1, episodes=6, hidden=8)
     policy, _ = train_policy(
-        DOME,
-        height,
-        short,
-        embeddings=embeddings,
-        embed=lambda images: embeddings[[i[0, 0, 0] for i in images]],
+        DOME, height, short, embeddings=embeddings, embed=lambda images: embeddings[[i[0, 0, 0] for i in images]]
     )
     state = CaptureState(DOME, 4, np.random.default_rng(0), None, [5, 9], [take(5), take(9)])
     values = policy.values(state)

@@ -90,15 +90,10 @@ def test_the_posterior_is_that_of_the_likelihood():
     """Against the exact posterior of two weights on a grid."""
     rng = np.random.default_rng(0)
     features = rng.normal(size=(30, 2))
-    answers = [
-        Answer(i, j, bool(features[i, 0] > features[j, 0]))
-        for i, j in rng.permutation(30)[:20].reshape(10, 2)
-    ]
+    answers = [Answer(i, j, bool(features[i, 0] > features[j, 0])) for i, j in rng.permutation(30)[:20].reshape(10, 2)]
     model = fit_reward(features, answers)
     w = np.stack(np.meshgrid(*[np.linspace(-40, 40, 401)] * 2), -1).reshape(-1, 2)
-    x = np.array(
-        [(features[a.first] - features[a.second]) / model.scale * (2 * a.prefers_first - 1) for a in answers]
-    )
+    x = np.array([(features[a.first] - features[a.second]) / model.scale * (2 * a.prefers_first - 1) for a in answers])
     first, second = np.array([0, 4, 9]), np.array([7, 2, 5])
     best = None
     for prior in (0.1, 0.3, 1.0, 3.0, 10.0):
@@ -139,14 +134,10 @@ def test_tastes_prefer_the_better_picture_each_by_its_own_measure(taste):
     inside, outside = truth.copy(), truth.copy()
     inside[10:22, 10:22] += 0.2
     outside[:6] -= 0.3
-    scores = {
-        name: judge(taste, [p], [truth]) for name, p in (("same", truth), ("in", inside), ("out", outside))
-    }
+    scores = {name: judge(taste, [p], [truth]) for name, p in (("same", truth), ("in", inside), ("out", outside))}
     assert scores["same"] == 0.0 >= max(scores.values())
     assert scores["in"] < 0.0 and (scores["out"] == 0.0) == (taste == "object")
-    assert (
-        SimulatedExpert(taste, np.zeros(2), rng, wrong=0.1).label == f"simulated expert ({taste}, 10 % wrong)"
-    )
+    assert SimulatedExpert(taste, np.zeros(2), rng, wrong=0.1).label == f"simulated expert ({taste}, 10 % wrong)"
 
 
 def test_features_of_a_trajectory_are_those_of_its_steps():
@@ -156,9 +147,6 @@ def test_features_of_a_trajectory_are_those_of_its_steps():
     expected = steps.actions([])[3] + steps.actions([3])[17] + steps.actions([3, 17])[30]
     np.testing.assert_allclose(steps.trajectory(order), expected)
     again = steps.actions([3])[3]
-    assert (
-        np.abs(again[GEOMETRY.index("first view within 0.5 rad")]) < 1e-12
-        and again[GEOMETRY.index("way")] == 0
-    )
+    assert np.abs(again[GEOMETRY.index("first view within 0.5 rad")]) < 1e-12 and again[GEOMETRY.index("way")] == 0
     far = int(np.argmax(DOME.travel_m(3)))
     assert steps.actions([3])[far, GEOMETRY.index("first view within 0.5 rad")] > 0

@@ -35,9 +35,7 @@ def test_every_sixth_question_repeats_an_earlier_pair_with_its_sides_swapped():
     repeats = [k for k, a in enumerate(done.answers) if a.repeats is not None]
     assert repeats == [5, 11, 17, 23] == list(range(REPEAT_EVERY - 1, 24, REPEAT_EVERY))
     of = [done.answers[k].repeats for k in repeats]
-    assert len(set(of)) == 4 and all(
-        k - j > 2 and done.answers[j].repeats is None for k, j in zip(repeats, of)
-    )
+    assert len(set(of)) == 4 and all(k - j > 2 and done.answers[j].repeats is None for k, j in zip(repeats, of))
     for k, j in zip(repeats, of):
         now, before = done.answers[k], done.answers[j]
         assert (now.left, now.right) == (before.right, before.left)
@@ -87,9 +85,12 @@ def test_the_file_says_what_was_shown_and_who_answered():
     assert (file["version"], file["scenario"], file["reconstructions"][3]) == (1, "tile", (3, 4))
     assert by_taste(NEW, 1).as_json()["answers"][0]["by"] == "person"
     assert file["answers"][0] == {
-        "left": NEW.question.left, "right": NEW.question.right, "choice": "neither",
-        "by": "simulated expert (edges)", "repeats": None,
-    }  # fmt: skip
+        "left": NEW.question.left,
+        "right": NEW.question.right,
+        "choice": "neither",
+        "by": "simulated expert (edges)",
+        "repeats": None,
+    }
 
 
 @pytest.mark.parametrize(

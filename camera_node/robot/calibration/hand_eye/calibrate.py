@@ -13,13 +13,7 @@ from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, Calibration
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, residuals, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
-from camera_node.robot.calibration.hand_eye.samples import (
-    Array,
-    Diversity,
-    Samples,
-    angles,
-    require_diversity,
-)
+from camera_node.robot.calibration.hand_eye.samples import Array, Diversity, Samples, angles, require_diversity
 from camera_node.robot.calibration.hand_eye.time_offset import StreamCalibration, calibrate_streams
 
 REFINED = DEFAULT_METHOD
@@ -29,9 +23,7 @@ _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
 # Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
-_ADVICE = (
-    "are the poses hand in base and target in camera, not their inverses, in meters, and is the set-up right?"
-)
+_ADVICE = "are the poses hand in base and target in camera, not their inverses, in meters, and is the set-up right?"
 _EXACT_ARM = (1e-6, 1e-6)  # radians, meters: negligible beside the noise of any camera
 
 
@@ -124,9 +116,7 @@ def _calibration(
             x = find()
         except CalibrationError as error:
             return MethodResult(name, None, None, error=str(error))
-        return MethodResult(
-            name, x, residuals(samples, x), angle_deg(refined.x, x), distance_mm(refined.x, x)
-        )
+        return MethodResult(name, x, residuals(samples, x), angle_deg(refined.x, x), distance_mm(refined.x, x))
 
     rows = [row(name, lambda name=name: solve(samples, name)) for name in METHODS]  # type: ignore[misc]
     rows.append(row(REFINED, lambda: refined.x))
@@ -139,9 +129,17 @@ def _calibration(
         start = (refined.x, refined.y)
         exact = row("exact arm", lambda: refine(samples, start, arm_noise=_EXACT_ARM).x)
     return Calibration(
-        samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, spread, exact,
-        timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
-    )  # fmt: skip
+        samples,
+        method,
+        chosen.transform,
+        chosen.residuals,
+        tuple(rows),
+        refined,
+        spread,
+        exact,
+        timed,
+        tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
+    )
 
 
 def _require_plausible(transform: Array, off: Residuals) -> None:
@@ -165,14 +163,11 @@ def _warnings(
         out.append(f"{len(samples)} poses: {_GOOD_POSES} to 20 well spread ones are worth their time")
     if spread.half_turns:
         out.append(
-            f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets "
-            "Tsai-Lenz"
+            f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets Tsai-Lenz"
         )
     median_mm, median_deg = off.medians
     if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
-        out.append(
-            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
-        )
+        out.append(f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}")
     for i in refined.outliers[:5]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "

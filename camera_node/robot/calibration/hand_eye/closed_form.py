@@ -9,14 +9,7 @@ import numpy as np
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.samples import (
-    Array,
-    Rotation,
-    Samples,
-    angles,
-    inverse,
-    transform_of,
-)
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angles, inverse, transform_of
 
 METHODS = {
     "tsai": cv2.CALIB_HAND_EYE_TSAI,
@@ -62,9 +55,12 @@ def solve(samples: Samples, method: str) -> Array:
     try:
         # By keyword: as a positional argument the method would be an output, and OpenCV would run Tsai-Lenz.
         rotation, translation = cv2.calibrateHandEye(
-            list(moved[:, :3, :3]), list(moved[:, :3, 3]), list(target[:, :3, :3]), list(target[:, :3, 3]),
+            list(moved[:, :3, :3]),
+            list(moved[:, :3, 3]),
+            list(target[:, :3, :3]),
+            list(target[:, :3, 3]),
             method=METHODS[method],
-        )  # fmt: skip
+        )
     except cv2.error as error:
         raise CalibrationError(f"{method}: found no solution ({error.err})") from None
     found = transform_of(np.asarray(rotation), np.asarray(translation).ravel())

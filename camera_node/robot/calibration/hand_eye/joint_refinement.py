@@ -113,14 +113,18 @@ def refine(
     root = _whitener(_covariances(seen, len(samples), noise))
     covariance: Array = np.asarray(np.linalg.pinv(_information(root @ jacobian, w), hermitian=True))
     return Refinement(
-        x, y, covariance[:6, :6], float(noise[0]), float(noise[1]), w, float(offset_s),
+        x,
+        y,
+        covariance[:6, :6],
+        float(noise[0]),
+        float(noise[1]),
+        w,
+        float(offset_s),
         float(np.sqrt(covariance[12, 12])) if velocity is not None else 0.0,
-    )  # fmt: skip
+    )
 
 
-def cramer_rao_bound(
-    samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]
-) -> tuple[float, float]:
+def cramer_rao_bound(samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]) -> tuple[float, float]:
     """Cramer-Rao bound of X in degrees and mm at the truth, with Y unknown too. arm_noise: (radians,
     meters)."""
     return _deviations(np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0)))
@@ -167,9 +171,7 @@ def _target_covariance(samples: Samples, x: Array, y: Array) -> Array | None:
     """(N, 6, 6): covariance of the residuals from the target's, None if the target is exact."""
     if samples.covariance is None:
         return None
-    slopes = derivative(
-        lambda step: _residuals(replace(samples, target=_retract(samples.target, step)), x, y), 6
-    )
+    slopes = derivative(lambda step: _residuals(replace(samples, target=_retract(samples.target, step)), x, y), 6)
     return np.asarray(slopes @ samples.covariance @ np.swapaxes(slopes, 1, 2))
 
 

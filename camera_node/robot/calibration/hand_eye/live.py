@@ -85,9 +85,18 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             if tracks is not None and arm is not None:
                 stack.callback(follow_arm(loaded, arm, tracks).stop)
             guide(
-                source, config.codec, lens, session, pace, show, hands,
-                move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
-            )  # fmt: skip
+                source,
+                config.codec,
+                lens,
+                session,
+                pace,
+                show,
+                hands,
+                move=mover,
+                to_base=to_base,
+                tracks=tracks,
+                first=live_camera.first_tick(source),
+            )
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
     except ArmStopped as error:

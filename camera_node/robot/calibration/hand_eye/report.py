@@ -107,8 +107,14 @@ def _plot_axes(found: Calibration, ball: Any) -> None:
     axes = turns / np.maximum(angle, 1e-12)[:, None]
     axes *= np.where(axes[:, 2:] < 0, -1.0, 1.0)  # an axis and its opposite are one
     drawn = ball.scatter(axes[:, 0], axes[:, 1], c=np.degrees(angle), s=8, vmin=0, vmax=180)
-    ball.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), aspect="equal", xlabel="x", ylabel="y",
-             title="axes of the turns, seen along z")  # fmt: skip
+    ball.set(
+        xlim=(-1.1, 1.1),
+        ylim=(-1.1, 1.1),
+        aspect="equal",
+        xlabel="x",
+        ylabel="y",
+        title="axes of the turns, seen along z",
+    )
     ball.figure.colorbar(drawn, ax=ball, label="turn (degrees)")
 
 

@@ -131,10 +131,14 @@ class HandEyeSession:
                 self._wanted = initial_pose(self._hands[0], len(self._hands) - 1 + self._rejected)
             else:
                 self._wanted = propose_pose(
-                    self.samples(), found.x, found.y, (found.arm_noise_rad, found.arm_noise_m),
+                    self.samples(),
+                    found.x,
+                    found.y,
+                    (found.arm_noise_rad, found.arm_noise_m),
                     self._seen[0].corners.points.mean(axis=0),
-                    np.random.default_rng([len(self._seen), self._rejected]), NEW_DEG,
-                )  # fmt: skip
+                    np.random.default_rng([len(self._seen), self._rejected]),
+                    NEW_DEG,
+                )
         return self._wanted
 
     def reject_pose(self) -> None:
@@ -176,9 +180,14 @@ class HandEyeSession:
     def _step(self, outcome: str, advice: str) -> HandEyeStep:
         found = self._refined
         return HandEyeStep(
-            outcome, len(self.samples()), self._diversity, None if found is None else found.std_mm,
-            None if found is None else found.std_deg, self._enough, advice,
-        )  # fmt: skip
+            outcome,
+            len(self.samples()),
+            self._diversity,
+            None if found is None else found.std_mm,
+            None if found is None else found.std_deg,
+            self._enough,
+            advice,
+        )
 
 
 def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:

@@ -58,9 +58,7 @@ class StreamCalibration:
     unpaired: int
 
 
-def calibrate_streams(
-    hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S
-) -> StreamCalibration:
+def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S) -> StreamCalibration:
     """Time offset and hand-eye calibration from two streams.
 
     hand, target: hand in base, and target in camera.
@@ -130,9 +128,7 @@ def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
     return starts_s + (lag + fraction) * _STEP_S, float(score[best])
 
 
-def _paired(
-    hand: Track, target: Track, offset_s: float, setup: str, max_gap_s: float
-) -> tuple[Samples, Array, int]:
+def _paired(hand: Track, target: Track, offset_s: float, setup: str, max_gap_s: float) -> tuple[Samples, Array, int]:
     """Samples at the target's stamps, the hand's velocity there (N, 6) in its own axes, and the number of
     stamps without a hand pose within ``max_gap_s``."""
     at = target.times_ns + round(offset_s * 1e9)
@@ -149,9 +145,7 @@ def _paired(
     return samples, np.concatenate([turns, shifts], axis=1) / (2 * _HALF_S), unpaired
 
 
-def _interpolated(
-    track: Track, at_ns: NDArray[np.int64], max_gap_s: float
-) -> tuple[Array, NDArray[np.bool_]]:
+def _interpolated(track: Track, at_ns: NDArray[np.int64], max_gap_s: float) -> tuple[Array, NDArray[np.bool_]]:
     """Poses (N, 4, 4) by slerp and straight lines, and whether each is within ``max_gap_s`` of a sample."""
     times = track.times_ns
     after = np.clip(np.searchsorted(times, at_ns), 1, len(times) - 1)
@@ -171,9 +165,7 @@ def _angular_speed(track: Track) -> Array:
     start, end = int(track.times_ns[0]), int(track.times_ns[-1])
     count = int((end - start) / 1e9 / _STEP_S)
     if count > 10_000_000:
-        raise CalibrationError(
-            f"a stream spans {(end - start) / 1e9:.0f} s: is one of its stamps on another clock?"
-        )
+        raise CalibrationError(f"a stream spans {(end - start) / 1e9:.0f} s: is one of its stamps on another clock?")
     at = start + np.arange(count, dtype=np.int64) * round(_STEP_S * 1e9)
     half = round(_WINDOW_S / 2 * 1e9)
     # In a gap no longer than the window, the mean speed over the gap is good enough.

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.session import KEPT, draw_corners
-from camera_node.robot.calibration.lens.solve import (
-    MIN_CORNERS,
-    MIN_VIEWS,
-    LensCalibration,
-    calibrate,
-    coverage_grid,
-)
+from camera_node.robot.calibration.lens.solve import MIN_CORNERS, MIN_VIEWS, LensCalibration, calibrate, coverage_grid
 from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 GOOD_PICTURES, GOOD_COVERED, GOOD_TILT_DEG, GOOD_F = 10, 0.8, 30.0, 0.003

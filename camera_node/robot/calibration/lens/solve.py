@@ -79,17 +79,13 @@ class LensCalibration:
         return "\n".join(lines)
 
 
-def calibrate_folder(
-    files: Sequence[Path], target: Target, progress: Callable[[int], None]
-) -> LensCalibration:
+def calibrate_folder(files: Sequence[Path], target: Target, progress: Callable[[int], None]) -> LensCalibration:
     """Calibrate from image files; see ``find_corners``. Raises CalibrationError."""
     found, unused, size = find_corners(files, target, None, progress)
     return calibrate(found, size, unused)
 
 
-def calibrate(
-    views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]
-) -> LensCalibration:
+def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> LensCalibration:
     """Calibrate from corners by image name.
 
     size: width and height of the images in pixels.
@@ -114,9 +110,7 @@ def calibrate(
     numbers = [lens.fx, lens.fy, *lens.distortion, *std]
     possible = all(_SHORTEST < f / max(size) < _LONGEST for f in (lens.fx, lens.fy))
     if not (np.isfinite(numbers).all() and possible and std[0] < 0.2 * lens.fx):
-        raise CalibrationError(
-            "the pictures do not determine a lens: show the target larger, tilted, everywhere"
-        )
+        raise CalibrationError("the pictures do not determine a lens: show the target larger, tilted, everywhere")
     normals = np.array([cv2.Rodrigues(t)[0][:, 2] for t in turns])
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
     if tilt_deg < MIN_TILT_DEG:
@@ -143,9 +137,13 @@ def _solve(
         raise CalibrationError(f"the pictures do not determine a lens ({error.err})") from None
     k1, k2, p1, p2 = map(float, distortion.ravel()[:4])
     lens = Pinhole(
-        *size, float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5,
+        *size,
+        float(matrix[0, 0]),
+        float(matrix[1, 1]),
+        float(matrix[0, 2]) + 0.5,
+        float(matrix[1, 2]) + 0.5,
         (k1, k2, p1, p2),
-    )  # fmt: skip
+    )
     vectors: list[Array] = [np.asarray(t, dtype=np.float64) for t in turns]
     return lens, tuple(map(float, std.ravel()[:8])), vectors, [float(e) for e in errors.ravel()]
 

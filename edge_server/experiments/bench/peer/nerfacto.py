@@ -20,9 +20,12 @@ RAYS = 1024
 # The usual settings for the scenes of the Blender data set: an object at the origin, cameras at a distance of
 # 4.
 BLENDER = {
-    "near_plane": 2.0, "far_plane": 6.0, "proposal_initial_sampler": "uniform",
-    "disable_scene_contraction": True, "background_color": "white",
-}  # fmt: skip
+    "near_plane": 2.0,
+    "far_plane": 6.0,
+    "proposal_initial_sampler": "uniform",
+    "disable_scene_contraction": True,
+    "background_color": "white",
+}
 
 
 def nerfacto(scene: str, still: MultiviewStill, seed: int) -> Contestant:
@@ -45,9 +48,7 @@ def nerfacto(scene: str, still: MultiviewStill, seed: int) -> Contestant:
     place = (np.zeros(3), 1.0) if blender else _normalization(still.training)
     edge = 1.5 if blender else 1.0  # half side of the scene box, as in nerfstudio's loaders
     config = peer.NerfactoModelConfig(
-        implementation="torch",
-        camera_optimizer=CameraOptimizerConfig(mode="off"),
-        **(BLENDER if blender else {}),
+        implementation="torch", camera_optimizer=CameraOptimizerConfig(mode="off"), **(BLENDER if blender else {})
     )
     box = SceneBox(aabb=torch.tensor([[-edge] * 3, [edge] * 3]))
     model = config.setup(scene_box=box, num_train_data=len(still.training), metadata={})
@@ -100,14 +101,14 @@ def _cameras(views: Sequence[View], centre: NDArray[np.float64], scale: float) -
     poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
     poses[:, :3, 1:3] *= -1.0
     lenses = [v.intrinsics for v in views]
-    of = {
-        n: torch.tensor([getattr(k, n) for k in lenses], dtype=torch.float32)
-        for n in ("fx", "fy", "cx", "cy")
-    }
+    of = {n: torch.tensor([getattr(k, n) for k in lenses], dtype=torch.float32) for n in ("fx", "fy", "cx", "cy")}
     return Cameras(
-        camera_to_worlds=torch.tensor(poses[:, :3], dtype=torch.float32), **of, width=lenses[0].width,
-        height=lenses[0].height, camera_type=CameraType.PERSPECTIVE,
-    )  # fmt: skip
+        camera_to_worlds=torch.tensor(poses[:, :3], dtype=torch.float32),
+        **of,
+        width=lenses[0].width,
+        height=lenses[0].height,
+        camera_type=CameraType.PERSPECTIVE,
+    )
 
 
 def _callbacks(model: Any) -> tuple[list[Any], list[Any]]:

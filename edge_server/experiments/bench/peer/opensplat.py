@@ -41,9 +41,7 @@ def opensplat(folder: Path, still: MultiviewStill, seed: int) -> Contestant:
     field.fit(still.training, Budget(seconds=POINTS_S))
     home = Path(tempfile.mkdtemp(prefix="opensplat-", dir=folder))
     points, color = field.points(POINTS)
-    shots = [
-        PosedImage(v.camera, v.image, v.camera_to_world, v.intrinsics) for v in (*still.training, held_out)
-    ]
+    shots = [PosedImage(v.camera, v.image, v.camera_to_world, v.intrinsics) for v in (*still.training, held_out)]
     write_transforms(home, shots, "points.ply")
     (home / "images").mkdir()
     for shot in shots:
@@ -52,10 +50,23 @@ def opensplat(folder: Path, still: MultiviewStill, seed: int) -> Contestant:
     log = home / "log.txt"
     with log.open("w") as out:
         process = subprocess.Popen(
-            [program, str(home), "-o", str(home / "out.ply"), "--cpu", "--num-downscales", "0", "--val",
-             "--val-image", f"{held_out.camera}.png", "--val-render", str(home / "val")],
-            stdout=out, stderr=out,
-        )  # fmt: skip
+            [
+                program,
+                str(home),
+                "-o",
+                str(home / "out.ply"),
+                "--cpu",
+                "--num-downscales",
+                "0",
+                "--val",
+                "--val-image",
+                f"{held_out.camera}.png",
+                "--val-render",
+                str(home / "val"),
+            ],
+            stdout=out,
+            stderr=out,
+        )
     until = time.monotonic() + START_S
     while "Step 1:" not in log.read_text():
         if process.poll() is not None or time.monotonic() > until:

@@ -138,9 +138,7 @@ def _of_field(field: Field, still: MultiviewStill) -> Contestant:
         return done.seconds
 
     field.warm_up()
-    return Contestant(
-        train, lambda view: field.render(view.camera_to_world, view.intrinsics).color, lambda: steps
-    )
+    return Contestant(train, lambda view: field.render(view.camera_to_world, view.intrinsics).color, lambda: steps)
 
 
 def table(figures: Mapping[str, Any]) -> str:
@@ -153,8 +151,11 @@ def table(figures: Mapping[str, Any]) -> str:
         for name, runs in found.items():
             best, spent = [r["best_db"] for r in runs], max(r["within_s"] for r in runs)
             times = [_times(runs, t, fastest[t] if name not in OURS else None) for t in _T]
-            last = f"{min(best):.1f} to {max(best):.1f} after {spent:.0f} s" if len(runs) > 1 else (
-                f"{best[0]:.1f} after {spent:.0f} s")  # fmt: skip
+            last = (
+                f"{min(best):.1f} to {max(best):.1f} after {spent:.0f} s"
+                if len(runs) > 1
+                else (f"{best[0]:.1f} after {spent:.0f} s")
+            )
             outside = [r["outside_cores"] for r in runs if r["outside_cores"] is not None]
             rows.append((scene, f"`{name}`", len(runs), *times, last, f"{max(outside, default=0.0):.1f}"))
     heads = ("scene", "contestant", "runs", *(f"s to {t} dB" for t in _T), "best, dB", "outside cores")

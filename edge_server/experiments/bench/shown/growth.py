@@ -35,7 +35,7 @@ POINTS: dict[str, tuple[dict[str, float], ...]] = {
     "image": ({"width": 64, "height": 64}, {}, {"width": 320, "height": 240}, {"width": 640, "height": 480}),
     "speed": ({"speed, m/s": 0.3}, {}, {"speed, m/s": 2.0}, {"speed, m/s": 4.0}),
     "people": ({"people": 0}, {}, {"people": 2}, {"people": 3}, {"people": 4}),
-}  # fmt: skip
+}
 _TEXT = (
     "From `room` (12 cameras of 128 x 128 at 15 frames a second, one person at 1 m/s, `ch5`, `splat` in "
     "layers on arrivals, one seed) one factor is varied at a time. Virtual time: "
@@ -59,15 +59,17 @@ def measure(run: BenchRun) -> dict[str, Any]:
             values, scenario = {**dict(zip(_FACTORS, _ROOM)), **point}, _scenario(point)
             sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
             settings = {
-                "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(SETTINGS),
+                "seconds": seconds,
+                "cameras": len(scenario.cameras),
+                **sections,
+                "run": asdict(SETTINGS),
                 "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
-            }  # fmt: skip
+            }
             name = ", ".join(f"{values[key]:g}" for key in _FACTORS)
             if name not in done:
                 done[name] = run.store.get(
-                    factor, name, settings=settings,
-                    compute=partial(_run, values, scenario, SETTINGS, *seconds),
-                )  # fmt: skip
+                    factor, name, settings=settings, compute=partial(_run, values, scenario, SETTINGS, *seconds)
+                )
             found = run.store.put(factor, name, result=done[name])
             print(
                 f"  {factor}: {name}: {number(found['psnr_db'])} / {number(found['psnr_moving_db'])} dB, "
@@ -81,9 +83,12 @@ def measure(run: BenchRun) -> dict[str, Any]:
 def _scenario(point: Mapping[str, float]) -> Scenario:
     value = dict(zip(_FACTORS, _ROOM)) | dict(point)
     source = {
-        "width": int(value["width"]), "height": int(value["height"]), "fps": value["fps"],
-        "speed_m_per_s": value["speed, m/s"], "params": {"people": int(value["people"])},
-    }  # fmt: skip
+        "width": int(value["width"]),
+        "height": int(value["height"]),
+        "fps": value["fps"],
+        "speed_m_per_s": value["speed, m/s"],
+        "params": {"people": int(value["people"])},
+    }
     cameras = {"count": int(value["cameras"]) + 1, "phase": "spread"}
     return Row("room", changes={"source": source, "cameras": cameras}).scenario(FIRST_SEED, "layers")
 
@@ -98,9 +103,8 @@ def _run(
 ) -> dict[str, Any]:
     costs = UpdateCosts()
     deployment = build_deployment(
-        scenario, settings,
-        on_published=lambda p: costs.published(deployment.updates, p.t_s >= free_s * 2 / 3),
-    )  # fmt: skip
+        scenario, settings, on_published=lambda p: costs.published(deployment.updates, p.t_s >= free_s * 2 / 3)
+    )
     updates = deployment.updates
     costs.watch(updates.field)
     deployment.run(free_s)
@@ -135,20 +139,27 @@ def table(figures: Mapping[str, Any]) -> str:
     for factor, points in figures.items():
         for found in points.values():
             cameras, width, height, fps, speed, people = found["point"].values()
-            rows.append((
-                factor, cameras, f"{width} x {height}", f"{fps:g}", f"{speed:g}", people,
-                *(number(found[name], 1) for name in _SCORES), number(found["age_ms"], 0),
-                *(number(found[name]) for name in _COSTS),
-                number(found["updates_per_s"], 0), f"{found['shed']:.0%}",
-            ))  # fmt: skip
+            rows.append(
+                (
+                    factor,
+                    cameras,
+                    f"{width} x {height}",
+                    f"{fps:g}",
+                    f"{speed:g}",
+                    people,
+                    *(number(found[name], 1) for name in _SCORES),
+                    number(found["age_ms"], 0),
+                    *(number(found[name]) for name in _COSTS),
+                    number(found["updates_per_s"], 0),
+                    f"{found['shed']:.0%}",
+                )
+            )
             if _is_saturated(found):
                 saturated.append(
                     f"{cameras} cameras of {width} x {height} at {fps:g} frames a second, {people} people at "
                     f"{speed:g} m/s ({found['shed']:.0%} of the frames shed)"
                 )
-    where = (
-        f"Saturated: {'; '.join(dict.fromkeys(saturated))}." if saturated else "No point saturates one core."
-    )
+    where = f"Saturated: {'; '.join(dict.fromkeys(saturated))}." if saturated else "No point saturates one core."
     return "\n\n".join([_TEXT, where, markdown_table(head.split("|"), rows)])
 
 
@@ -174,8 +185,15 @@ def draw(figures: Mapping[str, Any], path: Path) -> None:
                     values = [float("nan") if f[key] is None else f[key] for f in found]
                     ax.plot(range(len(found)), values, marker=".", color=color, label=name)
                     full = [k for k, f in enumerate(found) if _is_saturated(f)]
-                    ax.plot(full, [values[k] for k in full], "o", markersize=9, mfc="none", color=INK,
-                            label="saturated" if full and key == "psnr_db" else None)  # fmt: skip
+                    ax.plot(
+                        full,
+                        [values[k] for k in full],
+                        "o",
+                        markersize=9,
+                        mfc="none",
+                        color=INK,
+                        label="saturated" if full and key == "psnr_db" else None,
+                    )
                 if column == 0:
                     ax.set_ylabel(label)
                     ax.legend()

@@ -96,14 +96,19 @@ def _slower_table(figures: Figures) -> list[str]:
         for name, speed in ((of, 1.0), *((n, 1 / r.slower) for n, r in slower.items() if r.charged_as == of)):
             if (run := _first(figures, name, "shown")) is None or "frozen" not in run["perfect"]:
                 continue
-            rows.append((
-                of, f"{speed:g}", *(number(run["psnr_db"][part], 1) for part in PARTS),
-                number(run["perfect"]["frozen"]["psnr_db"]["moving"], 1), number(run["age_ms"]["mean"], 0),
-                number(run["updates"] / run["seconds"], 0), f"{run['left_out'] / run['arrivals']:.0%}",
-            ))  # fmt: skip
+            rows.append(
+                (
+                    of,
+                    f"{speed:g}",
+                    *(number(run["psnr_db"][part], 1) for part in PARTS),
+                    number(run["perfect"]["frozen"]["psnr_db"]["moving"], 1),
+                    number(run["age_ms"]["mean"], 0),
+                    number(run["updates"] / run["seconds"], 0),
+                    f"{run['left_out'] / run['arrivals']:.0%}",
+                )
+            )
     head = (
-        "scene|speed|whole|moving|still|a perfect field that stands still|mean age, ms|updates a second|"
-        "frames left out"
+        "scene|speed|whole|moving|still|a perfect field that stands still|mean age, ms|updates a second|frames left out"
     )
     return [_SLOWER_TEXT, markdown_table(head.split("|"), rows)]
 
@@ -120,9 +125,7 @@ def _shown_table(figures: Figures) -> str:
                 continue
             psnr = [str(interval([run["psnr_db"][part] for run in runs])) for part in PARTS]
             lags = " / ".join(_mean(runs, "lag_ms", p) for p in ("p50", "p95"))
-            ages = (
-                f"{_mean(runs, 'age_ms', 'mean')} = {' + '.join(_mean(runs, 'age_ms', age) for age in _AGES)}"
-            )
+            ages = f"{_mean(runs, 'age_ms', 'mean')} = {' + '.join(_mean(runs, 'age_ms', age) for age in _AGES)}"
             rows.append((name, mode, len(runs), *psnr, lags, _mean(runs, "age_ms", "newest"), ages))
     return markdown_table(head.split("|"), rows)
 
@@ -192,8 +195,14 @@ def draw(figures: Figures, path: Path) -> None:
     with figure(path, 1, 2, 1.0 + 0.3 * len(names), sharey=True) as (_, ((left, right),)):
         for (label, runs), color, mark in zip(lines.items(), CYCLE, "^ovxd"):
             psnr = [run and run["psnr_db"]["moving"] for run in runs]
-            left.plot([float("nan") if db is None else db for db in psnr], range(len(names)), mark,
-                      color=color, label=label, markersize=6)  # fmt: skip
+            left.plot(
+                [float("nan") if db is None else db for db in psnr],
+                range(len(names)),
+                mark,
+                color=color,
+                label=label,
+                markersize=6,
+            )
         begun = [0.0] * len(names)
         for k, part in enumerate(_SHARES):
             widths = [max(100 * (_shares(figures, name) or [0.0] * 4)[k], 0.0) for name in names]

@@ -14,9 +14,13 @@ FIRST_SEED = 7
 DRAWN = (101, 102, 103)
 # One thread, because the charged costs are those of one core.
 _LAYERS = {
-    "field": "splat", "field_options": {"layers": True, "threads": 1}, "policy": {"name": "all"},
-    "updates": "arrivals", "lpips": "none", "grace_ms": 1000.0,
-}  # fmt: skip
+    "field": "splat",
+    "field_options": {"layers": True, "threads": 1},
+    "policy": {"name": "all"},
+    "updates": "arrivals",
+    "lpips": "none",
+    "grace_ms": 1000.0,
+}
 _BEFORE = {**_LAYERS, "field_options": {"layers": False, "threads": 1}, "updates": "cycle"}
 EDGES: dict[str, dict[str, Any]] = {"layers": _LAYERS, "before": _BEFORE}
 
@@ -53,11 +57,15 @@ class Row:
         source = {**base.source, **self.changes.get("source", {})}
         return parse(
             {
-                "name": self.name, "seed": seed, "cameras": {**cameras, **given}, "source": source,
-                "channel": dict(self.changes.get("channel", base.channel)), "edge": EDGES[edge],
+                "name": self.name,
+                "seed": seed,
+                "cameras": {**cameras, **given},
+                "source": source,
+                "channel": dict(self.changes.get("channel", base.channel)),
+                "edge": EDGES[edge],
             },
             base.path,
-        )  # fmt: skip
+        )
 
 
 def drawn(seed: int) -> Row:
@@ -74,8 +82,7 @@ def drawn(seed: int) -> Row:
     count, preset = int(rng.integers(9, 18)), str(rng.choice(["ch5", "ch6", "ch6-high"]))
     cameras, channel = {"count": count, "phase": "spread"}, {"preset": preset}
     name = (
-        f"drawn {seed}: {base}, {count - 1} cameras, {source['fps']:g} fps, "
-        f"{source['speed_m_per_s']:g} m/s, {preset}"
+        f"drawn {seed}: {base}, {count - 1} cameras, {source['fps']:g} fps, {source['speed_m_per_s']:g} m/s, {preset}"
     )
     return Row(name, base, {"source": source, "cameras": cameras, "channel": channel})
 

@@ -98,21 +98,20 @@ def _measure(row: Row, name: str, seed: int, world: KnownWorld, store: ResultSto
     if name != FIRST_VARIANT:
         of = row.charged_as or row.name
         if of not in store.results:
-            raise BenchError(
-                f"{row.name} is charged as {of}, which is not known: measure that first (--resume)"
-            )
+            raise BenchError(f"{row.name} is charged as {of}, which is not known: measure that first (--resume)")
         cost = store.results[of][FIRST_VARIANT][str(FIRST_SEED)]["cost"]
-        compute = Compute(
-            ms_per_update=row.slower * cost["update_ms"], ms_per_view=row.slower * cost["view_ms"]
-        )
+        compute = Compute(ms_per_update=row.slower * cost["update_ms"], ms_per_view=row.slower * cost["view_ms"])
     sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
     settings = variant.settings(compute)
     if seconds > SETTLED_S:
         settings = replace(settings, shown_every_ms=10.0 * SHOWN_EVERY_MS)
     known = {
-        "seconds": seconds, "cameras": len(scenario.cameras), **sections, "run": asdict(settings),
+        "seconds": seconds,
+        "cameras": len(scenario.cameras),
+        **sections,
+        "run": asdict(settings),
         "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
-    }  # fmt: skip
+    }
     work = partial(_run, scenario, settings, world, seconds)
     found = store.get(row.name, name, str(seed), settings=known, compute=work)
     text = ", ".join(f"{part} {number(found['psnr_db'][part])}" for part in PARTS)
@@ -143,10 +142,13 @@ def _run(scenario: Scenario, settings: RunSettings, world: KnownWorld, seconds: 
     if seconds > SETTLED_S:
         found["by_minute"] = by_minute(truth.instants)
     return {
-        **found, "updates": len(deployment.publications), "charged": vars(settings.compute),
-        "seconds": seconds, "arrivals": deployment.updates.buffer.arrivals,
+        **found,
+        "updates": len(deployment.publications),
+        "charged": vars(settings.compute),
+        "seconds": seconds,
+        "arrivals": deployment.updates.buffer.arrivals,
         "left_out": deployment.updates.buffer.shed,
-    }  # fmt: skip
+    }
 
 
 def by_minute(instants: Sequence[dict[str, Any]]) -> list[dict[str, float]]:
@@ -168,15 +170,12 @@ def means(instants: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "instants": len(instants),
         "lag_ms": {f"p{q}": float(np.percentile(lags, q)) if lags else None for q in (50, 95)},
         "age_ms": {
-            name: statistics.fmean(i["age_ms"][name] or 0.0 for i in instants)
-            for name in instants[0]["age_ms"]
+            name: statistics.fmean(i["age_ms"][name] or 0.0 for i in instants) for name in instants[0]["age_ms"]
         },
-    }  # fmt: skip
+    }
     for kind in ("shown", *PERFECT):
         errors = {part: [e for i in instants if (e := i[kind][part]) is not None] for part in PARTS}
         place = found if kind == "shown" else found.setdefault("perfect", {}).setdefault(kind, {})
-        place["psnr_db"] = {
-            p: statistics.fmean(map(psnr_of_mse, e)) if e else None for p, e in errors.items()
-        }
+        place["psnr_db"] = {p: statistics.fmean(map(psnr_of_mse, e)) if e else None for p, e in errors.items()}
         place["squared_error"] = {p: statistics.fmean(e) if e else None for p, e in errors.items()}
     return found

@@ -29,8 +29,10 @@ class Weighing(SceneStudy):
     def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
         # The trials of the thresholds are those of ``mat``, and known if that study was run.
         settings = {"channel": {"preset": "ch5", "discipline": "drop-new"}}
-        omegas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS,
-                  "wait": QUICK_WAITS if request.quick else WAITS}  # fmt: skip
+        omegas = {
+            "threshold": QUICK_GAMMAS if request.quick else GAMMAS,
+            "wait": QUICK_WAITS if request.quick else WAITS,
+        }
         return request.sweep(scene, request.repeats(10, 40), [({}, settings)], "omega_ms", omegas)
 
     def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
@@ -56,9 +58,14 @@ class Weighing(SceneStudy):
             at = axes[0, 0]
             for k, ((policy, label), xs) in enumerate(best.items()):
                 at.plot(
-                    range(len(LAMBDAS)), xs, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
-                    linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
-                )  # fmt: skip
+                    range(len(LAMBDAS)),
+                    xs,
+                    marker="o",
+                    markersize=4,
+                    color=CYCLE[k % len(CYCLE)],
+                    linestyle="-" if k < len(CYCLE) else "--",
+                    label=f"{policy}, {label}",
+                )
             at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
             per = "lambda (per 0.01 of squared error and second of age)"
             label_lines(at, "best omega (ms)", per, scene)

@@ -45,9 +45,14 @@ class Images(SceneStudy):
         field = table.where(scene=scene)[0]["field"]
         _, way, thesis = SCENES.get(scene, ("", "", "the same"))
         draw_metrics(
-            request.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
-            [(field, {"scene": scene})], f"{scene}, cameras {way}",
-        )  # fmt: skip
+            request.out / f"images-{scene}.png",
+            table,
+            "images",
+            "images, the freshest",
+            _METRICS,
+            [(field, {"scene": scene})],
+            f"{scene}, cameras {way}",
+        )
         for metric in ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms"):
             curve = table.curve("images", metric, scene=scene)
             if not curve:

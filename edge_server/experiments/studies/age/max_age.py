@@ -26,8 +26,7 @@ class Mat(SceneStudy):
     def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
         ours = recording(scene) is None
         disciplines = DISCIPLINES if ours or not request.quick else DISCIPLINES[:1]
-        channels = [({"discipline": d}, {"channel": {"preset": "ch5", "discipline": d}})
-                    for d in disciplines]  # fmt: skip
+        channels = [({"discipline": d}, {"channel": {"preset": "ch5", "discipline": d}}) for d in disciplines]
         gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
         seeds = request.repeats(10 if ours else 4, 40)
         return request.sweep(scene, seeds, channels, "gamma_ms", gammas, [({"discipline": "-"}, {})])
@@ -35,11 +34,15 @@ class Mat(SceneStudy):
     def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
         disciplines = [d for d in DISCIPLINES if table.where(scene=scene, discipline=d)]
         draw_metrics(
-            request.out / f"mat-{scene}.png", table, "gamma_ms", "maximum age (ms)", _METRICS,
+            request.out / f"mat-{scene}.png",
+            table,
+            "gamma_ms",
+            "maximum age (ms)",
+            _METRICS,
             [(d, {"scene": scene, "discipline": d, "policy": "threshold"}) for d in disciplines],
             f"{scene}: threshold on age, from scratch",
             [("no delay", {"scene": scene, "policy": "no delay"})],
-        )  # fmt: skip
+        )
         return [v for discipline in disciplines for v in self._judge(table, scene, discipline)]
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from edge_server.experiments.common.statistics import Optimum, move_of_optimum, optimum
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.study import (
-    METRICS,
-    Curve,
-    Point,
-    SceneStudy,
-    StudyRequest,
-    Table,
-    Verdict,
-)
+from edge_server.experiments.studies.study import METRICS, Curve, Point, SceneStudy, StudyRequest, Table, Verdict
 from edge_server.report.style import CYCLE, figure, label_lines
 
 DELAYS_MS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0)
@@ -35,10 +27,12 @@ class MatDelay(SceneStudy):
     def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
         every = {"every_ms": 1500.0}
         delays = [
-            ({"delay_ms": ms},
-             {"channel": {"preset": "ch5", "service": {"law": "exponential", "mean_ms": ms}}, **every})
+            (
+                {"delay_ms": ms},
+                {"channel": {"preset": "ch5", "service": {"law": "exponential", "mean_ms": ms}}, **every},
+            )
             for ms in (QUICK_DELAYS_MS if request.quick else DELAYS_MS)
-        ]  # fmt: skip
+        ]
         gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
         return request.sweep(scene, request.repeats(8, 40), delays, "gamma_ms", gammas, [({}, every)])
 
@@ -72,17 +66,16 @@ class MatDelay(SceneStudy):
             slope,
         )
 
-    def _draw(
-        self, request: StudyRequest, table: Table, scene: str, best: dict[str, dict[float, Optimum]]
-    ) -> None:
+    def _draw(self, request: StudyRequest, table: Table, scene: str, best: dict[str, dict[float, Optimum]]) -> None:
         with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
             top, bottom = axes[:, 0]
             for k, (metric, found) in enumerate(best.items()):
                 xs = [d * (1 + 0.02 * (k - 1.5)) for d in found]
                 ys = [o.x for o in found.values()]
                 spread = [[o.x - o.low for o in found.values()], [o.high - o.x for o in found.values()]]
-                top.errorbar(xs, ys, spread, marker="o", markersize=4, capsize=2, color=CYCLE[k],
-                             label=METRICS[metric].label)  # fmt: skip
+                top.errorbar(
+                    xs, ys, spread, marker="o", markersize=4, capsize=2, color=CYCLE[k], label=METRICS[metric].label
+                )
             label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
             for k, delay in enumerate(table.distinct("delay_ms")):
                 draw_curve(bottom, _curve(table, scene, "psnr_moving_db", delay), f"{delay:g} ms", k)

@@ -5,14 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from edge_server.experiments.common.statistics import (
-    Interval,
-    at_its_best,
-    interval,
-    negated,
-    optimum,
-    paired,
-)
+from edge_server.experiments.common.statistics import Interval, at_its_best, interval, negated, optimum, paired
 from edge_server.experiments.studies.drawing import draw_metrics, draw_trials
 from edge_server.experiments.studies.study import METRICS, Point, SceneStudy, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import recording
@@ -30,14 +23,26 @@ STATES: dict[str, tuple[str, dict[str, Any], float, float]] = {
 POLICIES = ("threshold", "wait", "wait-arrived", "wait-flush")
 SHOWN = (30.0, 60.0, 120.0)
 _METRICS = (
-    "psnr_db", "psnr_moving_db", "shown_psnr_db", "shown_psnr_moving_db", "ssim", "lpips", "f_w",
+    "psnr_db",
+    "psnr_moving_db",
+    "shown_psnr_db",
+    "shown_psnr_moving_db",
+    "ssim",
+    "lpips",
+    "f_w",
     "f_w_corrected",
-)  # fmt: skip
+)
 # A curve is on its plateau if it is this near to its best value.
 _NEAR = {
-    "psnr_db": 0.3, "psnr_moving_db": 0.3, "shown_psnr_db": 0.3, "shown_psnr_moving_db": 0.3, "ssim": 0.01,
-    "lpips": 0.01, "f_w": 0.05, "f_w_corrected": 0.05,
-}  # fmt: skip
+    "psnr_db": 0.3,
+    "psnr_moving_db": 0.3,
+    "shown_psnr_db": 0.3,
+    "shown_psnr_moving_db": 0.3,
+    "ssim": 0.01,
+    "lpips": 0.01,
+    "f_w": 0.05,
+    "f_w_corrected": 0.05,
+}
 
 
 class Omega(SceneStudy):
@@ -50,8 +55,9 @@ class Omega(SceneStudy):
         ours = recording(scene) is None
         states = [
             ({"state": state}, {"channel": channel, "every_ms": 2400.0})
-            for state, (_, channel, _, _) in STATES.items() if ours or not request.quick or state == "high"
-        ]  # fmt: skip
+            for state, (_, channel, _, _) in STATES.items()
+            if ours or not request.quick or state == "high"
+        ]
         omegas = dict.fromkeys(POLICIES, QUICK_OMEGAS if request.quick else OMEGAS)
         seeds = request.repeats(6 if ours else 3, 40)
         return request.sweep(scene, seeds, states, "omega_ms", omegas, [({"state": "-"}, {})])
@@ -61,12 +67,18 @@ class Omega(SceneStudy):
         states = [s for s in STATES if table.where(scene=scene, state=s)]
         for state in states:
             draw_metrics(
-                request.out / f"omega-{scene}-{state}.png", table, "omega_ms", "omega (ms)", _METRICS,
+                request.out / f"omega-{scene}-{state}.png",
+                table,
+                "omega_ms",
+                "omega (ms)",
+                _METRICS,
                 [(p, {"scene": scene, "state": state, "policy": p}) for p in POLICIES],
                 f"{scene}, {STATES[state][0]}: from scratch",
-                [("use all", {"scene": scene, "state": state, "policy": "all"}),
-                 ("no delay", {"scene": scene, "policy": "no delay"})],
-            )  # fmt: skip
+                [
+                    ("use all", {"scene": scene, "state": state, "policy": "all"}),
+                    ("no delay", {"scene": scene, "policy": "no delay"}),
+                ],
+            )
             for metric in _METRICS:
                 verdicts += self._threshold(table, scene, state, metric)
                 for policy in POLICIES[1:]:

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from edge_server.experiments.common.statistics import all_of, optimum
 from edge_server.experiments.studies.drawing import draw_metrics
-from edge_server.experiments.studies.study import (
-    METRICS,
-    Point,
-    SceneStudy,
-    StudyRequest,
-    Table,
-    Verdict,
-    number,
-)
+from edge_server.experiments.studies.study import METRICS, Point, SceneStudy, StudyRequest, Table, Verdict, number
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (30.0, 75.0, 120.0, 240.0)
@@ -39,11 +31,14 @@ class Representations(SceneStudy):
         fields = table.distinct("field")
         for policy in POLICIES:
             draw_metrics(
-                request.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
+                request.out / f"representations-{scene}-{policy}.png",
+                table,
+                "omega_ms",
+                "omega (ms)",
                 _METRICS,
                 [(f, {"scene": scene, "field": f, "policy": policy}) for f in fields],
                 f"{scene}, {policy}: from scratch",
-            )  # fmt: skip
+            )
             for metric in _METRICS:
                 verdicts += self._judge(table, scene, policy, metric)
         return verdicts

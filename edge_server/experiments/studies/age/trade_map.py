@@ -146,21 +146,29 @@ class Phase(Study):
             text.append(f"best {policy} ({omega:g} ms) {gain}")
         about = f"{cell.text}; {name}"
         found = [
-            Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
-                    "; ".join(text) + " dB.", any_of(g.above(LEAST_DB) for g in gains),
-                    max(gains, key=lambda g: g.mean))
-        ]  # fmt: skip
+            Verdict(
+                about,
+                "giving up stale views (threshold, wait) beats using everything.",
+                "; ".join(text) + " dB.",
+                any_of(g.above(LEAST_DB) for g in gains),
+                max(gains, key=lambda g: g.mean),
+            )
+        ]
         for policy in OWN:
             treated = table.values(metric, policy=policy, **cell.labels)
             share = share_closed(treated, use_all, limit) if gap.above(0.0) else None
             over = [paired(treated, others) for _, others in best.values()]
-            found.append(Verdict(
-                about, f"{policy} beats the best threshold and the best wait.",
-                f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
-                f"{over[0]} above the best threshold, {over[1]} above the best wait "
-                f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
-                all_of(o.above(0.0) for o in over), min(over, key=lambda o: o.mean),
-            ))  # fmt: skip
+            found.append(
+                Verdict(
+                    about,
+                    f"{policy} beats the best threshold and the best wait.",
+                    f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
+                    f"{over[0]} above the best threshold, {over[1]} above the best wait "
+                    f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
+                    all_of(o.above(0.0) for o in over),
+                    min(over, key=lambda o: o.mean),
+                )
+            )
         return found
 
     def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:

@@ -100,14 +100,18 @@ class Drift(TrainingStudy):
             runs = [
                 [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
                 for training in range(trainings)
-            ]  # fmt: skip
+            ]
             all_runs = [run for of in runs for run in of]
             _draw(request, name, all_runs)
-            yield judge(f"room, {name}", runs), [
-                {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
-                for r, run in enumerate(all_runs) for policy, values in run.items()
-                for k, value in enumerate(values)
-            ]  # fmt: skip
+            yield (
+                judge(f"room, {name}", runs),
+                [
+                    {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
+                    for r, run in enumerate(all_runs)
+                    for policy, values in run.items()
+                    for k, value in enumerate(values)
+                ],
+            )
 
 
 def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, run: int) -> Rewards:
@@ -125,10 +129,11 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
         "fixed": fixed(rng),
         "learnt": BanditPolicy(home.actor, "learnt", rng),
         # The default settings without a warm-up.
-        "still learning": OnlinePolicy(Learner.load(home.folder / "policy.npz"), fixed(rng), "still learning",
-                                       rng, OnlineSettings(warmup=0)),
+        "still learning": OnlinePolicy(
+            Learner.load(home.folder / "policy.npz"), fixed(rng), "still learning", rng, OnlineSettings(warmup=0)
+        ),
         "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
-    }  # fmt: skip
+    }
     rewards: Rewards = {policy: [] for policy in POLICIES}
     number = 0
     for setting, count, first in ((before, BEFORE, 0), (after, AFTER, BEFORE)):
@@ -143,9 +148,8 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
 
 
 def _decide(
-    trainer: StudyTrainer, setting: Setting, policy: Policy, moments: list[DecisionPoint], reward: Reward,
-    first: int,
-) -> list[float]:  # fmt: skip
+    trainer: StudyTrainer, setting: Setting, policy: Policy, moments: list[DecisionPoint], reward: Reward, first: int
+) -> list[float]:
     """Rewards of decisions, numbered from ``first`` on, scored by the reporting cameras. An online policy
     learns from the scores of the rewarding ones."""
     requests = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
@@ -168,20 +172,29 @@ def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
     """
 
     def late(policy: str) -> list[PerSeed]:
-        return [{r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :]))
-                 for r, run in enumerate(of)} for of in runs]  # fmt: skip
+        return [
+            {r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :])) for r, run in enumerate(of)}
+            for of in runs
+        ]
 
     recovered = [recovery(run) for of in runs for run in of]
     text = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
     return [
-        better(about, "one that goes on learning is better than what was learnt before the change.",
-               late("still learning"), late("learnt"),
-               f"half of what the change cost is made up after: {text} (a run each); "),
-        better(about, "and better than the fixed policy that was best before.", late("still learning"),
-               late("fixed")),
-        better(about, "what is learnt on the new channel is better than what was learnt on the old.",
-               late("learnt afterwards"), late("learnt")),
-    ]  # fmt: skip
+        better(
+            about,
+            "one that goes on learning is better than what was learnt before the change.",
+            late("still learning"),
+            late("learnt"),
+            f"half of what the change cost is made up after: {text} (a run each); ",
+        ),
+        better(about, "and better than the fixed policy that was best before.", late("still learning"), late("fixed")),
+        better(
+            about,
+            "what is learnt on the new channel is better than what was learnt on the old.",
+            late("learnt afterwards"),
+            late("learnt"),
+        ),
+    ]
 
 
 def recovery(run: Rewards) -> int | str:

@@ -44,10 +44,12 @@ VIEWPOINTS = {"one viewpoint": ("cam00",), "four viewpoints": FOUR_VIEWPOINTS}
 # (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view). The first has the
 # thesis's reward and start. Without a cost views hardly ever harm, so using all is hard to beat.
 CASES = (
-    ("whole", "one viewpoint", True, 0.0), ("whole", "one viewpoint", False, 0.0),
-    ("moving", "one viewpoint", False, 0.0), ("whole", "four viewpoints", False, 0.0),
+    ("whole", "one viewpoint", True, 0.0),
+    ("whole", "one viewpoint", False, 0.0),
+    ("moving", "one viewpoint", False, 0.0),
+    ("whole", "four viewpoints", False, 0.0),
     ("whole", "four viewpoints", False, 0.003),
-)  # fmt: skip
+)
 # Name of the field's start, by whether updates start from scratch.
 FIELDS = {True: "from nothing", False: "warm"}
 # Numbers of cameras nearest to the held-out ones, to test whether a policy learns more than the viewpoint.
@@ -105,22 +107,35 @@ def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
     best_values = evaluation.best_values("threshold")
     over_named = paired_difference(mine, evaluation.rewards(best_name))
     return [
-        better(about, f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes "
-               "(5.6.2).", mine, random, f"over a uniformly random set: {percent(mean_of(mine), random)}; "),
-        better(about, "better than every fixed threshold (5.6.2).", mine, best,
-               f"the best is {best_name}, over which it has {over_named.text(4)} "
-               "where that is known from the very seeds it is tested on; over the best as the other half of "
-               "the seeds chose it, "),
-        *(better(about, f"better than {name}.", mine, evaluation.rewards(name))
-          for name in others(evaluation)),
+        better(
+            about,
+            f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes (5.6.2).",
+            mine,
+            random,
+            f"over a uniformly random set: {percent(mean_of(mine), random)}; ",
+        ),
+        better(
+            about,
+            "better than every fixed threshold (5.6.2).",
+            mine,
+            best,
+            f"the best is {best_name}, over which it has {over_named.text(4)} "
+            "where that is known from the very seeds it is tested on; over the best as the other half of "
+            "the seeds chose it, ",
+        ),
+        *(better(about, f"better than {name}.", mine, evaluation.rewards(name)) for name in others(evaluation)),
         _viewpoint(about, evaluation, mine),
         _share(about, evaluation, mine, best),
-        Verdict(about, "the best threshold differs between decisions: who knew it beforehand would win.",
-                f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
-                f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; "
-                "whether the state tells it is another question.",
-                best_values["gain"].above(0.0), best_values["gain"]),
-    ]  # fmt: skip
+        Verdict(
+            about,
+            "the best threshold differs between decisions: who knew it beforehand would win.",
+            f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+            f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; "
+            "whether the state tells it is another question.",
+            best_values["gain"].above(0.0),
+            best_values["gain"],
+        ),
+    ]
 
 
 def others(evaluation: Evaluation) -> list[str]:
@@ -132,9 +147,12 @@ def others(evaluation: Evaluation) -> list[str]:
 def _viewpoint(about: str, evaluation: Evaluation, mine: Runs) -> Verdict:
     best, name = evaluation.best_fixed("nearest")
     return better(
-        about, "more is learnt than from where the reward comes: better than the cameras nearest to those "
-        "that reward.", mine, best, f"the best number of them is {name}; ",
-    )  # fmt: skip
+        about,
+        "more is learnt than from where the reward comes: better than the cameras nearest to those that reward.",
+        mine,
+        best,
+        f"the best number of them is {name}; ",
+    )
 
 
 def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
@@ -143,11 +161,16 @@ def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
     random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
     return [
-        better(about, f"better than random there (the thesis: by {THESIS_PERCENT} %).", mine, random,
-               f"{percent(mean_of(mine), random)}; "),
+        better(
+            about,
+            f"better than random there (the thesis: by {THESIS_PERCENT} %).",
+            mine,
+            random,
+            f"{percent(mean_of(mine), random)}; ",
+        ),
         better(about, "better than using all there.", mine, evaluation.rewards("all")),
         better(about, "better than every fixed threshold there.", mine, best, f"the best is {name}; "),
-    ]  # fmt: skip
+    ]
 
 
 def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Verdict:
@@ -160,7 +183,8 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
     above, top = paired_difference(mine, half), interval(limit.values()).mean
     alone = " (the intervals are over seeds alone, not over trainings)" if len(mine) > 1 else ""
     return Verdict(
-        about, "most of what could be won is won: (r - random) / (hindsight - random) above a half.",
+        about,
+        "most of what could be won is won: (r - random) / (hindsight - random) above a half.",
         f"{share.text(2)} of the way to hindsight ({top:.4f}, the best of all that was tried at each "
         "decision, chosen by one fit and measured by another); the best fixed threshold has "
         f"{theirs.text(2)}{alone}.",
@@ -168,7 +192,7 @@ def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Ver
         # with an interval over trainings.
         above.above(0.0),
         above,
-    )  # fmt: skip
+    )
 
 
 def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
@@ -189,4 +213,4 @@ def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
         f"processes: {minutes:.1f} minutes for 600 episodes, {minutes / a_decision:.1f} with one fit a "
         "decision, as the machine was.",
         minutes <= WANTED_MINUTES,
-    )  # fmt: skip
+    )

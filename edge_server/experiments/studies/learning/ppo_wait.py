@@ -31,9 +31,13 @@ THESIS_AGE, LESS_AGE = -0.015, -0.003
 # of ch6-slow and swing lasts 3 s, and the best omega differs between the states of swing.
 QUICK_CASES = (("swing", LESS_AGE, "whole"), ("ch6-slow", THESIS_AGE, "whole"))
 CASES = (
-    *QUICK_CASES, ("swing", LESS_AGE, "moving"), ("ch6", THESIS_AGE, "whole"), ("swing", THESIS_AGE, "whole"),
-    ("ch6-slow", LESS_AGE, "whole"), ("ch6", LESS_AGE, "whole"),
-)  # fmt: skip
+    *QUICK_CASES,
+    ("swing", LESS_AGE, "moving"),
+    ("ch6", THESIS_AGE, "whole"),
+    ("swing", THESIS_AGE, "whole"),
+    ("ch6-slow", LESS_AGE, "whole"),
+    ("ch6", LESS_AGE, "whole"),
+)
 # The thesis's gain of waiting over thresholds (6.5.3).
 THESIS_PERCENT = 6
 # Episodes of one training, by whether it is a quick pass.
@@ -92,28 +96,45 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
             claim = "no worse than its best fixed omega by 1 %, where nothing can be foreseen."
             found.append(no_worse(about, claim, mine, best, evaluation))
         found.append(
-            better(about, "better than a uniformly random set.", mine, evaluation.rewards("random"),
-                   f"{percent(mean_of(mine), evaluation.rewards('random'))}; ")
-        )  # fmt: skip
+            better(
+                about,
+                "better than a uniformly random set.",
+                mine,
+                evaluation.rewards("random"),
+                f"{percent(mean_of(mine), evaluation.rewards('random'))}; ",
+            )
+        )
         found.append(
-            Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
-                    f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
-                    f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; learnt "
-                    f"{crossed(mine).text(4)}.",
-                    best_values["gain"].above(0.0), best_values["gain"])
-        )  # fmt: skip
+            Verdict(
+                about,
+                "the best omega differs between decisions: who knew it beforehand would win.",
+                f"as one fit has it, it is {quartiles(best_values)}; to know it would be worth "
+                f"{best_values['gain'].text(4)} over the best fixed one, as another fit has it; learnt "
+                f"{crossed(mine).text(4)}.",
+                best_values["gain"].above(0.0),
+                best_values["gain"],
+            )
+        )
     wait, threshold = trained["wait"], trained["threshold"]
     found.append(
-        better(f"room, {case}", f"waiting beats thresholds, both learnt (6.5.3: by {THESIS_PERCENT} %).",
-               wait, threshold, f"{percent(mean_of(wait), mean_of(threshold))}; ")
-    )  # fmt: skip
+        better(
+            f"room, {case}",
+            f"waiting beats thresholds, both learnt (6.5.3: by {THESIS_PERCENT} %).",
+            wait,
+            threshold,
+            f"{percent(mean_of(wait), mean_of(threshold))}; ",
+        )
+    )
     return found
 
 
 def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
     """The verdict whether there is anything to learn. gain: result of ``by_ages``."""
     return Verdict(
-        f"room, {case}, {kind}", "the ages tell which omega is best: there is something to learn.",
+        f"room, {case}, {kind}",
+        "the ages tell which omega is best: there is something to learn.",
         f"a rule fitted to the rewards of every omega at every decision of the other seeds wins "
-        f"{gain.text(4)} over the best fixed one, over {gain.count} seeds.", gain.above(0.0), gain,
-    )  # fmt: skip
+        f"{gain.text(4)} over the best fixed one, over {gain.count} seeds.",
+        gain.above(0.0),
+        gain,
+    )

@@ -29,9 +29,10 @@ def by_ages(evaluation: Evaluation, kind: str, moments: Sequence[DecisionPoint])
     names = [name for name in evaluation.outcomes if name.startswith(f"{kind}:")]
     values = {name: evaluation.decisions(name) for name in names}
     known = [
-        m for m in moments
+        m
+        for m in moments
         if m.state.reported.any() and all(values[n].get((m.seed, m.number)) is not None for n in names)
-    ]  # fmt: skip
+    ]
     if not known:
         return interval([])
     rewards = np.array([[values[n][m.seed, m.number] for n in names] for m in known], float)

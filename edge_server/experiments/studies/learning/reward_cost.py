@@ -21,12 +21,7 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
 from edge_server.experiments.studies.study import StudyRequest, Verdict
-from edge_server.experiments.training.scheduler.evaluation import (
-    Candidate,
-    Evaluation,
-    baseline_policies,
-    rows,
-)
+from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, baseline_policies, rows
 from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.experiments.training.scheduler.trainer import Row, stage_file
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
@@ -60,8 +55,9 @@ def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdi
     reward = trainer.reward("set")
     config = trainer.config("select", reward, EPISODES)
     config = dataclasses.replace(config, stages=stages(config.batches))
-    trained = {steps: trainer.train_repeats(f"reward-cost-{steps}", room("ch5", steps=steps), config)
-              for steps in budgets}  # fmt: skip
+    trained = {
+        steps: trainer.train_repeats(f"reward-cost-{steps}", room("ch5", steps=steps), config) for steps in budgets
+    }
     candidates = simple_policies("threshold")
     for steps, stage in itertools.product(budgets, config.stages):
         actors = [Actor.load(stage_file(one.folder, stage)) for one in trained[steps]]
@@ -69,8 +65,9 @@ def _by_budget(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdi
     # Every stage of every training is judged by expensive fits, so on fewer seeds than in other studies.
     judged = room("ch5", steps=JUDGED_STEPS)
     evaluation = trainer.evaluate(judged, candidates, reward, len(request.repeats(8, 40)))
-    spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in config.stages]
-             for steps, runs in trained.items()}  # fmt: skip
+    spent = {
+        steps: [spent_s([o.rows for o in runs], stage) for stage in config.stages] for steps, runs in trained.items()
+    }
     _draw(request, evaluation, config.stages, spent)
     return judge(evaluation, config.stages, spent), rows(evaluation, what="fit budget")
 
@@ -97,10 +94,10 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
     cheap, dear = min(spent), max(spent)
     curves = {steps: [evaluation.runs(_stage_name(steps, stage)) for stage in stages] for steps in spent}
     text = "; ".join(
-        f"{steps} steps a fit " + ", ".join(f"{crossed(runs).text(4)} after {at:.1f} s"
-                                            for runs, at in zip(curves[steps], spent[steps]))
+        f"{steps} steps a fit "
+        + ", ".join(f"{crossed(runs).text(4)} after {at:.1f} s" for runs, at in zip(curves[steps], spent[steps]))
         for steps in spent
-    )  # fmt: skip
+    )
     same = paired_difference(curves[cheap][-1], curves[dear][-1])
     same_count = Verdict(
         about,
@@ -113,9 +110,14 @@ def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[f
     theirs = _in_the_same_time(spent[cheap][-1], spent[dear])
     return [
         same_count,
-        better(about, claim, curves[cheap][-1], curves[dear][theirs],
-               f"after {spent[cheap][-1]:.1f} and {spent[dear][theirs]:.1f} s of processor time: "),
-    ]  # fmt: skip
+        better(
+            about,
+            claim,
+            curves[cheap][-1],
+            curves[dear][theirs],
+            f"after {spent[cheap][-1]:.1f} and {spent[dear][theirs]:.1f} s of processor time: ",
+        ),
+    ]
 
 
 def _in_the_same_time(limit_s: float, dear: Sequence[float]) -> int:
@@ -155,20 +157,21 @@ def _by_dim(trainer: StudyTrainer, request: StudyRequest) -> tuple[list[Verdict]
 def judge_dims(evaluations: dict[str, Evaluation]) -> list[Verdict]:
     """Verdicts whether each embedding is better than none (``d = 0``)."""
     runs = {name: evaluation.runs(name) for name, evaluation in evaluations.items()}
-    return [better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
-            for name, values in runs.items() if name != "d = 0"]  # fmt: skip
+    return [
+        better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
+        for name, values in runs.items()
+        if name != "d = 0"
+    ]
 
 
-def _draw(
-    request: StudyRequest, evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]
-) -> None:
+def _draw(request: StudyRequest, evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]) -> None:
     with figure(request.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
         for k, (steps, seconds) in enumerate(spent.items()):
             means = [crossed(evaluation.runs(_stage_name(steps, stage))).mean for stage in stages]
-            axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
-                            label=f"{steps} steps a fit")  # fmt: skip
-        label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time",
-                    "What a reward costs")  # fmt: skip
+            axes[0, 0].plot(
+                seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)], label=f"{steps} steps a fit"
+            )
+        label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time", "What a reward costs")
 
 
 def _draw_dims(request: StudyRequest, evaluations: dict[str, Evaluation]) -> None:
@@ -179,7 +182,7 @@ def _draw_dims(request: StudyRequest, evaluations: dict[str, Evaluation]) -> Non
     off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
     with figure(request.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
         axes[0, 0].axhline(0.0, color=GRAY, linewidth=1.0)
-        axes[0, 0].errorbar([str(dim) for dim in DIMS[1:]], [one.mean for one in found], off, fmt="o",
-                            color=CYCLE[0], capsize=3)  # fmt: skip
-        label_lines(axes[0, 0], "reward over none", "numbers of an embedding",
-                    "What a larger embedding is worth")  # fmt: skip
+        axes[0, 0].errorbar(
+            [str(dim) for dim in DIMS[1:]], [one.mean for one in found], off, fmt="o", color=CYCLE[0], capsize=3
+        )
+        label_lines(axes[0, 0], "reward over none", "numbers of an embedding", "What a larger embedding is worth")

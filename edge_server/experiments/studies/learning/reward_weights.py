@@ -46,12 +46,17 @@ def judge(evaluation: Evaluation, name: str, names: Sequence[str]) -> list[Verdi
     losses = {o: paired_difference(mine, evaluation.runs(f"learnt {o}")) for o in names if o != name}
     worst = max(losses, key=lambda o: losses[o].mean)
     return [
-        better(about, "what was learnt by it is better than the best fixed wait.", mine, best,
-               f"the best is {fixed}; "),
-        Verdict(about, "it matters: what was learnt by other weights is worse by these.",
-                "; ".join(f"{o} {loss.text(4)}" for o, loss in losses.items()) + f"; most: {worst}.",
-                any_of(loss.above(0.0) for loss in losses.values()), losses[worst]),
-    ]  # fmt: skip
+        better(
+            about, "what was learnt by it is better than the best fixed wait.", mine, best, f"the best is {fixed}; "
+        ),
+        Verdict(
+            about,
+            "it matters: what was learnt by other weights is worse by these.",
+            "; ".join(f"{o} {loss.text(4)}" for o, loss in losses.items()) + f"; most: {worst}.",
+            any_of(loss.above(0.0) for loss in losses.values()),
+            losses[worst],
+        ),
+    ]
 
 
 def variants(trainer: StudyTrainer) -> dict[str, Reward]:

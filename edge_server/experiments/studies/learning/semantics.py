@@ -36,9 +36,13 @@ KNOWING = (1, 2, 3, 4)
 # In the figure: label of a family of policies -> prefix of their names.
 LEARNT = ("with-", "without-")
 FAMILIES = {
-    "learnt with semantics": LEARNT[0], "learnt without": LEARNT[1], "knows who sees it": "sees:",
-    "thresholds": "threshold:", "freshest k": "freshest-k:", "random": "random",
-}  # fmt: skip
+    "learnt with semantics": LEARNT[0],
+    "learnt without": LEARNT[1],
+    "knows who sees it": "sees:",
+    "thresholds": "threshold:",
+    "freshest k": "freshest-k:",
+    "random": "random",
+}
 
 
 class Semantics(TrainingStudy):
@@ -93,10 +97,15 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
     fixed = [n for n in evaluation.outcomes if not n.startswith(("with", "random", "sees"))]
     best = max(fixed, key=lambda n: interval(evaluation.rewards(n).values()).mean)
     return found + [
-        better(f"{about}, {name} semantics", "better than the best of all that does not learn.", runs,
-               evaluation.rewards(best), f"{best}, known from the very seeds; ")
+        better(
+            f"{about}, {name} semantics",
+            "better than the best of all that does not learn.",
+            runs,
+            evaluation.rewards(best),
+            f"{best}, known from the very seeds; ",
+        )
         for name, runs in (("with", seeing), ("without", blind))
-    ]  # fmt: skip
+    ]
 
 
 def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[Verdict]:
@@ -108,13 +117,21 @@ def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[
     knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
     best = max(knowing, key=lambda n: interval(evaluation.rewards(n).values()).mean)
     return [
-        Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
-                f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
-                f"to; {camera:.2f} from which camera it is.", embedding > camera),
-        better(about, "who knows which cameras see what moves does better than what is learnt blindly.",
-               evaluation.rewards(best), evaluation.runs("without"),
-               f"{best}, the best number of them known from the very seeds; "),
-    ]  # fmt: skip
+        Verdict(
+            about,
+            "the embedding tells which cameras see what moves (better than which camera it is).",
+            f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
+            f"to; {camera:.2f} from which camera it is.",
+            embedding > camera,
+        ),
+        better(
+            about,
+            "who knows which cameras see what moves does better than what is learnt blindly.",
+            evaluation.rewards(best),
+            evaluation.runs("without"),
+            f"{best}, the best number of them known from the very seeds; ",
+        ),
+    ]
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -130,9 +147,8 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             known = [row for row in rows if row["scene"] == scene and row.get("views")]
             for k, (label, prefix) in enumerate(FAMILIES.items()):
                 some = sorted(
-                    (float(row["views"]), float(row["reward"]))
-                    for row in known if row["policy"].startswith(prefix)
-                )  # fmt: skip
+                    (float(row["views"]), float(row["reward"])) for row in known if row["policy"].startswith(prefix)
+                )
                 style = "D" if prefix in LEARNT else ".-"
                 at.plot([v for v, _ in some], [r for _, r in some], style, color=CYCLE[k], label=label)
             label_lines(at, "reward", "views used", scene)

@@ -97,9 +97,14 @@ class TrainedPolicy:
 
 
 def room(
-    channel: Mapping[str, Any] | str = "ch5", *, scene: str = "room", speed_m_per_s: float = 1.0,
-    held_out: tuple[str, ...] = ("cam00",), report: tuple[str, ...] = REPORT, **more: Any,
-) -> Setting:  # fmt: skip
+    channel: Mapping[str, Any] | str = "ch5",
+    *,
+    scene: str = "room",
+    speed_m_per_s: float = 1.0,
+    held_out: tuple[str, ...] = ("cam00",),
+    report: tuple[str, ...] = REPORT,
+    **more: Any,
+) -> Setting:
     """The usual setting: a world at 64 x 64, nineteen cameras and a warm splat field.
 
     channel: a preset, or the section of a scenario.
@@ -108,9 +113,7 @@ def room(
     more: fields of ``Setting``; ``scratch=True`` as in the thesis.
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
-    trial = Trial(
-        scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s
-    )
+    trial = Trial(scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s)
     scenario = trial.scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *report})
     scenario = dataclasses.replace(scenario, held_out=apart)
@@ -135,9 +138,7 @@ class Nearest(Policy):
         scene, _ = exact_scene(setting.scenario, source)
         stand = {camera: pose[:3, 3] for camera, (_, pose) in scene.cameras.items()}
         watched = [stand[camera] for camera in setting.rewarding]
-        far = {
-            c: min(float(np.linalg.norm(stand[c] - w)) for w in watched) for c in setting.scenario.training
-        }
+        far = {c: min(float(np.linalg.norm(stand[c] - w)) for w in watched) for c in setting.scenario.training}
         self._order = sorted(far, key=lambda c: far[c])
         self._k = k
 
@@ -179,9 +180,7 @@ class StudyTrainer:
         about = source_digest() + setting.key + repr(dataclasses.asdict(config))
         folder = self.folder / f"{name}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
         jobs_file = folder / "jobs.json"
-        learner = train(
-            setting, config, self.pool, folder, lambda line: print(f"  {name}: {line}", flush=True)
-        )
+        learner = train(setting, config, self.pool, folder, lambda line: print(f"  {name}: {line}", flush=True))
         rows = read_log(folder)
         draw_curve(self.request.out / f"{name}.png", rows)
         if not jobs_file.exists():
@@ -198,9 +197,13 @@ class StudyTrainer:
         ]
 
     def config(
-        self, action: Action, reward: Reward, episodes: Mapping[bool, int],
-        layout: StateLayout = AGE_AND_POSE, **more: Any,
-    ) -> TrainingConfig:  # fmt: skip
+        self,
+        action: Action,
+        reward: Reward,
+        episodes: Mapping[bool, int],
+        layout: StateLayout = AGE_AND_POSE,
+        **more: Any,
+    ) -> TrainingConfig:
         """The usual training of a learner that decides ``action``.
 
         episodes: number of episodes, by whether it is a quick pass.
@@ -225,9 +228,13 @@ class StudyTrainer:
     ) -> Evaluation:
         """As ``evaluate``, but scored by the rewarding cameras; it supplements the other evaluation."""
         return evaluate_policies(
-            setting, self.pool, seeds(seed, "test", count), candidates, reward,
+            setting,
+            self.pool,
+            seeds(seed, "test", count),
+            candidates,
+            reward,
             lambda line: print(f"  evaluation: {line}", flush=True),
-        )  # fmt: skip
+        )
 
 
 def embeddings_missing() -> str | None:
@@ -259,10 +266,7 @@ def mean_of(runs: Runs) -> PerSeed:
 
 def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str, Actor]:
     """The actors of repeated trainings as candidates ``NAME-0``, ``NAME-1``, ..."""
-    return {
-        f"{name}-{run}": one.actor if isinstance(one, TrainedPolicy) else one
-        for run, one in enumerate(trained)
-    }
+    return {f"{name}-{run}": one.actor if isinstance(one, TrainedPolicy) else one for run, one in enumerate(trained)}
 
 
 def paired_difference(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
@@ -301,9 +305,8 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
 
 
 def no_worse(
-    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, evaluation: Evaluation,
-    share: float = 0.01,
-) -> Verdict:  # fmt: skip
+    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, evaluation: Evaluation, share: float = 0.01
+) -> Verdict:
     """The verdict whether ``mine`` loses at most ``share`` of the absolute value of ``other``'s mean reward.
     The text also gives the loss relative to the difference between random and hindsight, because the zero of
     a reward is arbitrary. Undecided if the reward is too near its zero for a percentage."""

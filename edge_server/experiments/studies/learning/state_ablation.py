@@ -27,17 +27,21 @@ EPISODES = {True: 100, False: 600}
 WHICH_VIEWS, CHAPTER_6, FLUSHED = "which views", "chapter 6", "wait after a flush"
 # name -> parts of the state
 VARIANTS = {
-    "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
+    "age": ("age",),
+    "age+pose": ("age", "pose"),
+    "age+semantics": ("semantics", "age"),
     "all": ("semantics", "age", "pose"),
-}  # fmt: skip
+}
 # The schedulers of chapter 6, with both interpretations of ``wait``.
 KINDS: tuple[Action, ...] = ("threshold", "wait", "wait-arrived")
 WHOLE = "Z, age, pose"
 # name -> parts of the state: all, and without each of them
 LEFT_OUT = {
-    WHOLE: ("semantics", "age", "pose"), "age, pose": ("age", "pose"), "Z, pose": ("semantics", "pose"),
+    WHOLE: ("semantics", "age", "pose"),
+    "age, pose": ("age", "pose"),
+    "Z, pose": ("semantics", "pose"),
     "Z, age": ("semantics", "age"),
-}  # fmt: skip
+}
 
 
 class Ablation(TrainingStudy):
@@ -77,9 +81,13 @@ class Ablation(TrainingStudy):
         return found, [*rows(flushed, channel="ch6, flushed"), *rows(kept, channel="ch6, beside flushed")]
 
     def _omegas(
-        self, trainer: StudyTrainer, request: StudyRequest, kinds: Sequence[Action],
-        variants: dict[str, tuple[str, ...]], flush: bool = False,
-    ) -> Evaluation:  # fmt: skip
+        self,
+        trainer: StudyTrainer,
+        request: StudyRequest,
+        kinds: Sequence[Action],
+        variants: dict[str, tuple[str, ...]],
+        flush: bool = False,
+    ) -> Evaluation:
         """Train policies that choose omega by every variant of the state; evaluate them and all fixed
         omegas."""
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
@@ -133,8 +141,9 @@ def _left_out(evaluation: Evaluation, variants: Sequence[str], kind: str, about:
     ]
     return found + [
         better(about, f"better by {WHOLE} than by {name}.", trained[WHOLE], runs)
-        for name, runs in trained.items() if WHOLE in trained and name != WHOLE
-    ]  # fmt: skip
+        for name, runs in trained.items()
+        if WHOLE in trained and name != WHOLE
+    ]
 
 
 def judge_flushed(flushed: Evaluation, kept: Evaluation, variants: Sequence[str]) -> list[Verdict]:
@@ -143,11 +152,16 @@ def judge_flushed(flushed: Evaluation, kept: Evaluation, variants: Sequence[str]
     fullest, claim = variants[0], "a flush before the wait serves better than none (6.5)."
     return [
         *_left_out(flushed, variants, "wait", "room, ch6, flushed, wait"),
-        better("room, ch6, both learnt", claim,
-               flushed.runs(learnt("wait", fullest)), kept.runs(learnt("wait", fullest))),
-        better("room, ch6, both at their best fixed omega", claim,
-               flushed.best_fixed("wait")[0], kept.best_fixed("wait")[0]),
-    ]  # fmt: skip
+        better(
+            "room, ch6, both learnt", claim, flushed.runs(learnt("wait", fullest)), kept.runs(learnt("wait", fullest))
+        ),
+        better(
+            "room, ch6, both at their best fixed omega",
+            claim,
+            flushed.best_fixed("wait")[0],
+            kept.best_fixed("wait")[0],
+        ),
+    ]
 
 
 def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
@@ -155,10 +169,15 @@ def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
     about = "room, ch5, moving, four viewpoints"
     trained = {n: evaluation.runs(f"learnt {n}") for n in variants}
     best, text = evaluation.best_fixed("threshold")[0], fixed_of(evaluation, "threshold")
-    found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
-                    f"against {text}; ") for name, runs in trained.items()]  # fmt: skip
-    found += [better(f"{about}, {name}", "better than age alone.", runs, trained["age"])
-              for name, runs in trained.items() if name != "age"]  # fmt: skip
+    found = [
+        better(f"{about}, {name}", "better than the best fixed threshold.", runs, best, f"against {text}; ")
+        for name, runs in trained.items()
+    ]
+    found += [
+        better(f"{about}, {name}", "better than age alone.", runs, trained["age"])
+        for name, runs in trained.items()
+        if name != "age"
+    ]
     if "all" in trained:
         found.append(better(about, "semantics add to age and pose.", trained["all"], trained["age+pose"]))
     return found

@@ -58,8 +58,7 @@ def judge(place: str, evaluation: Evaluation) -> list[Verdict]:
     there."""
     home, here = evaluation.runs("learnt at home"), evaluation.runs("learnt here")
     best, text = evaluation.best_fixed("wait")[0], fixed_of(evaluation, "wait")
-    found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,
-                    f"against {text}; ")]  # fmt: skip
+    found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best, f"against {text}; ")]
     if place != HOME:
         claim = f"learnt in {HOME}, it loses no more than 5 % to what is learnt here."
         found.append(no_worse(place, claim, home, here, evaluation, 0.05))

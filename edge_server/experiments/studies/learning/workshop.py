@@ -28,9 +28,15 @@ def priced(trainer: StudyTrainer, on: str) -> Reward:
 def workshop(speed_m_per_s: float) -> Setting:
     """The setting of the workshop."""
     setting = room(
-        "ch5", scene="tower", speed_m_per_s=speed_m_per_s, held_out=REWARDING, report=JUDGING, parts=PARTS,
-        steps=STEPS, refresh_ms=REFRESH_MS,
-    )  # fmt: skip
+        "ch5",
+        scene="tower",
+        speed_m_per_s=speed_m_per_s,
+        held_out=REWARDING,
+        report=JUDGING,
+        parts=PARTS,
+        steps=STEPS,
+        refresh_ms=REFRESH_MS,
+    )
     scenario = setting.scenario
     params = {**scenario.source.get("params", {}), "movers": "person"}
     source = {**scenario.source, "params": params}

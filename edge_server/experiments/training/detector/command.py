@@ -44,10 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         import onnxruntime  # noqa: F401
         import torch  # noqa: F401
     except ModuleNotFoundError as error:
-        print(
-            f"edge-server train-detector needs {error.name}: pip install 'freshfield[edge,embed]'",
-            file=sys.stderr,
-        )
+        print(f"edge-server train-detector needs {error.name}: pip install 'freshfield[edge,embed]'", file=sys.stderr)
         return 2
     from edge_server.experiments.training.detector.training import CheckpointError
 
@@ -97,12 +94,18 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     else:
         more["masks"] = _masks(fp32, int8, sets)
     results = {
-        "settings": asdict(settings), "kinds": kinds, "parameters": parameters(model),
-        "pictures": {"train": len(known), "held_out": len(unseen)}, "boxes": sum(map(len, known.boxes)),
-        "quality": quality, **more, "epochs": log,
+        "settings": asdict(settings),
+        "kinds": kinds,
+        "parameters": parameters(model),
+        "pictures": {"train": len(known), "held_out": len(unseen)},
+        "boxes": sum(map(len, known.boxes)),
+        "quality": quality,
+        **more,
+        "epochs": log,
         "trained_s": round(sum(row["seconds"] for row in log), 1),
-        "machine": machine(), "versions": versions(),
-    }  # fmt: skip
+        "machine": machine(),
+        "versions": versions(),
+    }
     write_json(out / f"{name}.json", results, indent=1)
     return results
 
@@ -128,10 +131,7 @@ def _masks(fp32: Path, int8: Path, sets: dict[str, Any]) -> dict[str, Any]:
     from edge_server.experiments.training.detector.mask_quality import measure_masks
 
     ways = ((fp32.stem, fp32, None), (int8.stem, int8, None), (f"{int8.stem}, grabcut", int8, "grabcut"))
-    return {
-        name: {where: measure_masks(path, p, segment) for where, p in sets.items()}
-        for name, path, segment in ways
-    }
+    return {name: {where: measure_masks(path, p, segment) for where, p in sets.items()} for name, path, segment in ways}
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:
@@ -171,8 +171,12 @@ def show(results: dict[str, Any]) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-detector", DESCRIPTION)
     add = parser.add_argument
-    add("--of", choices=("scenes", "tile"), default="scenes", help="what to detect: people, carts, balls "
-        "and drums (scenes), or the tile with its mask [%(default)s]")  # fmt: skip
+    add(
+        "--of",
+        choices=("scenes", "tile"),
+        default="scenes",
+        help="what to detect: people, carts, balls and drums (scenes), or the tile with its mask [%(default)s]",
+    )
     add(
         "--out",
         type=out_folder,
@@ -181,9 +185,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add(
-        "--worlds", type=at_least(20), default=400, metavar="N",
+        "--worlds",
+        type=at_least(20),
+        default=400,
+        metavar="N",
         help="number of training scenes, 8 images each [%(default)s]",
-    )  # fmt: skip
+    )
     add("--epochs", type=at_least(1), default=18, metavar="N", help="training epochs [%(default)s]")
     add("--rate", type=float, default=2e-3, help="learning rate [%(default)s]")
     add("--start", type=Path, metavar="FILE", help="checkpoint.pt of an earlier training to begin from")

@@ -55,9 +55,7 @@ def network_inputs(images: NDArray[np.uint8], batch: int) -> Iterator[NDArray[np
         yield np.ascontiguousarray(part) / np.float32(255.0)
 
 
-def render(
-    purpose: str, shots: int, side: int, seed: int, folder: Path, subject: str = "scenes"
-) -> LabeledImages:
+def render(purpose: str, shots: int, side: int, seed: int, folder: Path, subject: str = "scenes") -> LabeledImages:
     """Render ``INSTANTS`` images of each of ``shots`` variations of a subject (``SUBJECTS``); those already
     in ``folder`` are read from there."""
     folder.mkdir(parents=True, exist_ok=True)

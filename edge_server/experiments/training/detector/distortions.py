@@ -37,8 +37,9 @@ def _stale(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 def _ghost(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
     """A blend of two instants, or of an image with a shifted one."""
     dx, dy = rng.uniform(-8, 8, 2) * (rng.random() < 0.5)
-    moved = cv2.warpAffine(other, np.array([[1, 0, dx], [0, 1, dy]]), other.shape[1::-1],
-                           borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    moved = cv2.warpAffine(
+        other, np.array([[1, 0, dx], [0, 1, dy]]), other.shape[1::-1], borderMode=cv2.BORDER_REPLICATE
+    )
     share = rng.uniform(0.1, 0.6)
     return image * (1.0 - share) + moved * share
 
@@ -80,9 +81,17 @@ def _warped(image: Image, other: Image, rng: np.random.Generator) -> NDArray:
 
 
 DISTORTIONS: dict[str, Distort] = {
-    "blur": _blur, "noise": _noise, "jpeg": _jpeg, "exposure": _exposure, "stale": _stale, "ghost": _ghost,
-    "coarse": _coarse, "displaced": _displaced, "floaters": _floaters, "warped": _warped,
-}  # fmt: skip
+    "blur": _blur,
+    "noise": _noise,
+    "jpeg": _jpeg,
+    "exposure": _exposure,
+    "stale": _stale,
+    "ghost": _ghost,
+    "coarse": _coarse,
+    "displaced": _displaced,
+    "floaters": _floaters,
+    "warped": _warped,
+}
 
 
 def distorted(image: Image, other: Image, rng: np.random.Generator) -> tuple[Image, str]:

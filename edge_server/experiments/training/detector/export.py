@@ -16,13 +16,7 @@ import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 from onnx import helper
-from onnxruntime.quantization import (
-    CalibrationDataReader,
-    CalibrationMethod,
-    QuantFormat,
-    QuantType,
-    quantize_static,
-)
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from edge_server.embed.backbone import OUTPUT, PROJECTION_KEY, load_backbone, pack_projection
@@ -41,9 +35,7 @@ AXES = 64
 _LEAST_SPREAD = 1e-3
 
 
-def export_fp32(
-    model: Detector, side: int, path: Path, about: dict[str, Any], kinds: Sequence[str] = KINDS
-) -> None:
+def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any], kinds: Sequence[str] = KINDS) -> None:
     """Export the detector for any number of images of any size whose sides are multiples of 16."""
     model = model.eval()
     axes = {INPUT: {0: "n", 2: "height", 3: "width"}, "output0": {0: "n", 2: "cells"}}

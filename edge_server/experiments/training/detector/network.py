@@ -112,12 +112,20 @@ class Detector(nn.Module):
         self.kinds, self.prototypes = kinds, prototypes
         self.model = nn.ModuleList(
             [
-                Conv(3, a, 3, 2), Conv(a, b, 3, 2), C2f(b, b), Conv(b, c, 3, 2), C2f(c, c, 2),
-                Conv(c, d, 3, 2), C2f(d, d), SPPF(d),
-                nn.Upsample(scale_factor=2, mode="nearest"), C2f(c + d, c, residual=False),
-                Head(c, kinds, prototypes), Head(d, kinds, prototypes),
+                Conv(3, a, 3, 2),
+                Conv(a, b, 3, 2),
+                C2f(b, b),
+                Conv(b, c, 3, 2),
+                C2f(c, c, 2),
+                Conv(c, d, 3, 2),
+                C2f(d, d),
+                SPPF(d),
+                nn.Upsample(scale_factor=2, mode="nearest"),
+                C2f(c + d, c, residual=False),
+                Head(c, kinds, prototypes),
+                Head(d, kinds, prototypes),
             ]
-        )  # fmt: skip
+        )
         if prototypes:
             self.model.append(Prototypes(c, b, a, prototypes))
 

@@ -77,10 +77,7 @@ def variation(seed: int, purpose: str, side: int) -> ObjectShot:
     tile = [] if rng.random() < _ABSENT else _tile(rng)
     others = _others(rng, bool(tile))
     world = dataclasses.replace(
-        scene.world,
-        static_parts=(*tile, *others),
-        light=_light(rng, scene.world.light),
-        background=_color(rng),
+        scene.world, static_parts=(*tile, *others), light=_light(rng, scene.world.light), background=_color(rng)
     )
     scene = dataclasses.replace(scene.with_world(world), object_parts=len(tile))
     return ObjectShot(scene, [_viewpoint(rng, scene, side) for _ in range(VIEWS)])
@@ -90,10 +87,7 @@ def _tile(rng: np.random.Generator) -> list[Part]:
     """The carrier, and most of the parts on it."""
     first, *rest = object_parts()
     kept = [first, *(part for part in rest if rng.random() >= _LEFT_OUT)]
-    return [
-        dataclasses.replace(part, texture=_texture(rng)) if rng.random() < _REPAINTED else part
-        for part in kept
-    ]
+    return [dataclasses.replace(part, texture=_texture(rng)) if rng.random() < _REPAINTED else part for part in kept]
 
 
 def _others(rng: np.random.Generator, around_tile: bool) -> list[Part]:
@@ -157,11 +151,7 @@ def _light(rng: np.random.Generator, light: Light) -> Light:
 
 def _color(rng: np.random.Generator) -> tx.Color:
     """A random color, or nearly gray."""
-    r, g, b = (
-        rng.uniform(0.05, 0.98, 3)
-        if rng.random() < 0.5
-        else rng.uniform(0.1, 0.95) * rng.uniform(0.9, 1.1, 3)
-    )
+    r, g, b = rng.uniform(0.05, 0.98, 3) if rng.random() < 0.5 else rng.uniform(0.1, 0.95) * rng.uniform(0.9, 1.1, 3)
     return min(float(r), 1.0), min(float(g), 1.0), min(float(b), 1.0)
 
 
@@ -194,7 +184,5 @@ def _viewpoint(rng: np.random.Generator, scene: Scene, side: int) -> tuple[Pinho
     right, down = rng.uniform(-half, half, 2) * (2.2 if rng.random() < _OFF else 1.0)
     roll = rng.uniform(-math.pi, math.pi) if rng.random() < 0.3 else rng.normal(0.0, 0.1)
     pose = pose.copy()
-    pose[:3, :3] = (
-        pose[:3, :3] @ so3_exp((0.0, right, 0.0)) @ so3_exp((down, 0.0, 0.0)) @ so3_exp((0.0, 0.0, roll))
-    )
+    pose[:3, :3] = pose[:3, :3] @ so3_exp((0.0, right, 0.0)) @ so3_exp((down, 0.0, 0.0)) @ so3_exp((0.0, 0.0, roll))
     return lens, pose

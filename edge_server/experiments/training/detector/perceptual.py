@@ -55,10 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return run_command("train-perceptual", work, (EmbeddingError, FitFailed), stopped)
     except ModuleNotFoundError as error:
-        print(
-            f"edge-server train-perceptual needs {error.name}: pip install 'freshfield[edge,embed]'",
-            file=sys.stderr,
-        )
+        print(f"edge-server train-perceptual needs {error.name}: pip install 'freshfield[edge,embed]'", file=sys.stderr)
         return 2
 
 
@@ -69,12 +66,7 @@ class FitFailed(ValueError):
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Render, distort, fit, measure and write; returns the contents of perceptual.json."""
     from edge_server.experiments.common.progress import Progress
-    from edge_server.experiments.training.detector.dataset import (
-        LabeledImages,
-        of_own_rigs,
-        render,
-        scenes_of,
-    )
+    from edge_server.experiments.training.detector.dataset import LabeledImages, of_own_rigs, render, scenes_of
     from edge_server.experiments.training.detector.network import LAYERS
     from edge_server.experiments.training.detector.renderings import field_renderings
 
@@ -122,11 +114,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     save_coefficients(args.out / COEFFICIENTS, taps, split, power)
     by_layer = [part.sum() for part in np.split((x * weights).sum(axis=0), np.cumsum(layers.widths())[:-1])]
     results = {
-        "fitted_to": f"LPIPS-{lpips.network}", "pairs": len(y), "power": power, "seed": args.seed,
+        "fitted_to": f"LPIPS-{lpips.network}",
+        "pairs": len(y),
+        "power": power,
+        "seed": args.seed,
         "share_by_layer": {tap: round(float(s / sum(by_layer)), 3) for tap, s in zip(taps, by_layer)},
-        "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
+        "channels_used": int((weights > 0).sum()),
+        "channels": len(weights),
+        "unseen": rank,
         "scene_left_out_of_the_fit": left_out(by_scene),
-    }  # fmt: skip
+    }
     write_json(args.out / "perceptual.json", results, indent=1)
     return results
 
@@ -232,13 +229,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("train-perceptual", DESCRIPTION)
     add = parser.add_argument
     add_lpips(parser)
-    add(
-        "--out",
-        type=out_folder,
-        default="runs/perceptual",
-        metavar="DIR",
-        help="folder to write [%(default)s]",
-    )
+    add("--out", type=out_folder, default="runs/perceptual", metavar="DIR", help="folder to write [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add("--quick", action="store_true", help="8 scenes, small images: to try it out")
     add("--json", action="store_true", help="print perceptual.json instead of a summary")

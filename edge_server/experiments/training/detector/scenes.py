@@ -71,10 +71,7 @@ def kind_of(shape: Shape, matrix: Array) -> int | None:
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
     if isinstance(shape, Sphere) and np.ptp(stretch) < 0.05 * stretch.max():
         return KINDS.index("ball")
-    if (
-        isinstance(shape, Cylinder)
-        and _DRUM_PROPORTIONS[0] <= shape.half_height / shape.radius <= _DRUM_PROPORTIONS[1]
-    ):
+    if isinstance(shape, Cylinder) and _DRUM_PROPORTIONS[0] <= shape.half_height / shape.radius <= _DRUM_PROPORTIONS[1]:
         return KINDS.index("drum")
     return None
 
@@ -116,9 +113,7 @@ def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Gener
     held-out worlds of equal seeds."""
     name, rng = _base_scene(seed, purpose)
     scene = make_scene(name, {"count": 1, "width": side, "height": side})
-    statics = tuple(
-        p for p in scene.world.static_parts if isinstance(p.shape, Quad) or rng.random() < _PRESENT
-    )
+    statics = tuple(p for p in scene.world.static_parts if isinstance(p.shape, Quad) or rng.random() < _PRESENT)
     things = _small_things(rng) if name == "tile" else _things(rng, name)
     light = scene.world.light
     world = dataclasses.replace(
@@ -126,10 +121,8 @@ def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Gener
         static_parts=statics,
         moving_bodies=tuple(mover for _, mover in things),
         light=dataclasses.replace(light, strength=light.strength * rng.uniform(0.7, 1.2)),
-    )  # fmt: skip
-    camera = Pinhole.from_fov(
-        side, side, float(rng.uniform(38, 48) if name == "tile" else rng.uniform(50, 85))
     )
+    camera = Pinhole.from_fov(side, side, float(rng.uniform(38, 48) if name == "tile" else rng.uniform(50, 85)))
     pose = _viewpoint(rng, name, scene, [mover for _, mover in things])
     return Shot(world, camera, pose, tuple(KINDS.index(kind) for kind, _ in things)), rng
 

@@ -72,9 +72,7 @@ def train(
         try:
             model.load_state_dict(_read(start)["averaged"])
         except RuntimeError:
-            raise CheckpointError(
-                f"{start}: holds another network; begin from one of the same --of"
-            ) from None
+            raise CheckpointError(f"{start}: holds another network; begin from one of the same --of") from None
     averaged = Detector(kinds, prototypes).eval()
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
@@ -186,9 +184,7 @@ def _batches(
         yield batch[:, :3], truths, None if dataset.masks is None else batch[:, 3]
 
 
-def augmented(
-    image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], Boxes]:
+def augmented(image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator) -> tuple[NDArray[np.float32], Boxes]:
     """Randomly augment an image (side, side, 3), returned in [0, 1], and its boxes: mirrored, scaled,
     shifted, with a random exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the
     mask of its single object, from 0 to 255: it is transformed as well, and the box is computed from it."""
@@ -201,24 +197,21 @@ def augmented(
         scale = rng.uniform(0.7, 1.4)
         shift = (1.0 - scale) * side / 2 + rng.uniform(-0.15, 0.15, 2) * side
         warp = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
-        image = np.asarray(cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side),
-                                          borderValue=(114, 114, 114, 0)), np.uint8)  # fmt: skip
+        image = np.asarray(
+            cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side), borderValue=(114, 114, 114, 0)), np.uint8
+        )
         before = np.maximum(boxes[:, 2:4] - boxes[:, :2], 1.0).prod(axis=1)
         boxes[:, :4] = boxes[:, :4] * scale + np.tile(shift, 2)
         boxes[:, :4] = boxes[:, :4].clip(0, side)
         size = boxes[:, 2:4] - boxes[:, :2]
         # Boxes that are mostly cut off are dropped.
-        kept = (size.min(axis=1, initial=float(side)) >= MIN_SIDE_PX) & (
-            size.prod(axis=1) > 0.25 * before * scale**2
-        )
+        kept = (size.min(axis=1, initial=float(side)) >= MIN_SIDE_PX) & (size.prod(axis=1) > 0.25 * before * scale**2)
         boxes = boxes[kept]
     mask = image[..., 3:]
     if mask.shape[2]:
         boxes = boxes_of(np.where(mask[..., 0] > 127, 0, -1), [0])
     out = image[..., :3].astype(np.float32) / 255.0
-    out = out * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3).astype(np.float32) + rng.uniform(
-        -0.08, 0.08
-    )
+    out = out * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3).astype(np.float32) + rng.uniform(-0.08, 0.08)
     if rng.random() < 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.2)))
     if rng.random() < 0.3:

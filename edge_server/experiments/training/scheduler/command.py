@@ -16,22 +16,12 @@ from edge_server.experiments.common.arguments import add_folders, command_parser
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.result_store import content_key
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.evaluation import (
-    Evaluation,
-    baseline_policies,
-    evaluate_policies,
-)
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, evaluate_policies
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
 from edge_server.experiments.training.scheduler.policy_comparison import LEAD_MS, LEARNT, score_policies
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
-from edge_server.experiments.training.scheduler.trainer import (
-    REPORTS,
-    TrainingConfig,
-    TrainingError,
-    read_log,
-    train,
-)
+from edge_server.experiments.training.scheduler.trainer import REPORTS, TrainingConfig, TrainingError, read_log, train
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import STATE_PARTS
@@ -99,13 +89,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command("train-scheduler", work, (ScenarioError, DatasetError, TrainingError), stopped)
 
 
-def _train_and_evaluate(
-    args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool
-) -> None:
+def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool) -> None:
     print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
     if config.reward.fidelity == "whole" and not config.reward.age:
-        print("  the reward is of the whole image and has no term of age: where little moves it teaches to "
-              "ignore how old views are (--on moving)")  # fmt: skip
+        print(
+            "  the reward is of the whole image and has no term of age: where little moves it teaches to "
+            "ignore how old views are (--on moving)"
+        )
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
     learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
@@ -127,14 +117,21 @@ def _train_and_evaluate(
     omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
     candidates: dict[str, Maker | Actor] = {**baseline_policies(omegas, kinds), LEARNT: learner.actor}
     evaluation = evaluate_policies(
-        setting.judged, pool, seeds(config.seed, "test", args.test), candidates, config.reward,
+        setting.judged,
+        pool,
+        seeds(config.seed, "test", args.test),
+        candidates,
+        config.reward,
         lambda line: print(f"  on unseen seeds: {line}", flush=True),
-    )  # fmt: skip
+    )
     about = {
-        "reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent_s, 1),
-        "rewarded_from": setting.rewarding, "judged_from": setting.judged.scoring,
+        "reward_name": config.reward.name,
+        "on": config.reward.fidelity,
+        "seconds": round(spent_s, 1),
+        "rewarded_from": setting.rewarding,
+        "judged_from": setting.judged.scoring,
         "motions": setting.draws_motions,
-    }  # fmt: skip
+    }
     _report(args.out, evaluation, kinds[0], rows, about)
 
 
@@ -147,16 +144,19 @@ def _score(args: argparse.Namespace, setting: Setting, actor: Actor, pool: Worke
     as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
     weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
     found = score_policies(
-        as_it_is, pool, seeds(args.seed, "test", args.test), actor, weights, args.out / "runs.jsonl",
+        as_it_is,
+        pool,
+        seeds(args.seed, "test", args.test),
+        actor,
+        weights,
+        args.out / "runs.jsonl",
         lambda line: print(f"  {line}", flush=True),
-    )  # fmt: skip
+    )
     write_json(args.out / "scores.json", found, indent=1)
     actor.save(args.out / "actor.npz")
 
 
-def _report(
-    out: Path, evaluation: Evaluation, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
-) -> None:
+def _report(out: Path, evaluation: Evaluation, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
     write_csv(out / "evaluation.csv", rows_of(evaluation))
     found = summary(evaluation, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
@@ -191,12 +191,16 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
-        given, report=report,
+        given,
+        report=report,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
-        scratch=args.scratch, decisions=args.decisions, lead_ms=LEAD_MS if args.hold else 1000.0,
-        span_ms=args.hold * args.decisions or 6000.0, compute=read_config(given).compute,
+        scratch=args.scratch,
+        decisions=args.decisions,
+        lead_ms=LEAD_MS if args.hold else 1000.0,
+        span_ms=args.hold * args.decisions or 6000.0,
+        compute=read_config(given).compute,
         parts=_parts(args.parts),
-    )  # fmt: skip
+    )
 
 
 def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
@@ -238,9 +242,13 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
     spec = Spec(
-        args.kind, layout_of(setting, setting.parts), _omegas(args), network=args.network, hold_ms=args.hold,
+        args.kind,
+        layout_of(setting, setting.parts),
+        _omegas(args),
+        network=args.network,
+        hold_ms=args.hold,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
-    )  # fmt: skip
+    )
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
 
 
@@ -255,17 +263,13 @@ def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
             return tuple(float(ms) for ms in range(int(first), int(last) + 1))
         return tuple(float(v) for v in args.omegas.split(","))
     except ValueError:
-        raise ValueError(
-            f"--omegas: expected milliseconds such as 20,60,120 or 0..120, got {args.omegas!r}"
-        ) from None
+        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120 or 0..120, got {args.omegas!r}") from None
 
 
 def _parts(text: str) -> tuple[str, ...]:
     asked = set(text.split(","))
     if unknown := asked - set(STATE_PARTS):
-        raise ValueError(
-            f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(STATE_PARTS)}"
-        )
+        raise ValueError(f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(STATE_PARTS)}")
     return tuple(part for part in STATE_PARTS if part in asked)
 
 
@@ -276,20 +280,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
     add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
     add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
-    add("--hold", type=float, default=0.0, metavar="MS",
-        help="decide in the running deployment, every MS milliseconds [single decisions]")  # fmt: skip
+    add(
+        "--hold",
+        type=float,
+        default=0.0,
+        metavar="MS",
+        help="decide in the running deployment, every MS milliseconds [single decisions]",
+    )
     add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
     add("--tries", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
+    add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select and with --hold, else corrected]")
     add(
-        "--reward",
-        choices=tuple(REWARDS),
-        help="reward, see above [set for select and with --hold, else corrected]",
-    )
-    add(
-        "--on",
-        choices=("whole", "moving"),
-        default="whole",
-        help="pixels that the reward's PSNR is over [%(default)s]",
+        "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"
     )
     add(
         "--distance",
@@ -297,11 +299,19 @@ def _parser() -> argparse.ArgumentParser:
         default="lpips",
         help="distance in the reward; perceptual: a substitute without LPIPS weights [%(default)s]",
     )
-    add("--price", type=float, default=0.0, metavar="R",
-        help="cost of each used view, taken off the reward; at 0, policies tend to use all [0]")  # fmt: skip
-    add("--report", metavar="CAM,...",
+    add(
+        "--price",
+        type=float,
+        default=0.0,
+        metavar="R",
+        help="cost of each used view, taken off the reward; at 0, policies tend to use all [0]",
+    )
+    add(
+        "--report",
+        metavar="CAM,...",
         help="cameras that only report; none: the rewarding one reports [the last of several held-out "
-        "cameras, else one of the training cameras]")  # fmt: skip
+        "cameras, else one of the training cameras]",
+    )
     add(
         "--parts",
         default="age,pose",
@@ -313,8 +323,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MS,...",
         help="ms that threshold and wait choose from: 20,60,120, or A..B: each whole number",
     )
-    add("--network", choices=("pooled", "flat"), default="pooled",
-        help="pooled: any number of cameras; flat: the thesis's, a fixed number [%(default)s]")  # fmt: skip
+    add(
+        "--network",
+        choices=("pooled", "flat"),
+        default="pooled",
+        help="pooled: any number of cameras; flat: the thesis's, a fixed number [%(default)s]",
+    )
     add("--scratch", action="store_true", help="each update starts from an empty field, as in the thesis")
     add("--fit-steps", type=int, metavar="N", help="optimizer steps of an update [20; 50 with --scratch]")
     add(
@@ -324,17 +338,10 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PX",
         help="pixels a side in synthetic scenes; 0: the scenario's [%(default)s]",
     )
-    add("--field", metavar="NAME",
-        help="representation; '': the scenario's ['' with --hold, else splat]")  # fmt: skip
+    add("--field", metavar="NAME", help="representation; '': the scenario's ['' with --hold, else splat]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add("--test", type=int, default=20, metavar="N", help="unseen seeds to test on at the end [%(default)s]")
-    add(
-        "--jobs",
-        type=int,
-        default=usable_cores(),
-        metavar="N",
-        help="number of worker processes [%(default)s]",
-    )
+    add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
     add_folders(parser)
     add("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     return parser

@@ -77,8 +77,13 @@ def judge(factory: EpisodeFactory, seed: int, who: Judged) -> dict[str, Any]:
         policy = _Forking(who) if isinstance(who, Hindsight) else named(who)(rng)
     deployment, decided = _run(factory, seed, policy)
     outcome = _outcome(deployment, round(factory.setting.lead_ms * 1e6), deployment.clock.now_ns())
-    found: dict[str, Any] = {"psnr_db": outcome.psnr_db, "psnr_moving_db": outcome.psnr_moving_db,
-        "ssim": outcome.ssim, "views": outcome.views, "aaoi_ms": outcome.aaoi_ms}  # fmt: skip
+    found: dict[str, Any] = {
+        "psnr_db": outcome.psnr_db,
+        "psnr_moving_db": outcome.psnr_moving_db,
+        "ssim": outcome.ssim,
+        "views": outcome.views,
+        "aaoi_ms": outcome.aaoi_ms,
+    }
     if isinstance(who, Actor) and who.spec.omegas_ms:
         by_state: dict[str, list[float]] = {}
         for d in decided:
@@ -101,14 +106,22 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
             decisions.append(last.without_frames())
 
     settings = RunSettings(
-        steps=edge.steps, compute=setting.compute, grace_ms=edge.grace_ms,
+        steps=edge.steps,
+        compute=setting.compute,
+        grace_ms=edge.grace_ms,
         epoch_ms=edge.update_ms,
-        score_every_ms=None, shown_every_ms=SHOWN_EVERY_MS,
-    )  # fmt: skip
+        score_every_ms=None,
+        shown_every_ms=SHOWN_EVERY_MS,
+    )
     deployment = build_deployment(
-        scenario, settings, field=field, cameras=stage.cameras, truth=stage.truth,
-        embedder=factory.embedder, on_published=published,
-    )  # fmt: skip
+        scenario,
+        settings,
+        field=field,
+        cameras=stage.cameras,
+        truth=stage.truth,
+        embedder=factory.embedder,
+        on_published=published,
+    )
     deployment.updates.policy = policy
     if isinstance(policy, _Forking):
         policy.shown_db = lambda begin_ns, end_ns: _outcome(deployment, begin_ns, end_ns).psnr_db

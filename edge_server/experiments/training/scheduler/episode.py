@@ -25,12 +25,7 @@ from camera_node.synthetic.effects import NO_EFFECTS
 from edge_server.config import read_config
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.training.scheduler.setting import GRID_MS, Setting
-from edge_server.experiments.virtual.from_scenario import (
-    build_deployment,
-    build_truth,
-    exact_scene,
-    training_cameras,
-)
+from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, exact_scene, training_cameras
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -293,9 +288,7 @@ class Episode:
         record = recorder.record
         # Kept for the images only: the instant of reception depends on the record.
         self._frames |= {(b.frame.camera, b.frame.sequence): b for b in record}
-        return deployment, [
-            Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record
-        ]
+        return deployment, [Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record]
 
     def evaluate(self, number: int, choice: Choice) -> Outcome:
         """Fit the choice at a decision and score it at publication on the setting's scoring cameras. An empty

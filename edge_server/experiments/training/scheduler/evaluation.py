@@ -27,9 +27,18 @@ At = tuple[int, int]
 
 # Policies without learning, thresholds and waits aside.
 BASELINE_POLICIES = (
-    "random", "all", "periodic:500", "round-robin:6", "freshest-k:4", "freshest-k:6", "freshest-k:9",
-    "freshest-k:12", "age-driven", "mask", "freshen",
-)  # fmt: skip
+    "random",
+    "all",
+    "periodic:500",
+    "round-robin:6",
+    "freshest-k:4",
+    "freshest-k:6",
+    "freshest-k:9",
+    "freshest-k:12",
+    "age-driven",
+    "mask",
+    "freshen",
+)
 HINDSIGHT = "hindsight"
 _REQUESTS_AT_ONCE = 400
 
@@ -81,9 +90,8 @@ class Evaluation:
         """Rewards of ``kind`` (threshold, wait) at its best value, chosen on one half of the seeds and
         measured on the other; and the name of the best value over all seeds."""
         curve = {
-            float(name.partition(":")[2]): self.rewards(name)
-            for name in self.outcomes if name.startswith(f"{kind}:")
-        }  # fmt: skip
+            float(name.partition(":")[2]): self.rewards(name) for name in self.outcomes if name.startswith(f"{kind}:")
+        }
         means = {x: interval(values.values()).mean for x, values in curve.items()}
         best = max(means, key=lambda x: means[x])
         return dict(at_its_best(curve)), f"{kind}:{best:g}"
@@ -122,8 +130,9 @@ class Evaluation:
         found: dict[At, float | None] = {}
         best: list[int] = []
         for at in self.outcomes[names[0]] if names else ():
-            pairs = {k: [self.value(o) for o in self._fits(n, at)] for k, n in enumerate(names)
-                     if at in self.outcomes[n]}  # fmt: skip
+            pairs = {
+                k: [self.value(o) for o in self._fits(n, at)] for k, n in enumerate(names) if at in self.outcomes[n]
+            }
             known = {k: p for k, p in pairs.items() if len(p) == 2 and None not in p}
             if not known:
                 found[at] = None

@@ -37,9 +37,7 @@ class FitProblem:
     reward: Reward
     pool: WorkerPool
     run: int = 0
-    _drawn: deque[int] = field(
-        default_factory=lambda: deque(maxlen=KEPT), init=False, repr=False, compare=False
-    )
+    _drawn: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT), init=False, repr=False, compare=False)
 
     def draw(self, seed: int) -> FitDecision:
         episode, number = divmod(seed, self.setting.decisions)

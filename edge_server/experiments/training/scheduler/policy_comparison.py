@@ -38,9 +38,17 @@ from freshfield.scenario import ScenarioError, load
 LEARNT = "learnt"
 REFERENCE = "all"
 POLICIES = (
-    REFERENCE, LEARNT, "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "whittle:1", "aoii:1",
-    "covariance:1", "age-driven",
-)  # fmt: skip
+    REFERENCE,
+    LEARNT,
+    "threshold:120",
+    "threshold:300",
+    "wait:60",
+    "freshest-k:6",
+    "whittle:1",
+    "aoii:1",
+    "covariance:1",
+    "age-driven",
+)
 # Decisions have no effect until the layers of a field have begun (``layered_field.PLATE_S``).
 LEAD_MS = 5000.0
 # For how long shown images are scored, after the lead of an episode.
@@ -72,17 +80,25 @@ def score_policies(
         found[name] = {"own_seed": _runs(own, pool, own_seed, who, weights, known)[0]}
         shown = number(found[name]["own_seed"]["psnr_db"])
         say(f"{name}: {shown} dB shown with seed {setting.scenario.seed}")
-    runs = {who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
-            for who in (REFERENCE, LEARNT)}  # fmt: skip
+    runs = {
+        who: _runs(setting, pool, seeds, learnt if who == LEARNT else who, weights, known)
+        for who in (REFERENCE, LEARNT)
+    }
     for who, of in _means(runs, seeds, _SHOWN).items():
         found[who] |= of
     found[LEARNT]["omega_ms"] = _by_state([run.get("omega_ms", {}) for run in runs[LEARNT]])
     say(f"{LEARNT} over {REFERENCE}: {found[LEARNT][f'psnr_db_over_{REFERENCE}']} dB over {len(seeds)} seeds")
     return {
-        "scenario": setting.scenario.name, "seed": setting.scenario.seed, "seeds": len(seeds),
-        "lead_s": setting.lead_ms / 1e3, "seconds": setting.span_ms / 1e3, "judged_from": setting.scoring,
-        "policies": found, "compute": dataclasses.asdict(setting.compute), "machine": machine(),
-    }  # fmt: skip
+        "scenario": setting.scenario.name,
+        "seed": setting.scenario.seed,
+        "seeds": len(seeds),
+        "lead_s": setting.lead_ms / 1e3,
+        "seconds": setting.span_ms / 1e3,
+        "judged_from": setting.scoring,
+        "policies": found,
+        "compute": dataclasses.asdict(setting.compute),
+        "machine": machine(),
+    }
 
 
 def _runs(
@@ -98,9 +114,7 @@ def _runs(
         return [store.results[keys[seed]] for seed in seeds]
 
 
-def _means(
-    runs: Mapping[str, list[dict[str, Any]]], seeds: range, names: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+def _means(runs: Mapping[str, list[dict[str, Any]]], seeds: range, names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """For each policy the means of ``names``, and its shown fidelity minus that of the first policy,
     paired."""
     first, found = next(iter(runs)), {}
@@ -157,26 +171,33 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one, with edge.compute")
     parser.add_argument(
-        "policies", nargs="+", metavar="NAME[:VALUE]",
+        "policies",
+        nargs="+",
+        metavar="NAME[:VALUE]",
         help="as edge.policy; hindsight:MS,MS,... takes each second the best of these thresholds",
-    )  # fmt: skip
+    )
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="number of seeds [%(default)s]")
     parser.add_argument(
-        "--seconds",
-        type=float,
-        default=SPAN_MS / 1e3,
-        metavar="S",
-        help="seconds that are scored [%(default)g]",
+        "--seconds", type=float, default=SPAN_MS / 1e3, metavar="S", help="seconds that are scored [%(default)g]"
     )
-    parser.add_argument("--costs", type=Path, metavar="FILE",
-        help="file written by `edge-server costs` [edge.compute of the scenario]")  # fmt: skip
-    parser.add_argument("--slower", type=float, default=1.0, metavar="K",
-        help="an edge on which all computing takes K times as long [%(default)g]")  # fmt: skip
     parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="number of worker processes [%(default)s]"
+        "--costs", type=Path, metavar="FILE", help="file written by `edge-server costs` [edge.compute of the scenario]"
     )
-    parser.add_argument("--json", type=out_file, required=True, metavar="FILE",
-        help="write the result to FILE; finished runs are kept beside it")  # fmt: skip
+    parser.add_argument(
+        "--slower",
+        type=float,
+        default=1.0,
+        metavar="K",
+        help="an edge on which all computing takes K times as long [%(default)g]",
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="number of worker processes [%(default)s]")
+    parser.add_argument(
+        "--json",
+        type=out_file,
+        required=True,
+        metavar="FILE",
+        help="write the result to FILE; finished runs are kept beside it",
+    )
     add_folders(parser)
     args = parser.parse_args(argv)
     try:
@@ -186,29 +207,35 @@ def main(argv: Sequence[str] | None = None) -> None:
             edge["compute"] = str(args.costs.resolve())
         scenario = dataclasses.replace(scenario, edge=edge)
         compute = _slower(read_config(scenario).compute, args.slower)
-        setting = Setting(
-            scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=compute, parts=STATE_PARTS
-        )
+        setting = Setting(scenario, lead_ms=LEAD_MS, span_ms=args.seconds * 1e3, compute=compute, parts=STATE_PARTS)
     except (ScenarioError, ValueError) as error:
         parser.error(str(error))
     args.json.parent.mkdir(parents=True, exist_ok=True)
     with WorkerPool(folders_of(args), args.jobs) as pool:
         seeds = seeds_of(scenario.seed, "test", args.seeds)
         found = compare(setting, pool, seeds, args.policies, args.json.with_suffix(".jsonl"))
-    write_json(args.json, {
-        "scenario": scenario.name, "seeds": args.seeds, "lead_s": LEAD_MS / 1e3, "seconds": args.seconds,
-        "judged_from": setting.scoring, "motions": setting.draws_motions,
-        "compute": dataclasses.asdict(compute), "commit": commit(), "policies": found,
-    }, indent=1)  # fmt: skip
+    write_json(
+        args.json,
+        {
+            "scenario": scenario.name,
+            "seeds": args.seeds,
+            "lead_s": LEAD_MS / 1e3,
+            "seconds": args.seconds,
+            "judged_from": setting.scoring,
+            "motions": setting.draws_motions,
+            "compute": dataclasses.asdict(compute),
+            "commit": commit(),
+            "policies": found,
+        },
+        indent=1,
+    )
 
 
 def _slower(costs: ComputeConfig, times: float) -> ComputeConfig:
     """``costs`` multiplied by ``times``. Raises ValueError if this is invalid or has no effect."""
     charged = dataclasses.asdict(costs)
     if not times > 0.0 or (times != 1.0 and not any(charged.values())):
-        raise ValueError(
-            f"--slower {times:g}: expected more than 0, and a scenario or --costs that charge something"
-        )
+        raise ValueError(f"--slower {times:g}: expected more than 0, and a scenario or --costs that charge something")
     return ComputeConfig(**{name: times * ms for name, ms in charged.items()})
 
 

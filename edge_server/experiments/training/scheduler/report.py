@@ -60,8 +60,7 @@ def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
         "seeds": evaluation.seeds(trained)[1],
         "seeds_without_value": evaluation.seeds(trained)[0] - evaluation.seeds(trained)[1],
         "reward": interval(mine.values()).rounded(6),
-        "rewards": {n: interval(evaluation.rewards(n).values()).rounded(6)
-                    for n in (*evaluation.outcomes, HINDSIGHT)},
+        "rewards": {n: interval(evaluation.rewards(n).values()).rounded(6) for n in (*evaluation.outcomes, HINDSIGHT)},
         "over_random": paired(mine, evaluation.rewards("random")).rounded(6),
         "over_best_fixed": paired(mine, best).rounded(6),
         "best_fixed": name,
@@ -69,7 +68,7 @@ def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
         "best_fixed_share": evaluation.share(best).rounded(6),
         "best_value_by_decision": best_values["quartiles"],
         "knowing_it_is_worth": best_values["gain"].rounded(6),
-    }  # fmt: skip
+    }
 
 
 def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:

@@ -87,9 +87,7 @@ class TrainingConfig:
         return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
 
 
-def train(
-    setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]
-) -> Learner:
+def train(setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
     Writes OUT/training.jsonl (a line per batch), OUT/training.json, the ``stage_file`` of each stage and, at
@@ -169,9 +167,11 @@ def _train_batch(
     advantages = subtract_sibling_baseline(rewards, config.tries)
     update = learner.update(learner.batch(states, actions, logps, advantages))
     row = _row(config, episode_seeds, found, outcomes, actions) | {
-        "decisions": len(moments), "fits": len(each), "carried_out": pool.evaluated - before,
+        "decisions": len(moments),
+        "fits": len(each),
+        "carried_out": pool.evaluated - before,
         "processor_seconds": pool.cost_s(setting, requests),
-    }  # fmt: skip
+    }
     return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
 
 
@@ -185,9 +185,10 @@ def _row(
     """The part of a batch's row of the log that describes its decisions."""
     first = config.seeds(0)[0]
     row: Row = {
-        "batch": (episode_seeds[0] - first) // config.batch, "episodes": episode_seeds[-1] + 1 - first,
+        "batch": (episode_seeds[0] - first) // config.batch,
+        "episodes": episode_seeds[-1] + 1 - first,
         "reward": _mean([_complete(r) for r in found]),
-    }  # fmt: skip
+    }
     terms = found[0].terms if found else ()
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
@@ -216,9 +217,11 @@ def _train_deployed_batch(
     if not each:  # nothing arrived in any of its episodes
         return row | {"decisions": 0}
     batch = learner.batch(
-        [d.state for d in decisions], np.array([d.action for d in decisions]),
-        np.array([d.logp for d in decisions]), np.concatenate(advantages),
-    )  # fmt: skip
+        [d.state for d in decisions],
+        np.array([d.action for d in decisions]),
+        np.array([d.logp for d in decisions]),
+        np.concatenate(advantages),
+    )
     update = dataclasses.asdict(learner.update(batch))
     return row | {"decisions": len(each)} | {k: v for k, v in update.items() if k != "reward"}
 
@@ -320,9 +323,7 @@ class _Checkpoint:
             lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
             return Learner.load(self.out / name), [json.loads(line) for line in lines]
         except (OSError, ValueError) as error:
-            raise TrainingError(
-                f"{self.out}: cannot go on: {error}: choose another --out, or delete it"
-            ) from None
+            raise TrainingError(f"{self.out}: cannot go on: {error}: choose another --out, or delete it") from None
 
     def save(self, learner: Learner, rows: list[Row]) -> None:
         name = f"weights-{len(rows):05d}.npz"

@@ -130,9 +130,7 @@ class WorkerPool:
         for seed in seeds:
             self._moments.pop((setting.key, seed), None)
 
-    def evaluate(
-        self, setting: Setting, requests: Sequence[Request], say: Progress | None = None
-    ) -> list[Outcome]:
+    def evaluate(self, setting: Setting, requests: Sequence[Request], say: Progress | None = None) -> list[Outcome]:
         """The outcome of each request, in order. After Ctrl-C the file has what was finished.
 
         say: called with the number of new evaluations that are done and their total.
@@ -162,9 +160,7 @@ class WorkerPool:
         one."""
         return math.fsum(self._known[key][1] for key in {self._key(setting, r) for r in requests}) / 1e3
 
-    def play(
-        self, setting: Setting, seeds: Sequence[int], actor: Actor, tries: int
-    ) -> list[list[list[Decided]]]:
+    def play(self, setting: Setting, seeds: Sequence[int], actor: Actor, tries: int) -> list[list[list[Decided]]]:
         """The decisions of every try of each episode in which ``actor`` decides."""
         work = partial(_each, play)
         sent = [self._send(s, work, setting, [(s, actor, turn) for turn in range(tries)]) for s in seeds]
@@ -172,9 +168,7 @@ class WorkerPool:
 
     def judge(self, setting: Setting, seeds: Sequence[int], who: Judged) -> Iterator[dict[str, Any]]:
         """``deployed.judge`` of each episode."""
-        sent: Iterable[Future[list[Any]]] = (
-            self._send(s, partial(_each, judge), setting, [(s, who)]) for s in seeds
-        )
+        sent: Iterable[Future[list[Any]]] = (self._send(s, partial(_each, judge), setting, [(s, who)]) for s in seeds)
         # With one job, sending computes the result, so send one only when it is asked for.
         for one in sent if self.jobs == 1 else list(sent):
             yield one.result()[0]

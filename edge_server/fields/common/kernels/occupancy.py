@@ -63,8 +63,24 @@ def count_views(counter, worker, cells, contracted, near, views, mask_first, mas
 
 
 @kernel
-def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, net, cells, contracted, seen,
-                   min_views, density, acts, x):  # fmt: skip
+def sample_density(
+    counter,
+    worker,
+    key,
+    phase,
+    phases,
+    fade,
+    encoding,
+    levels,
+    net,
+    cells,
+    contracted,
+    seen,
+    min_views,
+    density,
+    acts,
+    x,
+):
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
     key: uint64, random stream. seen: uint16 (cells^3,); cells seen by fewer than min_views get 0.

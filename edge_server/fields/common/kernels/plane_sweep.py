@@ -81,8 +81,9 @@ def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden)
 
 
 @kernel
-def score_cells(counter, worker, cams, views, blurred, flags, plain, plain_color, tolerance, contracted,
-                cells, min_views, scores):  # fmt: skip
+def score_cells(
+    counter, worker, cams, views, blurred, flags, plain, plain_color, tolerance, contracted, cells, min_views, scores
+):
     """How well the cameras agree on the color of each cell. Tasks are layers along z.
 
     cams: float32 rows of at most MOST_VIEWS cameras; views: ``rays.Views`` of the same. Pixels of weight 0 do
@@ -94,8 +95,11 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, plain_color
         where it is hidden, or where background shows.
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
-    red, green, blue = np.empty(MOST_VIEWS, np.float32), np.empty(MOST_VIEWS, np.float32), (
-        np.empty(MOST_VIEWS, np.float32))  # fmt: skip
+    red, green, blue = (
+        np.empty(MOST_VIEWS, np.float32),
+        np.empty(MOST_VIEWS, np.float32),
+        (np.empty(MOST_VIEWS, np.float32)),
+    )
     places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
     tally, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
     sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
@@ -125,9 +129,10 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, plain_color
                     if pixel == nowhere or (weight.size > 0 and weight[pixel] <= _F0):
                         continue
                     r, g, b = (
-                        np.float32(blurred[pixel, 0]) * _BYTE, np.float32(blurred[pixel, 1]) * _BYTE,
+                        np.float32(blurred[pixel, 0]) * _BYTE,
+                        np.float32(blurred[pixel, 1]) * _BYTE,
                         np.float32(blurred[pixel, 2]) * _BYTE,
-                    )  # fmt: skip
+                    )
                     red[n], green[n], blue[n] = r, g, b
                     away = abs(r - plain_color[0]) + abs(g - plain_color[1]) + abs(b - plain_color[2])
                     if blurred.shape[1] == 4:
@@ -150,8 +155,7 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, plain_color
 
 
 @kernel
-def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, least, scores,
-               distance):  # fmt: skip
+def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, least, scores, distance):
     """The distance of the best cell on each ray. Tasks are runs of 256 rays.
 
     view_of: int64 (N,), each ray's view; pixels: int64 (N,), its pixel within that.
@@ -171,12 +175,16 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
             v = view_of[n]
             width = views.size[v, 0]
             dx, dy, dz = pixel_direction(
-                views.lens[v], views.rotation[v],
-                np.float64(pixels[n] % width) + 0.5, np.float64(pixels[n] // width) + 0.5,
-            )  # fmt: skip
+                views.lens[v],
+                views.rotation[v],
+                np.float64(pixels[n] % width) + 0.5,
+                np.float64(pixels[n] // width) + 0.5,
+            )
             ox, oy, oz = (
-                np.float32(views.origin[v, 0]), np.float32(views.origin[v, 1]), np.float32(views.origin[v, 2])
-            )  # fmt: skip
+                np.float32(views.origin[v, 0]),
+                np.float32(views.origin[v, 1]),
+                np.float32(views.origin[v, 2]),
+            )
             best, at, t = least, _F0, max(near, size)
             while t < np.float32(2.0) * horizon + middle:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz

@@ -17,8 +17,26 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 @kernel
-def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics,
-                 background, acts, x, line, color, depth, opacity):  # fmt: skip
+def render_tiles(
+    counter,
+    worker,
+    lens,
+    rotation,
+    origin,
+    pixels,
+    space,
+    encoding,
+    levels,
+    net,
+    harmonics,
+    background,
+    acts,
+    x,
+    line,
+    color,
+    depth,
+    opacity,
+):
     """Render image points; tasks are runs of TILE of them.
 
     lens: float64 (8,). rotation: float64 (3, 3), camera to world. origin: float64 (3,), scene units.
@@ -29,9 +47,7 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
     out_row = acts.shape[1] - net.widths[-1]
     ts, dts = line[worker, 0], line[worker, 1]
     out = acts[worker, out_row:]
-    travel = np.empty(
-        (TILE, 6), np.float32
-    )  # direction, distance reached, distance of leaving, optical depth
+    travel = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)
     active = np.empty(TILE, np.int64)
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
@@ -57,9 +73,22 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
             for k in range(count):
                 r = active[k]
                 n, t, _ = march(
-                    space, ox, oy, oz, travel[r, 0], travel[r, 1], travel[r, 2], travel[r, 3],
-                    travel[r, 4], x[worker], ts, dts, n, n + ROUND, NEVER,
-                )  # fmt: skip
+                    space,
+                    ox,
+                    oy,
+                    oz,
+                    travel[r, 0],
+                    travel[r, 1],
+                    travel[r, 2],
+                    travel[r, 3],
+                    travel[r, 4],
+                    x[worker],
+                    ts,
+                    dts,
+                    n,
+                    n + ROUND,
+                    NEVER,
+                )
                 travel[r, 3] = t
                 first[k + 1] = n
             query_density(encoding, levels, net, x[worker], start, n, acts[worker])
@@ -67,9 +96,7 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
             if harmonics > 1:
                 for k in range(count):
                     r = active[k]
-                    add_harmonics(
-                        out, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2]
-                    )
+                    add_harmonics(out, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2])
             activate(out, start, n)
             left = 0
             for k in range(count):

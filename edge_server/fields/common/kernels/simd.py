@@ -156,8 +156,20 @@ _WIDE = ir.VectorType(ir.FloatType(), _LANES)
 
 
 @intrinsic
-def add_products(typingctx: Any, w: Any, first: Any, out_stride: Any, in_stride: Any, n_in: Any, x: Any,
-                 x_row: Any, y: Any, y_row: Any, a: Any, b: Any) -> Any:  # fmt: skip
+def add_products(
+    typingctx: Any,
+    w: Any,
+    first: Any,
+    out_stride: Any,
+    in_stride: Any,
+    n_in: Any,
+    x: Any,
+    x_row: Any,
+    y: Any,
+    y_row: Any,
+    a: Any,
+    b: Any,
+) -> Any:
     """``y[y_row + o, s] += sum_i w[first + o out_stride + i in_stride] x[x_row + i, s]``, o < 4, a <= s < b.
 
     w: contiguous float32; x, y: contiguous float32 (rows, N), or one array whose rows read and written are
@@ -180,15 +192,14 @@ def add_products(typingctx: Any, w: Any, first: Any, out_stride: Any, in_stride:
         sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(4 * _VECTORS)]
 
         def at(data: Any, row: Any, side: Any, s: Any) -> Any:
-            return builder.bitcast(
-                builder.gep(data, [builder.add(builder.mul(row, side), s)]), _WIDE.as_pointer()
-            )
+            return builder.bitcast(builder.gep(data, [builder.add(builder.mul(row, side), s)]), _WIDE.as_pointer())
 
         with cgutils.for_range_slice(builder, a, b, i64(AT_ONCE)) as (s, _):
             places = [
                 at(y_data, builder.add(y_row, i64(o)), y_side, builder.add(s, i64(_LANES * v)))
-                for o in range(4) for v in range(_VECTORS)
-            ]  # fmt: skip
+                for o in range(4)
+                for v in range(_VECTORS)
+            ]
             for total, place in zip(sums, places, strict=True):
                 old = builder.load(place)
                 old.align = 4

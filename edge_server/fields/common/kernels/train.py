@@ -151,9 +151,7 @@ def take_pixel(views, recipe, pixel, n, ray):
         if recipe.random_background:
             back = uniform(key, k + np.uint64(3 + c))
         ray[6 + c] = back
-        ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (
-            _F1 - alpha
-        )
+        ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
     ray[9] = np.float32(view)
     if views.exposure.shape[0] > 0:
         for c in range(3):
@@ -175,8 +173,9 @@ def begin_rays(views, recipe, space, chunk, first, end, ray, travel):
         index = chunk * CHUNK_RAYS + r
         view = draw_ray(views, recipe, index, ray[r])
         o = views.origin[view]
-        enter, leave = interval(space, np.float32(o[0]), np.float32(o[1]), np.float32(o[2]),
-                                ray[r, 0], ray[r, 1], ray[r, 2])  # fmt: skip
+        enter, leave = interval(
+            space, np.float32(o[0]), np.float32(o[1]), np.float32(o[2]), ray[r, 0], ray[r, 1], ray[r, 2]
+        )
         enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
         travel[r, _AT], travel[r, _LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
@@ -212,9 +211,22 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, t
             r = active[marched]
             o = views.origin[np.int64(ray[r, 9])]
             end, travel[r, _AT], _ = march(
-                space, np.float32(o[0]), np.float32(o[1]), np.float32(o[2]), ray[r, 0], ray[r, 1], ray[r, 2],
-                travel[r, _AT], travel[r, _LEAVE], x, ts, dts, end, room, np.float32(ASKED),
-            )  # fmt: skip
+                space,
+                np.float32(o[0]),
+                np.float32(o[1]),
+                np.float32(o[2]),
+                ray[r, 0],
+                ray[r, 1],
+                ray[r, 2],
+                travel[r, _AT],
+                travel[r, _LEAVE],
+                x,
+                ts,
+                dts,
+                end,
+                room,
+                np.float32(ASKED),
+            )
             stops[marched] = end
             marched += 1
         query_density(encoding, recipe.levels, net, x, n, end, acts)
@@ -340,9 +352,7 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
         if chunk >= batch.samples.size:
             return
         x = batch.x[chunk]
-        drawn, n, spans = fill_chunk(
-            views, recipe, space, encoding, net, chunk, x, line, acts, ray, travel, span
-        )
+        drawn, n, spans = fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, travel, span)
         rays = sort_by_ray(drawn, spans, span, ray, travel, column, ray_first)
         used = ray_first[rays]
         query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
@@ -361,9 +371,7 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
         for r in range(rays):
             a, b = ray_first[r], ray_first[r + 1]
             guide = ray[r, 11] if views.guide.size > 0 else _F0
-            error = ray_loss(
-                by_ray[:4], by_ray[4:8], ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], guide, weights
-            )  # fmt: skip
+            error = ray_loss(by_ray[:4], by_ray[4:8], ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], guide, weights)
             if error < _F0:
                 dropped += 1
                 clear_columns(acts, column, a, b)

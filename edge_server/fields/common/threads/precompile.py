@@ -45,9 +45,7 @@ def compile_ahead(run_kernels: Callable[[Pool], None]) -> float:
     recording = _RecordingPool()
     with np.errstate(all="ignore"):  # of memory that no kernel filled
         run_kernels(recording)
-    missing = sorted(
-        (c for c in recording.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func)
-    )
+    missing = sorted((c for c in recording.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func))
     if len(missing) > 1:
         own = [(kernel, tuple(map(typeof, args))) for kernel, args in work_queue.kernel_calls()]  # a pool's
         missing += [call for call in own if not is_stored(*call)]
@@ -106,9 +104,11 @@ class _CompilerProcess(threading.Thread):
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _HELPER],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            )  # fmt: skip
+            )
         except OSError as error:
             log.info("no process to compile kernels beside this one: %s", error)
         else:

@@ -133,11 +133,7 @@ def await_workers(queue, others, polls):
 def kernel_calls() -> list[tuple[Any, tuple[Any, ...]]]:
     """The kernels above with arguments of the types that a pool gives them, to be compiled ahead."""
     queue = make_queue(1)
-    return [
-        (post_job, (queue, 0)),
-        (poll_for_job, (queue, queue, 0, 0, 0, 0)),
-        (await_workers, (queue, 0, 0)),
-    ]
+    return [(post_job, (queue, 0)), (poll_for_job, (queue, queue, 0, 0, 0, 0)), (await_workers, (queue, 0, 0))]
 
 
 @cache

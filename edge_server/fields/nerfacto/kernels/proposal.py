@@ -116,9 +116,7 @@ def unwarp(u, knee, slope):
 
 
 @part
-def make_bins(
-    space, encoding, bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell, depth, edges, at
-):
+def make_bins(space, encoding, bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell, depth, edges, at):
     """Divide a ray into bins and keep those in occupied cells, up to optical depth CUTOFF_DEPTH.
 
     shift: in [0, 1), moves the raster of bins. Written from ``first`` on: cell, int32 (N,), proposal cell of
@@ -219,9 +217,7 @@ def _dilated(weight, k, first, end):
 
 
 @part
-def place_samples(
-    contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line
-):
+def place_samples(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line):
     """Append a ray's samples, of equal length within a group, from column n on.
 
     shift: in [0, 1), position of a sample within its part. x: float32 (3, N), points in the unit cube. line:

@@ -9,12 +9,7 @@ from edge_server.fields.common.kernels.radiance_model import query_color, query_
 from edge_server.fields.common.kernels.rays import interval, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
-from edge_server.fields.nerfacto.kernels.proposal import (
-    allocate_samples,
-    bin_weights,
-    make_bins,
-    place_samples,
-)
+from edge_server.fields.nerfacto.kernels.proposal import allocate_samples, bin_weights, make_bins, place_samples
 
 TILE = 256  # rays a task
 SAMPLE_BATCH = 2048  # samples that the network evaluates at a time
@@ -23,8 +18,27 @@ _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
 @kernel
-def render_with_proposal(counter, worker, lens, rotation, origin, pixels, sampling, space, encoding, levels,
-                         net, harmonics, background, acts, x, line, color, depth, opacity):  # fmt: skip
+def render_with_proposal(
+    counter,
+    worker,
+    lens,
+    rotation,
+    origin,
+    pixels,
+    sampling,
+    space,
+    encoding,
+    levels,
+    net,
+    harmonics,
+    background,
+    acts,
+    x,
+    line,
+    color,
+    depth,
+    opacity,
+):
     """Render image points: pixels, float64 (N, 2).
 
     Writes color, float32 (N, 3), depth in scene units and opacity, (N,). Scratch: acts, float32 (W, units,
@@ -55,17 +69,45 @@ def render_with_proposal(counter, worker, lens, rotation, origin, pixels, sampli
                 enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
                 if leave > enter:
                     count, _ = make_bins(
-                        space, encoding, sampling.bins, ox, oy, oz, dx, dy, dz, enter, leave, _HALF, zero,
-                        cell, tau, edges, at,
-                    )  # fmt: skip
-                    bin_weights(tau, zero, count, weight)
-                    allocate_samples(
-                        weight, zero, count, sampling.samples, sampling.uniform_share, _HALF, group, share
+                        space,
+                        encoding,
+                        sampling.bins,
+                        ox,
+                        oy,
+                        oz,
+                        dx,
+                        dy,
+                        dz,
+                        enter,
+                        leave,
+                        _HALF,
+                        zero,
+                        cell,
+                        tau,
+                        edges,
+                        at,
                     )
+                    bin_weights(tau, zero, count, weight)
+                    allocate_samples(weight, zero, count, sampling.samples, sampling.uniform_share, _HALF, group, share)
                     n = place_samples(
-                        space.contracted, ox, oy, oz, dx, dy, dz, edges, group, zero, count, share, _HALF, n,
-                        room, x[worker], line[worker],
-                    )  # fmt: skip
+                        space.contracted,
+                        ox,
+                        oy,
+                        oz,
+                        dx,
+                        dy,
+                        dz,
+                        edges,
+                        group,
+                        zero,
+                        count,
+                        share,
+                        _HALF,
+                        n,
+                        room,
+                        x[worker],
+                        line[worker],
+                    )
                 here += 1
                 first[here] = n
             query_density(encoding, levels, net, x[worker], zero, n, acts[worker])

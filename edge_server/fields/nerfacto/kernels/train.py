@@ -95,8 +95,25 @@ def compact_columns(rows, a, b, to):
 
 
 @part
-def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell,
-                  depth, weight, group, bin_first):  # fmt: skip
+def sample_chunk(
+    views,
+    recipe,
+    sampling,
+    space,
+    encoding,
+    net,
+    chunk,
+    x,
+    acts,
+    ray_first,
+    ray,
+    line,
+    cell,
+    depth,
+    weight,
+    group,
+    bin_first,
+):
     """Fill a chunk with rays, their bins, their samples and the result of ``query_density``.
 
     Hidden samples are removed, and further rays fill their place. Returns (rays, samples, rays whose
@@ -124,18 +141,46 @@ def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, 
                 shift = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
                 within = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
                 count, finite = make_bins(
-                    space, encoding, sampling.bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell,
-                    depth, edges, at,
-                )  # fmt: skip
+                    space,
+                    encoding,
+                    sampling.bins,
+                    ox,
+                    oy,
+                    oz,
+                    dx,
+                    dy,
+                    dz,
+                    enter,
+                    leave,
+                    shift,
+                    first,
+                    cell,
+                    depth,
+                    edges,
+                    at,
+                )
                 broken += 0 if finite else 1
                 bin_weights(depth, first, count, weight)
-                allocate_samples(
-                    weight, first, count, sampling.samples, sampling.uniform_share, within, group, share
-                )
+                allocate_samples(weight, first, count, sampling.samples, sampling.uniform_share, within, group, share)
                 end = place_samples(
-                    space.contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, within, end,
-                    room, x, line,
-                )  # fmt: skip
+                    space.contracted,
+                    ox,
+                    oy,
+                    oz,
+                    dx,
+                    dy,
+                    dz,
+                    edges,
+                    group,
+                    first,
+                    count,
+                    share,
+                    within,
+                    end,
+                    room,
+                    x,
+                    line,
+                )
             drawn += 1
             ray_first[drawn], bin_first[drawn] = end, first + count
         if drawn == rays:
@@ -158,8 +203,22 @@ def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, 
 
 
 @kernel
-def train_with_proposal(counter, worker, views, recipe, sampling, space, encoding, net, embeddings, weights,
-                        batch, bins, scratch, proposal_scratch):  # fmt: skip
+def train_with_proposal(
+    counter,
+    worker,
+    views,
+    recipe,
+    sampling,
+    space,
+    encoding,
+    net,
+    embeddings,
+    weights,
+    batch,
+    bins,
+    scratch,
+    proposal_scratch,
+):
     """Forward and backward of a step; a task is a chunk. Scatter kernels then add up the gradients of the
     encoding and of the proposal. embeddings: float32 (V, A), one a view; A = 0: none."""
     acts, d_acts = scratch.acts[worker], scratch.d_acts[worker]
@@ -178,9 +237,24 @@ def train_with_proposal(counter, worker, views, recipe, sampling, space, encodin
         x, cell, grad = batch.x[chunk], bins.cell[chunk], bins.grad[chunk]
         bins.d_embeddings[chunk] = _F0
         rays, n, broken = sample_chunk(
-            views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell, depth,
-            weight, group, bin_first,
-        )  # fmt: skip
+            views,
+            recipe,
+            sampling,
+            space,
+            encoding,
+            net,
+            chunk,
+            x,
+            acts,
+            ray_first,
+            ray,
+            line,
+            cell,
+            depth,
+            weight,
+            group,
+            bin_first,
+        )
         query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
         for r in range(rays):
             a, b = ray_first[r], ray_first[r + 1]
@@ -207,18 +281,14 @@ def train_with_proposal(counter, worker, views, recipe, sampling, space, encodin
                     for s in range(a, b):
                         d_out[k, s] *= ray[r, 10]
             loss += error
-            interlevel_loss(
-                encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, sampling, slope, grad
-            )
+            interlevel_loss(encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, sampling, slope, grad)
             if batch.exposure.shape[1] > 0:
                 add_exposure_sums(out, w, dts, a, b, ray[r], batch.exposure[chunk])
             if recipe.harmonics > 1:
                 add_harmonics_backward(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
             if embeddings.shape[1] > 0:
                 view = np.int64(ray[r, 9])
-                add_appearance_backward(
-                    out, d_out, row, embeddings[view], a, b, bins.d_embeddings[chunk, view]
-                )
+                add_appearance_backward(out, d_out, row, embeddings[view], a, b, bins.d_embeddings[chunk, view])
         batch.d_params[chunk] = _F0
         query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, n, rays

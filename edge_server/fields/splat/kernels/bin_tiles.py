@@ -127,7 +127,11 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             asked += np.int64(wanted[t])
         whole = asked == across * down
         keys, order, begins, binned = (
-            lists.keys[worker], lists.order[worker], lists.begins[worker], lists.binned[worker])  # fmt: skip
+            lists.keys[worker],
+            lists.order[worker],
+            lists.begins[worker],
+            lists.binned[worker],
+        )
         # Every band computes where each Gaussian's pairs begin; each band stores a share of the Gaussians.
         low, high = count * band // bands, count * (band + 1) // bands
         n = made = needed = above = mine = 0
@@ -142,9 +146,7 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             else:  # Gaussians outside the wanted tiles are not sorted
                 before = _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
                 here = _count_tiles(bits, (begin - y0) * width, x0, x1, begin, end, across, wanted)
-                pairs = (
-                    before + here + _count_tiles(bits, (end - y0) * width, x0, x1, end, y1, across, wanted)
-                )
+                pairs = before + here + _count_tiles(bits, (end - y0) * width, x0, x1, end, y1, across, wanted)
             needed += pairs
             if made + pairs > room:
                 pairs = before = here = 0

@@ -129,8 +129,19 @@ class _StripBuilder:
 
 
 @intrinsic
-def composite(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any,
-              tile: Any, first: Any, saved: Any, step: Any) -> Any:  # fmt: skip
+def composite(
+    typingctx: Any,
+    pairs: Any,
+    count: Any,
+    owner: Any,
+    projected: Any,
+    x0: Any,
+    y0: Any,
+    tile: Any,
+    first: Any,
+    saved: Any,
+    step: Any,
+) -> Any:
     """Composite a strip's Gaussians front to back. Returns how many were composited before ``STOP``.
 
     pairs: int32, pair numbers, of which the first ``count`` are used.
@@ -178,8 +189,19 @@ def composite(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any
 
 
 @intrinsic
-def composite_backward(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any,
-                       slopes: Any, first: Any, saved: Any, sums: Any) -> Any:  # fmt: skip
+def composite_backward(
+    typingctx: Any,
+    pairs: Any,
+    count: Any,
+    owner: Any,
+    projected: Any,
+    x0: Any,
+    y0: Any,
+    slopes: Any,
+    first: Any,
+    saved: Any,
+    sums: Any,
+) -> Any:
     """The gradient of ``composite``, back to front; arguments as there.
 
     slopes: float32 rows of PIXELS: d loss / d red, green and blue, and the background's share of the pixel's
@@ -190,9 +212,7 @@ def composite_backward(typingctx: Any, pairs: Any, count: Any, owner: Any, proje
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         strip = _StripBuilder(context, builder, signature, args)
-        pair_data, owners, rows, slope_data, saved_data, sum_data = (
-            strip.data(n) for n in (0, 2, 3, 6, 8, 9)
-        )
+        pair_data, owners, rows, slope_data, saved_data, sum_data = (strip.data(n) for n in (0, 2, 3, 6, 8, 9))
         _, count, _, _, x0, y0, _, first, _, _ = args
         x, y = strip.pixels(x0, y0)
         er, eg, eb, behind = (Vector.load(builder, strip.at(slope_data, first, PIXELS * k)) for k in range(4))

@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite, log32
-from edge_server.fields.splat.kernels.project import (
-    BASE,
-    BLOCK,
-    COLOR,
-    OPACITY,
-    POSITION,
-    QUATERNION,
-    RADIUS,
-    SCALE,
-)
+from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,
     SEEN,
@@ -155,8 +146,19 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
 
 
 @intrinsic
-def _adam_vectors(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: Any, first: Any, vectors: Any,
-                  beta1: Any, beta2: Any, epsilon: Any) -> Any:  # fmt: skip
+def _adam_vectors(
+    typingctx: Any,
+    g: Any,
+    third: Any,
+    params: Any,
+    m: Any,
+    v: Any,
+    first: Any,
+    vectors: Any,
+    beta1: Any,
+    beta2: Any,
+    epsilon: Any,
+) -> Any:
     """``_adam`` for the first ``vectors`` * LANES of its parameters."""
     require_contiguous(g, params, m, v)
 
@@ -183,9 +185,7 @@ def _adam_vectors(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: An
             new_m, new_v = new_m.where(sound), new_v.where(sound)
             step = rate * new_m / ((new_v * second).sqrt() + epsilon)
             moves = given.is_finite()
-            for place, new, before in zip(
-                places, (old - step, new_m, new_v), (old, old_m, old_v), strict=True
-            ):
+            for place, new, before in zip(places, (old - step, new_m, new_v), (old, old_m, old_v), strict=True):
                 new.where(moves, before).store(place)
         return context.get_dummy_value()
 
@@ -199,9 +199,7 @@ def _adam(first, size, params, moments, rule, g):
     ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""
     third, limit, width = g.size // 3, np.float32(GRADIENT_LIMIT), params.shape[1]
     vectors = size // LANES
-    _adam_vectors(
-        g, third, params, moments.m, moments.v, first, vectors, rule.beta1, rule.beta2, rule.epsilon
-    )
+    _adam_vectors(g, third, params, moments.m, moments.v, first, vectors, rule.beta1, rule.beta2, rule.epsilon)
     for k in range(vectors * LANES, size):  # the remainder, in the last block only
         i, column, d = (first + k) // width, (first + k) % width, g[k]
         if is_finite(d):
@@ -215,8 +213,9 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments,
-              rule, dropped):  # fmt: skip
+def adam_step(
+    counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments, rule, dropped
+):
     """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
     are blocks of Gaussians.
 
@@ -263,8 +262,7 @@ def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own
 
 
 @kernel
-def position_gradients(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums,
-                       slope):  # fmt: skip
+def position_gradients(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums, slope):
     """Write the gradient by position of Gaussians ``which``, int64 (M,), to slope: float32 (M, 3)."""
     s, ids = block_scratch(gaussians.params.shape[1]), np.empty(BLOCK, np.int64)
     while True:

@@ -12,16 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import (
-    LENS,
-    LIMITS,
-    NEAR,
-    ORIGIN,
-    SIZE,
-    TIME,
-    distort,
-    load_camera,
-)
+from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN, SIZE, TIME, distort, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
@@ -43,10 +34,7 @@ BLOCK = 128  # Gaussians a task
 # The bits of positive float32 sort as the numbers do. From .01 to 1e5 scene units their upper 23 bits take
 # 380 thousand values: the order of Gaussians whose depths differ by less than a share of 6e-5 is arbitrary.
 DEPTH_BITS = 20
-_NEAREST_BITS, _DROPPED_BITS = (
-    np.int32(0x3C23D70A),
-    np.int32(9),
-)  # the bits of .01; lower bits that are left out
+_NEAREST_BITS, _DROPPED_BITS = (np.int32(0x3C23D70A), np.int32(9))  # the bits of .01; lower bits that are left out
 
 LOW_PASS = 0.3  # pixels squared, added to projected variances: nothing is sharper than a pixel
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian ends where its alpha is below this
@@ -85,19 +73,28 @@ def unit_quaternion(w, x, y, z):
     has = (square > np.float32(_NO_DIRECTION)) & (square < np.float32(1e20))
     inverse = _F1 / np.sqrt(square if has else _F1)
     return (
-        w * inverse if has else _F1, x * inverse if has else _F0, y * inverse if has else _F0,
-        z * inverse if has else _F0, inverse if has else _F0,
-    )  # fmt: skip
+        w * inverse if has else _F1,
+        x * inverse if has else _F0,
+        y * inverse if has else _F0,
+        z * inverse if has else _F0,
+        inverse if has else _F0,
+    )
 
 
 @part
 def rotation(w, x, y, z):
     """The rotation matrix of a unit quaternion, row by row."""
     return (
-        _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
-        _F2 * (x * y + w * z), _F1 - _F2 * (x * x + z * z), _F2 * (y * z - w * x),
-        _F2 * (x * z - w * y), _F2 * (y * z + w * x), _F1 - _F2 * (x * x + y * y),
-    )  # fmt: skip
+        _F1 - _F2 * (y * y + z * z),
+        _F2 * (x * y - w * z),
+        _F2 * (x * z + w * y),
+        _F2 * (x * y + w * z),
+        _F1 - _F2 * (x * x + z * z),
+        _F2 * (y * z - w * x),
+        _F2 * (x * z - w * y),
+        _F2 * (y * z + w * x),
+        _F1 - _F2 * (x * x + y * y),
+    )
 
 
 @part
@@ -167,9 +164,7 @@ def _load_block(gaussians, base, count, s):
             s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
         s[_ALPHA + j] = params[i, OPACITY]
     for j in range(BLOCK):
-        w, x, y, z, _ = unit_quaternion(
-            s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
-        )
+        w, x, y, z, _ = unit_quaternion(s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j])
         r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(w, x, y, z)
         s0, s1, s2 = exp_scale(s[_S + j]), exp_scale(s[_S + BLOCK + j]), exp_scale(s[_S + 2 * BLOCK + j])
         s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
@@ -243,9 +238,7 @@ def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
             dx = max(low_x, min(high_x, _F0))
             # The minimum over a rectangle lies on one of the two edges that face the mean.
             ex, ey = min(max(slope_x * dy, low_x), high_x), min(max(slope_y * dx, low_y), high_y)
-            least = min(
-                a * ex * ex + (b + b) * ex * dy + c * dy * dy, a * dx * dx + (b + b) * dx * ey + c * ey * ey
-            )
+            least = min(a * ex * ex + (b + b) * ex * dy + c * dy * dy, a * dx * dx + (b + b) * dx * ey + c * ey * ey)
             if least <= most:
                 bits |= np.uint64(1) << bit
             bit += np.uint64(1)
@@ -265,8 +258,7 @@ def _write_projected(cam, gaussians, i, s, j, row, edges):
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
     if harmonics > 1:
-        ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
-            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
+        ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (params[i, 2] - cam[ORIGIN + 2])
         length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
         ox, oy, oz = ox * length, oy * length, oz * length
         for h in range(1, harmonics):

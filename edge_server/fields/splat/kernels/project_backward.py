@@ -106,9 +106,7 @@ def project_backward(cam, s):
             s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
             s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
         )
-        a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = lens_terms(
-            cam, x, y, z if seen else _F1
-        )
+        a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = lens_terms(cam, x, y, z if seen else _F1)
         gx, gy = fx * inverse, fy * inverse
         j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
         j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
@@ -120,10 +118,16 @@ def project_backward(cam, s):
         r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(qw, qx, qy, qz)
         raw0, raw1, raw2 = s[_S + j], s[_S + BLOCK + j], s[_S + 2 * BLOCK + j]
         s0, s1, s2 = exp_scale(raw0), exp_scale(raw1), exp_scale(raw2)
-        v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
-            t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
-        w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
-            t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
+        v0, v1, v2 = (
+            (t0 * r0 + t1 * r3 + t2 * r6) * s0,
+            (t0 * r1 + t1 * r4 + t2 * r7) * s1,
+            (t0 * r2 + t1 * r5 + t2 * r8) * s2,
+        )
+        w0, w1, w2 = (
+            (t3 * r0 + t4 * r3 + t5 * r6) * s0,
+            (t3 * r1 + t4 * r4 + t5 * r7) * s1,
+            (t3 * r2 + t4 * r5 + t5 * r8) * s2,
+        )
         # mean and conic
         qa, qb, qc = s[_QA + j], s[_QB + j], s[_QC + j]
         hx, hy = s[SUM + BLOCK + j], s[SUM + 2 * BLOCK + j]
@@ -223,8 +227,7 @@ def harmonics_backward(cam, gaussians, ids, count, s):
         if s[SEEN + j] == _F0:
             continue
         i, at = ids[j], GRADIENT + j
-        nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
-            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
+        nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (params[i, 2] - cam[ORIGIN + 2])
         length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
         nx, ny, nz = nx * length, ny * length, nz * length
         lx, ly, lz = _F0, _F0, _F0

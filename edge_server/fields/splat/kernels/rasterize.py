@@ -78,9 +78,17 @@ def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
     bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
     for n in range(STRIPS):
         composite(
-            strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-            _T + n * STRIP, store, 0,
-        )  # fmt: skip
+            strip_pairs[n],
+            count[n],
+            lists.owner[b],
+            projected[b],
+            np.float32(x0),
+            np.float32(y0 + 2 * n),
+            s,
+            _T + n * STRIP,
+            store,
+            0,
+        )
 
 
 @part
@@ -168,8 +176,7 @@ def _apply_weights(s, target, share, absolute):
 
 
 @kernel
-def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved,
-                sums, losses):  # fmt: skip
+def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved, sums, losses):
     """Render tiles, compare them with the views, and backpropagate to the pairs.
 
     With ``views.weight``, each pixel's loss is multiplied by its weight and the tile's SSIM loss by the mean
@@ -202,9 +209,17 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
         bin_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             composited[n] = composite(
-                strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0),
-                np.float32(y0 + 2 * n), s, _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
-            )  # fmt: skip
+                strip_pairs[n],
+                count[n],
+                lists.owner[b],
+                projected[b],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                _T + n * STRIP,
+                store[n * size : (n + 1) * size],
+                SAVED,
+            )
         total, square = _F0, _F0
         for c in range(3):
             for k in range(PIXELS):
@@ -233,14 +248,23 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
             s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
         for n in range(STRIPS):
             composite_backward(
-                strip_pairs[n], composited[n], lists.owner[b], projected[b], np.float32(x0),
-                np.float32(y0 + 2 * n), s, _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
-            )  # fmt: skip
+                strip_pairs[n],
+                composited[n],
+                lists.owner[b],
+                projected[b],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                _ER + n * STRIP,
+                store[n * size : (n + 1) * size],
+                sums[b],
+            )
 
 
 @kernel
-def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, saved,
-                 color, depth, opacity):  # fmt: skip
+def render_tiles(
+    counter, worker, columns, rows, width, height, projected, lists, background, memory, saved, color, depth, opacity
+):
     """Render camera slot 0. Tasks are tiles. color: float32 (H, W, 3), depth (z): (H, W), opacity: (H, W),
     all written."""
     s, store = memory[worker], saved[worker]
@@ -267,9 +291,7 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
 
 
 @kernel
-def compare_tiles(
-    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error
-):
+def compare_tiles(counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error):
     """Write each pixel's color error, the largest difference of a channel, for the tiles of ``tasks``.
 
     error: float32 (P,), for all pixels of ``views``; other arguments as in ``train_tiles``."""

@@ -30,16 +30,22 @@ def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
         if most < np.float32(STOP):
             return False
     composite(
-        strip_pairs[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
-        np.float32(y0 + 2 * n), s, first, store, 0,
-    )  # fmt: skip
+        strip_pairs[n, j : j + 1],
+        1,
+        lists.owner[slot],
+        projected[slot],
+        np.float32(x0),
+        np.float32(y0 + 2 * n),
+        s,
+        first,
+        store,
+        0,
+    )
     return True
 
 
 @kernel
-def render_planes(
-    counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, saved, out
-):
+def render_planes(counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, saved, out):
     """Blend the Gaussians' planes with the weights of their colors. Tasks are tiles of camera ``slot``.
 
     planes: float32 (N, 4), unit normal in camera axes, and the plane's distance from the camera along it.
@@ -55,9 +61,7 @@ def render_planes(
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
         clear_tile(s)
         sums[:] = _F0
-        bin_strips(
-            lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, strip_pairs, count
-        )
+        bin_strips(lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             for j in range(count[n]):
                 if not composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):

@@ -170,14 +170,8 @@ def eight_lane_sums(vectors: Sequence[Vector]) -> Any:
         # Shuffles within four lanes are the cheap ones. Numbers 4 to 7 mean lanes of the second vector.
         return [group + (k if k < 4 else k - 4 + LANES) for group in range(0, LANES, 4) for k in order]
 
-    pairs = [
-        merged(values[k], values[k + 1], each_four([0, 4, 1, 5]), each_four([2, 6, 3, 7]))
-        for k in range(0, 8, 2)
-    ]
-    fours = [
-        merged(pairs[k], pairs[k + 1], each_four([0, 1, 4, 5]), each_four([2, 3, 6, 7]))
-        for k in range(0, 4, 2)
-    ]
+    pairs = [merged(values[k], values[k + 1], each_four([0, 4, 1, 5]), each_four([2, 6, 3, 7])) for k in range(0, 8, 2)]
+    fours = [merged(pairs[k], pairs[k + 1], each_four([0, 1, 4, 5]), each_four([2, 3, 6, 7])) for k in range(0, 4, 2)]
     first, second = list(range(8)), list(range(8, 16))
     folded = merged(*fours, first + [k + LANES for k in first], second + [k + LANES for k in second])
     one = [*range(0, 4), *range(8, 12)]

@@ -156,9 +156,14 @@ class LayeredField:
         self._take_whole(taken)
         note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
         return FitReport(
-            steps, pace.elapsed_s(), loss, rays, samples, note=note,
+            steps,
+            pace.elapsed_s(),
+            loss,
+            rays,
+            samples,
+            note=note,
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
-        )  # fmt: skip
+        )
 
     def _fit_first(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
         """Spend what is left of a budget on the first field."""
@@ -284,19 +289,21 @@ class LayeredField:
             self.refused = refused
             return
         self.refused -= {view.camera}
-        self.observations.add(Observation(
-            (view.shows_ns - self.origin_ns) / 1e9, view.camera,
-            replace(view, camera_to_world=camera.view.camera_to_world), foreground,
-        ))  # fmt: skip
+        self.observations.add(
+            Observation(
+                (view.shows_ns - self.origin_ns) / 1e9,
+                view.camera,
+                replace(view, camera_to_world=camera.view.camera_to_world),
+                foreground,
+            )
+        )
 
     def _take_whole(self, taken: Sequence[View]) -> None:
         """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
         begun, now_s = self.now(), self.observations.newest_s
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [
-            o
-            for o in self.observations
-            if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
+            o for o in self.observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
         ]
         if not seen or now_s - self.fine_s < FINE_EVERY_S:
             return
@@ -416,9 +423,7 @@ class LayeredField:
         has rendered them, they are rendered here: all at first, then one a fit."""
         begun, shown, cameras = self.now(), self.static.shown, self.cameras
         if not beside and self.shown and shown is not None:
-            stale = sorted(
-                (c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step
-            )
+            stale = sorted((c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step)
             never = [c for c in stale if c.rendered_step < 0]
             self.static.render([c.view for c in never or stale[:1]])
         rendered = list(self.static.rendered)
@@ -444,14 +449,25 @@ class LayeredField:
         shown = None
         if moving.alive:
             shown = MovingSnapshot(
-                moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy(), moving.motion.copy(),
-                self.origin_ns, self.observations.newest_s,
-            )  # fmt: skip
+                moving.cloud.params.copy(),
+                moving.anchor.copy(),
+                moving.share.copy(),
+                moving.motion.copy(),
+                self.origin_ns,
+                self.observations.newest_s,
+            )
         exposed = self._static_gaussians()
         self._published = LayeredSnapshot(
-            still.box, exposed, still.background, still.cameras, still.pool, still.step, planar=still.planar,
-            static=exposed.params, moving=shown,
-        )  # fmt: skip
+            still.box,
+            exposed,
+            still.background,
+            still.cameras,
+            still.pool,
+            still.step,
+            planar=still.planar,
+            static=exposed.params,
+            moving=shown,
+        )
         self.part_s.add("publication", begun)
         if begins:
             self.first.reset()

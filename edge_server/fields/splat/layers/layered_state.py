@@ -35,11 +35,15 @@ def pack(field: Any) -> Arrays:
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
         view = camera.view
-        cameras.append({
-            **_facts(view), "taken": list(camera.taken), "newest_s": _number(camera.newest_s),
-            "rendered_step": camera.rendered_step,
-            "intrinsics": asdict(view.intrinsics),
-        })  # fmt: skip
+        cameras.append(
+            {
+                **_facts(view),
+                "taken": list(camera.taken),
+                "newest_s": _number(camera.newest_s),
+                "rendered_step": camera.rendered_step,
+                "intrinsics": asdict(view.intrinsics),
+            }
+        )
         state |= {f"camera_{k}.image": view.image, f"camera_{k}.pose": view.camera_to_world}
         state |= _prefixed(f"camera_{k}.plate.", camera.plate.state())
         if camera.fine is not None:
@@ -49,8 +53,11 @@ def pack(field: Any) -> Arrays:
     for k, o in enumerate(field.observations):
         observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
         arrays: dict[str, NDArray[Any] | None] = {
-            "image": o.view.image, "foreground": o.foreground, "given": o.view.weight,
-            "weight": None if o.weight is None else _half(o.weight)}  # fmt: skip
+            "image": o.view.image,
+            "foreground": o.foreground,
+            "given": o.view.weight,
+            "weight": None if o.weight is None else _half(o.weight),
+        }
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
@@ -61,8 +68,16 @@ def pack(field: Any) -> Arrays:
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
         tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
-    meta = {"version": VERSION, "field": NAME, "settings": asdict(field.settings), **counters,
-            "refused": refused, "tracked": tracked, "cameras": cameras, "frames": observations}  # fmt: skip
+    meta = {
+        "version": VERSION,
+        "field": NAME,
+        "settings": asdict(field.settings),
+        **counters,
+        "refused": refused,
+        "tracked": tracked,
+        "cameras": cameras,
+        "frames": observations,
+    }
     return {"meta": np.array(json.dumps(meta)), **{name: np.array(array) for name, array in state.items()}}
 
 
@@ -78,9 +93,13 @@ def unpack(field: Any, state: Arrays) -> None:
         arrays = _under(f"camera_{k}.", state)
         lens = {**facts["intrinsics"], "distortion": tuple(facts["intrinsics"]["distortion"])}
         view = View(
-            facts["camera"], np.array(arrays["image"]), np.array(arrays["pose"]), Pinhole(**lens),
-            facts["generated_ns"], carried_to_ns=facts["carried_to_ns"],
-        )  # fmt: skip
+            facts["camera"],
+            np.array(arrays["image"]),
+            np.array(arrays["pose"]),
+            Pinhole(**lens),
+            facts["generated_ns"],
+            carried_to_ns=facts["carried_to_ns"],
+        )
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
@@ -113,16 +132,24 @@ def _set(owner: Any, names: tuple[str, ...], values: dict[str, Any]) -> None:
 def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observation:
     found = {name: np.array(array) for name, array in arrays.items()}
     view = replace(
-        field.cameras[facts["camera"]].view, image=found["image"], generated_ns=facts["generated_ns"],
-        carried_to_ns=facts["carried_to_ns"], weight=found.get("given"),
-    )  # fmt: skip
+        field.cameras[facts["camera"]].view,
+        image=found["image"],
+        generated_ns=facts["generated_ns"],
+        carried_to_ns=facts["carried_to_ns"],
+        weight=found.get("given"),
+    )
     row = None
     if "matrix" in found:
         row = ViewRow(facts["instant_s"], found["matrix"], found["vector"], found["around"])
     return Observation(
-        facts["instant_s"], view.camera, view, found["foreground"],
-        found["weight"].astype(np.float32) if "weight" in found else None, row, fresh=facts["fresh"],
-    )  # fmt: skip
+        facts["instant_s"],
+        view.camera,
+        view,
+        found["foreground"],
+        found["weight"].astype(np.float32) if "weight" in found else None,
+        row,
+        fresh=facts["fresh"],
+    )
 
 
 def _half(weight: NDArray[np.float32]) -> NDArray[Any]:

@@ -109,10 +109,7 @@ class Motion:
         if i == last:
             return base, np.array([0.0, 0.0, -f, 1.0 + f])
         # Catmull-Rom; the neighbor that is missing at an end lies on the line through the two next to it.
-        w = (
-            np.array([-f + 2 * f**2 - f**3, 2 - 5 * f**2 + 3 * f**3, f + 4 * f**2 - 3 * f**3, f**3 - f**2])
-            / 2
-        )
+        w = np.array([-f + 2 * f**2 - f**3, 2 - 5 * f**2 + 3 * f**3, f + 4 * f**2 - 3 * f**3, f**3 - f**2]) / 2
         if i == 0:
             w = np.array([w[1] + 2 * w[0], w[2] - w[0], w[3], 0.0])
         elif i == last - 1:
@@ -124,9 +121,7 @@ class Motion:
         base, w = self.weights(instant_s)
         return np.einsum("k,kac->ac", w, self._knots[base : base + 4])
 
-    def attach(
-        self, points: NDArray[np.floating], instant_s: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def attach(self, points: NDArray[np.floating], instant_s: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The three nearest anchors of points (N, 3) at an instant, int64 (N, 3), and their shares, float32
         (N, 3), 1 / (distance^2 + (reach / 4)^2) normalized. With fewer anchors the rest have share 0."""
         assert self.anchors is not None
@@ -138,11 +133,7 @@ class Motion:
         return np.pad(nearest, missing), np.pad(share, missing).astype(np.float32)
 
     def displaced(
-        self,
-        points: NDArray[np.float32],
-        anchor: NDArray[np.int64],
-        share: NDArray[np.float32],
-        instant_s: float,
+        self, points: NDArray[np.float32], anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
     ) -> NDArray[np.float32]:
         """Places (N, 3) of points (N, 3) at an instant. anchor, share: see ``attach``."""
         moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32)[anchor])
@@ -214,16 +205,7 @@ class Motion:
         steady, alike = self._prior_weights()
         iterations = np.zeros(1, np.int64)
         self.pool.run(
-            solve_knots,
-            self._band,
-            right,
-            knots,
-            FIXED,
-            DIFFERENCES,
-            steady,
-            alike,
-            self._laplacian,
-            iterations,
+            solve_knots, self._band, right, knots, FIXED, DIFFERENCES, steady, alike, self._laplacian, iterations
         )
         self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
         return len(rows) - sum(int(span.used[0]) for span in spans)
@@ -257,9 +239,7 @@ class Motion:
         steady, alike = ACCELERATION_M_PER_S2 * dt**2, NEIGHBOR_M_PER_S * dt
         return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
 
-    def deviation(
-        self, anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
-    ) -> NDArray[np.float32]:
+    def deviation(self, anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float) -> NDArray[np.float32]:
         """Standard deviation (N,) of places at an instant, scene units, the root of the mean over three axes,
         from the covariance of the last solution. It grows past the last view. anchor, share: see
         ``attach``."""
@@ -306,9 +286,12 @@ class Motion:
         if self.anchors is None:
             return {}
         return {
-            "anchors": self.anchors.copy(), "knots": self._knots.copy(), "first": np.array(self._first),
-            "band": self._band.copy(), "rng": np.array(json.dumps(self.rng.bit_generator.state)),
-        }  # fmt: skip
+            "anchors": self.anchors.copy(),
+            "knots": self._knots.copy(),
+            "first": np.array(self._first),
+            "band": self._band.copy(),
+            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+        }
 
     def load_state(self, state: dict[str, NDArray]) -> None:
         """Continue from ``state``, bit for bit."""

@@ -131,9 +131,7 @@ class MovingSet:
         rates = np.zeros(params.shape[1], np.float32)
         one = np.float32(1.0)
         self.train(
-            observation,
-            camera,
-            AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one),
+            observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one)
         )
         self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
         self.motion.pool = self.pool
@@ -152,15 +150,33 @@ class MovingSet:
         raster.project_and_bin(camera.row, gaussians, [None])
         tasks = raster.tasks()
         self.pool.run(
-            train_over, observation.view.image, camera.plate.picture, observation.weight, tasks,
-            raster.columns, raster.projected, raster.lists, raster.memory, raster.saved, raster.sums,
+            train_over,
+            observation.view.image,
+            camera.plate.picture,
+            observation.weight,
+            tasks,
+            raster.columns,
+            raster.projected,
+            raster.lists,
+            raster.memory,
+            raster.saved,
+            raster.sums,
             np.zeros(len(tasks)),
-        )  # fmt: skip
+        )
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
         self.pool.run(
-            adam_step, camera.row, gaussians, len(cloud), raster.projected, raster.lists.own_first,
-            raster.lists.own_count, raster.sums, cloud.optimizer_state(), parameters, dropped,
-        )  # fmt: skip
+            adam_step,
+            camera.row,
+            gaussians,
+            len(cloud),
+            raster.projected,
+            raster.lists.own_first,
+            raster.lists.own_count,
+            raster.sums,
+            cloud.optimizer_state(),
+            parameters,
+            dropped,
+        )
         rest = cloud.params[:, :3] + (gaussians.params[:, :3] - before)
         cloud.params[:] = gaussians.params
         cloud.params[:, :3] = rest
@@ -210,9 +226,16 @@ class MovingSet:
             return
         instant_s = float(np.mean([o.instant_s for o in frames]))
         params = seed_gaussians(
-            self.settings, self.pool, self.box, [o.view for o in frames], missing, np.zeros(0, np.float32),
-            count, self._rng(2), [o.foreground for o in frames],
-        )  # fmt: skip
+            self.settings,
+            self.pool,
+            self.box,
+            [o.view for o in frames],
+            missing,
+            np.zeros(0, np.float32),
+            count,
+            self._rng(2),
+            [o.foreground for o in frames],
+        )
         places = [params[:, :3]] * len(frames)
         if len(params) and self.motion.anchors is not None:
             anchor, share = self.motion.attach(params[:, :3], instant_s)
@@ -243,9 +266,12 @@ class MovingSet:
         self.anchor, self.share = self.anchor[which], self.share[which]
 
     def _inside(
-        self, places: Sequence[NDArray[np.float32]], frames: Sequence[Observation],
-        cameras: dict[str, FixedCamera], dilation_px: int,
-    ) -> NDArray[np.float64]:  # fmt: skip
+        self,
+        places: Sequence[NDArray[np.float32]],
+        frames: Sequence[Observation],
+        cameras: dict[str, FixedCamera],
+        dilation_px: int,
+    ) -> NDArray[np.float64]:
         """For each point, (N,): of the frames that see it, the share in whose grown foreground it lies.
 
         places: for each frame (N, 3), the points at its instant.
@@ -254,9 +280,7 @@ class MovingSet:
         square = np.ones((dilation_px, dilation_px), np.uint8)
         for points, o in zip(places, frames, strict=True):
             mask = cv2.dilate(o.foreground.astype(np.uint8), square)
-            self.pool.run(
-                count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside
-            )
+            self.pool.run(count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside)
         return inside / np.maximum(seen, 1)
 
     # --- state --------------------------------------------------------------------------------
@@ -266,8 +290,14 @@ class MovingSet:
         cloud = {f"cloud.{f.name}": getattr(self.cloud, f.name).copy() for f in fields(self.cloud)}
         motion = {f"motion.{name}": array for name, array in self.motion.state().items()}
         counters = np.array([self.steps, self._grown, self._draws], np.int64)
-        return {**cloud, **motion, "anchor": self.anchor.copy(), "share": self.share.copy(),
-                "capacity_factor": np.array(self.capacity_factor), "counters": counters}  # fmt: skip
+        return {
+            **cloud,
+            **motion,
+            "anchor": self.anchor.copy(),
+            "share": self.share.copy(),
+            "capacity_factor": np.array(self.capacity_factor),
+            "counters": counters,
+        }
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. KeyError: it lacks something."""

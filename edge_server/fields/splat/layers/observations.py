@@ -137,10 +137,7 @@ class Observations:
 
 
 def pixel_weights(
-    foreground: NDArray[np.bool_],
-    depth_m: NDArray[np.float32] | None,
-    distance_m: float,
-    given: NDArray | None,
+    foreground: NDArray[np.bool_], depth_m: NDArray[np.float32] | None, distance_m: float, given: NDArray | None
 ) -> NDArray[np.float32]:
     """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
     field hides what moves.

@@ -34,9 +34,7 @@ Arrays = dict[str, NDArray]
 LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
 GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must be usable to estimate a change of exposure
-COMMON_SHARE = (
-    0.25  # the same over other cameras: of overexposed areas only edges are usable, and these mislead
-)
+COMMON_SHARE = 0.25  # the same over other cameras: of overexposed areas only edges are usable, and these mislead
 CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
@@ -59,10 +57,14 @@ class Plate:
 
         self.pool = pool
         self.arrays = PlateArrays(
-            means=np.stack([zeros(3)] * MODES), blurred=np.stack([zeros(3)] * MODES),
-            weight=np.stack([zeros()] * MODES), total=zeros(), run=np.zeros((height, width), np.int32),
-            deviation=zeros(), known=np.zeros((height, width), bool),
-        )  # fmt: skip
+            means=np.stack([zeros(3)] * MODES),
+            blurred=np.stack([zeros(3)] * MODES),
+            weight=np.stack([zeros()] * MODES),
+            total=zeros(),
+            run=np.zeros((height, width), np.int32),
+            deviation=zeros(),
+            known=np.zeros((height, width), bool),
+        )
         self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
         # The latest frames, a ring: as taken, their gains since, and blurred.
         self._frames = np.zeros((max(LAGS), height, width, 3), np.uint8)
@@ -110,9 +112,16 @@ class Plate:
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
         self.pool.run(
-            compare_with_plate, blurred, self.arrays, earlier_frames, len(earlier),
-            self._static_blurred[None], self._has_static, self._difference, self._flags,
-        )  # fmt: skip
+            compare_with_plate,
+            blurred,
+            self.arrays,
+            earlier_frames,
+            len(earlier),
+            self._static_blurred[None],
+            self._has_static,
+            self._difference,
+            self._flags,
+        )
         foreground = np.zeros_like(self._flags)
         votes = np.ones_like(foreground)
         if self.count > 0:
@@ -123,9 +132,18 @@ class Plate:
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
             votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
         self.pool.run(
-            vote, image, blurred, self._difference, foreground, votes.astype(np.uint8), self._held,
-            self.arrays, self._static, self._has_static, self.picture,
-        )  # fmt: skip
+            vote,
+            image,
+            blurred,
+            self._difference,
+            foreground,
+            votes.astype(np.uint8),
+            self._held,
+            self.arrays,
+            self._static,
+            self._has_static,
+            self.picture,
+        )
         slot = self.count % len(self._recent)
         self._frames[slot], self._gains[slot], self._recent[slot] = image, 1.0, blurred
         self.count += 1
@@ -165,9 +183,15 @@ class Plate:
 
     def state(self) -> Arrays:
         """Everything needed to continue bit for bit."""
-        mine = {**self.arrays._asdict(), "gain": self.gain, "frames": self._frames, "gains": self._gains,
-                "held": self._held, "static": self._static,
-                "counters": np.array([self.count, int(self._has_static)])}  # fmt: skip
+        mine = {
+            **self.arrays._asdict(),
+            "gain": self.gain,
+            "frames": self._frames,
+            "gains": self._gains,
+            "held": self._held,
+            "static": self._static,
+            "counters": np.array([self.count, int(self._has_static)]),
+        }
         return {name: array.copy() for name, array in mine.items()}
 
     def load_state(self, state: Arrays) -> None:
@@ -189,10 +213,7 @@ class Plate:
         self.pool.run(count_exposure, image, self.arrays, counts)
         used = counts[:, 0]
         # The median is beyond a bound if more than half of the ratios are.
-        if (
-            used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4
-            or (2 * counts[:, 1:] <= used[:, None]).all()
-        ):
+        if used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4 or (2 * counts[:, 1:] <= used[:, None]).all():
             return
         plate = self.arrays.means[0, ::2, ::2]
         use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
@@ -246,12 +267,7 @@ class FinePlate:
         """Everything needed to continue bit for bit."""
         lens = self.view.intrinsics
         numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
-        return {
-            "color": self.color,
-            "frames": self.frames,
-            "count": np.array(self.count),
-            "lens": np.array(numbers),
-        }
+        return {"color": self.color, "frames": self.frames, "count": np.array(self.count), "lens": np.array(numbers)}
 
     @staticmethod
     def from_state(view: View, state: Arrays) -> FinePlate:
@@ -286,9 +302,11 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     x0, y0 = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
     x1, y1 = x0 + stats[:, cv2.CC_STAT_WIDTH], y0 + stats[:, cv2.CC_STAT_HEIGHT]
     goes_on = (  # beyond the bounding box: no hole
-        ((x0 == 0) & (left > 0)) | ((y0 == 0) & (top > 0))
-        | ((x1 == right - left) & (right < width)) | ((y1 == bottom - top) & (bottom < height))
-    )  # fmt: skip
+        ((x0 == 0) & (left > 0))
+        | ((y0 == 0) & (top > 0))
+        | ((x1 == right - left) & (right < width))
+        | ((y1 == bottom - top) & (bottom < height))
+    )
     fill = ((stats[:, cv2.CC_STAT_AREA] <= HOLE * mask.size) & ~goes_on).astype(np.uint8)
     fill[0] = 0
     out[top:bottom, left:right] = part | fill[label]

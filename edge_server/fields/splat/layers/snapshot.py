@@ -37,9 +37,7 @@ class MovingSnapshot:
     def params_at(self, ahead_s: float) -> NDArray[np.float32]:
         """Parameters, float32 (N, P), so much later than the newest frame."""
         params = self.params.copy()
-        params[:, :3] = self.motion.displaced(
-            self.params[:, :3], self.anchor, self.share, self.newest_s + ahead_s
-        )
+        params[:, :3] = self.motion.displaced(self.params[:, :3], self.anchor, self.share, self.newest_s + ahead_s)
         return params
 
 

@@ -49,9 +49,7 @@ class StaticField(SplatField):
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool | None = None) -> None:
-        super().__init__(
-            replace(settings, refuse_beyond=0.0, follow=0, age_tau_ms=0.0, mask_stale_ms=0.0), pool
-        )
+        super().__init__(replace(settings, refuse_beyond=0.0, follow=0, age_tau_ms=0.0, mask_stale_ms=0.0), pool)
 
     def reset(self) -> None:
         """Forget everything, the schedule included."""
@@ -162,16 +160,13 @@ class StaticField(SplatField):
         if self._mean is not None:
             mine["mean"] = self._mean.copy()
         for k, (camera, (plate, known)) in enumerate(self._learned.items()):
-            mine |= {f"learned_{k}.camera": np.array(camera), f"learned_{k}.plate": plate,
-                     f"learned_{k}.known": known}  # fmt: skip
+            mine |= {f"learned_{k}.camera": np.array(camera), f"learned_{k}.plate": plate, f"learned_{k}.known": known}
         return {**super().state(), **mine}
 
     def load_state(self, state: Arrays) -> None:
         """Resume from ``state``."""
         super().load_state(state)
-        self.rounds, self._rounds_wanted, self._round_step, again, self._grows_until = (
-            int(n) for n in state["rounds"]
-        )
+        self.rounds, self._rounds_wanted, self._round_step, again, self._grows_until = (int(n) for n in state["rounds"])
         self._rate = RATE_AGAIN if again else RATE_FIRST
         self._mean = np.array(state["mean"]) if "mean" in state else None
         self._learned = {}
@@ -179,10 +174,7 @@ class StaticField(SplatField):
             camera = str(state[f"{key}.camera"])
             self._learned[camera] = (np.array(state[f"{key}.plate"]), np.array(state[f"{key}.known"]))
         with self._lock:
-            views = [
-                replace(v, weight=self._learned[v.camera][1].astype(np.float32))
-                for v in self.view_store.views
-            ]
+            views = [replace(v, weight=self._learned[v.camera][1].astype(np.float32)) for v in self.view_store.views]
             if views:
                 self._ingest(views)
 

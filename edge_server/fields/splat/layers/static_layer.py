@@ -51,9 +51,7 @@ class StaticLayer:
         """Learn plates that have changed, in a thread, until nothing is left to learn, and render ``views``
         meanwhile. The thread must not be at work."""
         self._stopping = False
-        self._thread = threading.Thread(
-            target=self._main, args=(plates, views), name="static-field", daemon=True
-        )
+        self._thread = threading.Thread(target=self._main, args=(plates, views), name="static-field", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:

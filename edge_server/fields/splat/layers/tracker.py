@@ -15,13 +15,7 @@ from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
 from edge_server.fields.splat.layers.motion import KNOTS_PER_S
 from edge_server.fields.splat.layers.moving_set import LEAST_FOREGROUND, MovingSet
-from edge_server.fields.splat.layers.observations import (
-    FixedCamera,
-    Observation,
-    Observations,
-    knot_of,
-    pixel_weights,
-)
+from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
 
 # Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.
 PASSES, AGAIN_M = 3, 0.02
@@ -64,9 +58,7 @@ class MotionTracker:
         self.fits = self.left_out = 0
         self._step_time, self._seed_time = StepTimer(), StepTimer()
 
-    def follow(
-        self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters
-    ) -> tuple[int, int, int]:
+    def follow(self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters) -> tuple[int, int, int]:
         """Estimate motion, seed Gaussians where they are missing, train appearance. Returns steps, pixels and
         pairs.
 
@@ -146,9 +138,7 @@ class MotionTracker:
                 observation.foreground, camera.depth_m, distance_m, observation.view.weight
             )
 
-    def _train_appearance(
-        self, pace: StepBudget, parameters: AdamParameters, most: int
-    ) -> tuple[int, int, int]:
+    def _train_appearance(self, pace: StepBudget, parameters: AdamParameters, most: int) -> tuple[int, int, int]:
         """At most so many steps on the frames of the last two knots, one frame a step, each as often as the
         others."""
         moving, newest = self.moving, self.observations.newest_knot

@@ -112,9 +112,7 @@ def store_products(typingctx: Any, table: Any, rows: Any, weights: Any, out: Any
 
 
 @intrinsic
-def store_products_backward(
-    typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at: Any, gradient: Any
-) -> Any:
+def store_products_backward(typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at: Any, gradient: Any) -> Any:
     """Backward of ``store_products``: d[at] is dLoss / dout[at]; adds to ``gradient``, shaped like table."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -66,8 +66,9 @@ def cell_value(typingctx: Any, table: Any, row: Any, size: Any, x: Any, y: Any, 
 
 
 @intrinsic
-def add_to_cell(typingctx: Any, table: Any, row: Any, size: Any, x: Any, y: Any, z: Any,
-                a: Any, b: Any, c: Any, d: Any) -> Any:  # fmt: skip
+def add_to_cell(
+    typingctx: Any, table: Any, row: Any, size: Any, x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, d: Any
+) -> Any:
     """Add (a, b, c, d) to a cell's vertices by their weights at (x, y, z): backward of ``cell_value``."""
     f32 = types.float32
     signature = types.void(table, types.int64, types.int64, *[f32] * 7)

@@ -138,8 +138,7 @@ def march_ray_backward(row, line, n, size, d_r, d_g, d_b, total, d_depth_total, 
         if d_depth == _F0:
             d_depth = _TOUCHED
         first = row[s]
-        add_to_cell(gradient, first, size, line[s, _X], line[s, _Y], line[s, _Z],
-                    d_depth, w * d_r, w * d_g, w * d_b)  # fmt: skip
+        add_to_cell(gradient, first, size, line[s, _X], line[s, _Y], line[s, _Z], d_depth, w * d_r, w * d_g, w * d_b)
         y, z = first + size, first + size * size
         dirty[first // SEGMENT] = 1
         dirty[(first + 1) // SEGMENT] = 1
@@ -176,8 +175,9 @@ def draw_pixel(views, recipe, n, rays, shift):
 
 
 @kernel
-def train_rays(counter, worker, views, recipe, space, voxels, rays, outline, memory, gradient, dirty, samples,
-               dropped, loss):  # fmt: skip
+def train_rays(
+    counter, worker, views, recipe, space, voxels, rays, outline, memory, gradient, dirty, samples, dropped, loss
+):
     """Forward and backward of ``rays`` rays.
 
     A task is a run of rays with gradient[p] and dirty[p] of its own. There are P tasks whatever the number of
@@ -223,14 +223,16 @@ def train_rays(counter, worker, views, recipe, space, voxels, rays, outline, mem
                 # The expected gradient under a random background, without its noise.
                 alpha = np.float32(views.pixels[pixel, 3]) * _BYTE
                 d_depth_total = two * trust * outline * (_F1 - transmittance - alpha) * transmittance
-            march_ray_backward(row, line, k, voxels.size, d_r, d_g, d_b, total, d_depth_total,
-                               gradient[part], dirty[part])  # fmt: skip
+            march_ray_backward(
+                row, line, k, voxels.size, d_r, d_g, d_b, total, d_depth_total, gradient[part], dirty[part]
+            )
         samples[part], dropped[part], loss[part] = count, bad, error
 
 
 @kernel
-def render_rays(counter, worker, lens, rotation, origin, pixels, space, voxels, background, memory, color,
-                depth, opacity):  # fmt: skip
+def render_rays(
+    counter, worker, lens, rotation, origin, pixels, space, voxels, background, memory, color, depth, opacity
+):
     """Render pixels, float64 (N, 2), to color, float32 (N, 3), depth in scene units and opacity (N,)."""
     row, line = memory.row[worker], memory.line[worker]
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])

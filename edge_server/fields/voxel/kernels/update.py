@@ -191,8 +191,7 @@ def upsample_grid(counter, worker, old, size, new, new_size):
 
 
 @kernel
-def update_cell_density(counter, worker, phase, phases, fade, voxels, per_unit, cells, seen, min_views,
-                        density):  # fmt: skip
+def update_cell_density(counter, worker, phase, phases, fade, voxels, per_unit, cells, seen, min_views, density):
     """Refresh every ``phases``-th layer of cells: the larger of the faded old density and the density of the
     densest vertex that reaches into a cell, times per_unit. Cells seen by fewer than min_views get 0."""
     size, table = voxels.size, voxels.table

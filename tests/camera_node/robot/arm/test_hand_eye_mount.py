@@ -20,8 +20,13 @@ def transform(turn, shift) -> np.ndarray:
 
 
 def written(tmp_path, **change):
-    data = {"setup": "eye-in-hand", "transform": transform((0.1, 0, 0), (0.05, 0, 0.1)).round(9).tolist(),
-            "time_offset_s": 0.02, "method": "refined", **change}  # fmt: skip
+    data = {
+        "setup": "eye-in-hand",
+        "transform": transform((0.1, 0, 0), (0.05, 0, 0.1)).round(9).tolist(),
+        "time_offset_s": 0.02,
+        "method": "refined",
+        **change,
+    }
     file = tmp_path / "hand.yaml"
     file.write_text(yaml.safe_dump(data))
     return file

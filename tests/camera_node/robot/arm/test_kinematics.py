@@ -142,9 +142,7 @@ def test_a_calibration_moves_the_hand_and_the_inverse_follows_it(factory):
 
 def test_a_calibration_of_zeros_changes_nothing(tmp_path):
     file = tmp_path / "calibration.conf"
-    file.write_text(
-        "[mounting]\n" + "".join(f"delta_{k} = [0, 0, 0, 0, 0, 0]\n" for k in ("theta", "a", "d"))
-    )
+    file.write_text("[mounting]\n" + "".join(f"delta_{k} = [0, 0, 0, 0, 0, 0]\n" for k in ("theta", "a", "d")))
     for q in POSTURES[:5]:
         assert np.array_equal(apply_calibration(UR3E, file).forward(q), UR3E.forward(q))
 

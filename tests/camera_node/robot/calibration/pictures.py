@@ -46,14 +46,7 @@ def write_scenario(
     for k, (picture, pose) in enumerate(zip(pictures, poses)):
         cv2.imwrite(str(folder / f"{k}.png"), picture)
         frames.append({"file_path": f"{k}.png", "transform_matrix": (pose @ OPENGL_TO_OPENCV).tolist()})
-    about = {
-        "w": lens.width,
-        "h": lens.height,
-        "fl_x": lens.fx,
-        "fl_y": lens.fy,
-        "cx": lens.cx,
-        "cy": lens.cy,
-    }
+    about = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
     (folder / "transforms.json").write_text(json.dumps({**about, "frames": frames}))
     file = folder / "bench.yaml"
     source = {"kind": "transforms", "data": str(folder / "transforms.json"), "fps": 500, "codec": "png"}

@@ -39,8 +39,16 @@ def test_json_is_the_answer_and_what_it_is_worth_and_nothing_else_is_printed(pai
     assert hand_eye("--pairs", pairs, "--json") == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
-    assert list(found) == ["transform", "time_offset_s", "residual_mm", "residual_deg", "method",
-                           "std_mm", "std_deg", "warnings"]  # fmt: skip
+    assert list(found) == [
+        "transform",
+        "time_offset_s",
+        "residual_mm",
+        "residual_deg",
+        "method",
+        "std_mm",
+        "std_deg",
+        "warnings",
+    ]
     assert 0.0 < found["std_mm"] < 1.0 and 0.0 < found["std_deg"] < 0.2 and found["warnings"] == []
     assert found["method"] == "refined" and found["time_offset_s"] == 0.0 and said.err == ""
     assert distance_mm(np.array(found["transform"]), X) < 1.5

@@ -66,16 +66,11 @@ def test_the_wrong_tag_and_the_wrong_text_are_not_taken():
     twice = np.hstack([printed, printed])
     assert parse_target("apriltag:36h11:3:80mm").find(twice) is None
     printed = np.pad(parse_target("qr:80mm:here").draw(400), 60, constant_values=255)
-    assert (
-        parse_target("qr:80mm:here").find(printed) is not None
-        and parse_target("qr:80mm").find(printed) is not None
-    )
+    assert parse_target("qr:80mm:here").find(printed) is not None and parse_target("qr:80mm").find(printed) is not None
     assert parse_target("qr:80mm:there").find(printed) is None
 
 
-@pytest.mark.parametrize(
-    "turn", [None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE]
-)
+@pytest.mark.parametrize("turn", [None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE])
 def test_a_chessboard_is_the_same_way_up_however_it_is_held(turn):
     """Its first corner stays the first: the picture is turned and the corners with it."""
     target = parse_target("chessboard:7x4:20mm")
@@ -105,9 +100,7 @@ def test_the_covariance_is_what_noisy_corners_scatter_by(roll):
     truth = inverse(camera)
     exact = LENS.project(points @ truth[:3, :3].T + truth[:3, 3])
     rng = np.random.default_rng(1)
-    poses = [
-        estimate_pose(Corners(exact + rng.normal(0, 0.1, exact.shape), points), LENS).pose for _ in range(400)
-    ]
+    poses = [estimate_pose(Corners(exact + rng.normal(0, 0.1, exact.shape), points), LENS).pose for _ in range(400)]
     turns = np.array([cv2.Rodrigues(truth[:3, :3].T @ p[:3, :3])[0].ravel() for p in poses])
     off = np.concatenate([turns, np.array(poses)[:, :3, 3] - truth[:3, 3]], axis=1)
     said = estimate_pose(Corners(exact, points), LENS).unit_covariance * 0.1**2

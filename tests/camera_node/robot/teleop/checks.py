@@ -28,9 +28,7 @@ def drive(operator: Teleoperator, ticks: Iterable[tuple[int, Sequence[StylusSamp
     return [operator.tick(now_ns, samples) for now_ns, samples in ticks]
 
 
-def assert_within_limits(
-    config: TeleopConfig, commands: Sequence[Command], start: NDArray[np.float64] = HOME
-) -> None:
+def assert_within_limits(config: TeleopConfig, commands: Sequence[Command], start: NDArray[np.float64] = HOME) -> None:
     """Every limit of ``config`` at every tick, from the joints alone: speeds and accelerations are their
     differences."""
     dt_s = 1.0 / config.rate_hz

@@ -59,9 +59,8 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     scenario = write_cell(tmp_path, "127.0.0.2", teleop=teleop)
     with Sender(port):
         status = main(
-            ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file),
-             "--json"]
-        )  # fmt: skip
+            ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file), "--json"]
+        )
     assert status == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["messages"]["engaged"] >= 1 and summary["solver"] == "dls"

@@ -49,7 +49,13 @@ def test_a_message_arrives_as_it_was_sent():
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"{", b"[1, 2]", b"\xff\xfe", b"null", b"7", b"[" * 1500,
+        b"",
+        b"{",
+        b"[1, 2]",
+        b"\xff\xfe",
+        b"null",
+        b"7",
+        b"[" * 1500,
         json.dumps({**GOOD, "p": [0, 0]}).encode(),
         json.dumps({**GOOD, "q": "none"}).encode(),
         json.dumps({**GOOD, "p": [[1], 0, 0]}).encode(),
@@ -59,7 +65,7 @@ def test_a_message_arrives_as_it_was_sent():
         json.dumps({"t_ns": 1}).encode(),
         json.dumps({**GOOD, "more": "x" * MAX_BYTES}).encode(),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_message_is_none(data):
     assert parse(data) is None
 
@@ -91,9 +97,7 @@ def test_a_taken_port_is_one_clear_line():
     stylus.close()
 
 
-@pytest.mark.parametrize(
-    "text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"]
-)
+@pytest.mark.parametrize("text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"])
 def test_unknown_styluses_are_refused(text):
     with pytest.raises(TeleopError, match="--stylus: expected"):
         open_stylus(text)

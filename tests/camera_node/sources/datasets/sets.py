@@ -51,9 +51,7 @@ class Taken:
     def fisheye(self, points: np.ndarray, k: list[float]) -> np.ndarray:
         """Where OpenCV's fisheye model with k1..k4 sees them, corner origin."""
         m = self.world_to_camera
-        found, _ = cv2.fisheye.projectPoints(
-            points[None], cv2.Rodrigues(m[:3, :3])[0], m[:3, 3], self.k, np.array(k)
-        )
+        found, _ = cv2.fisheye.projectPoints(points[None], cv2.Rodrigues(m[:3, :3])[0], m[:3, 3], self.k, np.array(k))
         return found[0] + 0.5
 
 
@@ -70,9 +68,7 @@ def rig(count: int = 3, lens: Pinhole | None = None) -> list[Taken]:
 
 def write_image(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(
-        str(path), image[..., ::-1] if image.ndim == 3 else image, [cv2.IMWRITE_JPEG_QUALITY, 98]
-    )
+    assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, [cv2.IMWRITE_JPEG_QUALITY, 98])
 
 
 def write_dynerf(folder: Path, cameras: list[Taken], frames: int = 6, written_at: float = 1.0) -> Path:
@@ -108,9 +104,7 @@ def write_zju(folder: Path, cameras: list[Taken], frames: int = 4, k3: float = 0
         cams["R"].append(m[:3, :3])
         cams["T"].append(1000.0 * m[:3, 3:])
     names = [f"Camera_B{number + 1}" for number in range(len(cameras))]
-    ims = [
-        {"ims": [f"{name}/{k:06d}.jpg" for name in names], "kpts2d": np.zeros((2, 3))} for k in range(frames)
-    ]
+    ims = [{"ims": [f"{name}/{k:06d}.jpg" for name in names], "kpts2d": np.zeros((2, 3))} for k in range(frames)]
     np.save(folder / "annots.npy", {"cams": cams, "ims": ims}, allow_pickle=True)  # type: ignore[arg-type]
     return folder
 
@@ -122,9 +116,13 @@ def _eyeful_pose(camera: Taken) -> np.ndarray:
 
 
 def write_eyeful(
-    folder: Path, cameras: list[Taken], positions: int = 2, model: str = "RadialAndTangential",
-    distortion: list[float] | None = None, full: int = 4,
-) -> Path:  # fmt: skip
+    folder: Path,
+    cameras: list[Taken],
+    positions: int = 2,
+    model: str = "RadialAndTangential",
+    distortion: list[float] | None = None,
+    full: int = 4,
+) -> Path:
     """full: the JSON describes images so many times larger than those in images-jpeg-2k."""
     bend = distortion or [*cameras[0].lens.distortion, 0.0]
     krt, splits = [], {"train": [], "test": []}  # type: ignore[var-annotated]
@@ -135,12 +133,19 @@ def write_eyeful(
             splits["test" if number == 0 else "train"].append(name)
             lens = camera.lens
             K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1 / full]]) * full
-            krt.append({
-                "width": WIDTH * full, "height": HEIGHT * full,
-                "cameraId": name, "frameId": k, "sensorId": number,
-                "K": K.T.tolist(), "T": np.linalg.inv(_eyeful_pose(camera)).T.tolist(),
-                "distortionModel": model, "distortion": bend,
-            })  # fmt: skip
+            krt.append(
+                {
+                    "width": WIDTH * full,
+                    "height": HEIGHT * full,
+                    "cameraId": name,
+                    "frameId": k,
+                    "sensorId": number,
+                    "K": K.T.tolist(),
+                    "T": np.linalg.inv(_eyeful_pose(camera)).T.tolist(),
+                    "distortionModel": model,
+                    "distortion": bend,
+                }
+            )
     (folder / "cameras.json").write_text(json.dumps({"KRT": krt}))
     (folder / "splits.json").write_text(json.dumps(splits))
     return folder
@@ -157,9 +162,7 @@ COLMAP_MODELS = {
 }
 
 
-def write_colmap(
-    folder: Path, cameras: list[Taken], model: str, binary: bool, place: str = "sparse/0"
-) -> Path:
+def write_colmap(folder: Path, cameras: list[Taken], model: str, binary: bool, place: str = "sparse/0") -> Path:
     """One image a camera, its name with a blank as COLMAP allows; points only where the images see them."""
     where = folder / place
     where.mkdir(parents=True, exist_ok=True)

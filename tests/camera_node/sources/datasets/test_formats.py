@@ -263,9 +263,7 @@ def test_eyeful_lenses_that_are_none_of_ours_are_straightened(tmp_path, model, d
     record = dataset[1]
     assert not record.intrinsics.distorted and record.path is None
     # A picture of straight lines through the lens is a picture of straight lines again: known by its points.
-    lens = Lens(
-        64, 48, *cameras[1].k[[0, 1], [0, 1]], *(cameras[1].k[:2, 2] + 0.5), *as_lens(model, distortion)
-    )
+    lens = Lens(64, 48, *cameras[1].k[[0, 1], [0, 1]], *(cameras[1].k[:2, 2] + 0.5), *as_lens(model, distortion))
     assert record.intrinsics == pinhole(lens)
     local = (sets.POINTS - record.camera_to_world[:3, 3]) @ record.camera_to_world[:3, :3]
     truth = (
@@ -361,9 +359,7 @@ def test_colmap_pictures_may_be_smaller_than_the_model(tmp_path):
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
 def test_colmap_damage_is_named(tmp_path, binary):
     folder = sets.write_colmap(tmp_path, sets.rig(3), "PINHOLE", binary)
-    cameras, images = (
-        folder / f"sparse/0/{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images")
-    )
+    cameras, images = (folder / f"sparse/0/{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
     (folder / "images/cam01 x.jpg").unlink()
     assert colmap.load_dataset(folder).missing == 1
     whole = {file: file.read_bytes() for file in (cameras, images)}
@@ -456,9 +452,7 @@ def test_straightened_pictures_show_each_ray_where_it_belongs(lens):
     k = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
     rays = straight.rays().reshape(-1, 1, 3)
     if lens.fisheye:
-        truth, _ = cv2.fisheye.projectPoints(
-            rays, np.zeros(3), np.zeros(3), k, np.array([*lens.radial, 0.0, 0.0])
-        )
+        truth, _ = cv2.fisheye.projectPoints(rays, np.zeros(3), np.zeros(3), k, np.array([*lens.radial, 0.0, 0.0]))
     else:
         bend = np.array([*lens.radial[:2], *lens.tangential, lens.radial[2]])
         truth, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), k, bend)

@@ -98,17 +98,11 @@ def test_alpha_is_kept_laid_on_a_color_and_weighted_when_shrinking(tmp_path):
     [
         (lambda d: d.pop("frames"), "frames"),
         (lambda d: d["frames"][0].pop("transform_matrix"), r"frames\[0\].*transform_matrix"),
-        (
-            lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]),
-            r"frames\[0\].*transform_matrix",
-        ),
+        (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), r"frames\[0\].*transform_matrix"),
         (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(0, 7.0), "orthonormal"),
         (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, float("nan")), "finite"),
         (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, 10**400), "transform_matrix"),
-        (
-            lambda d: d["frames"][0]["transform_matrix"].__setitem__(3, [0, 0, 0, 2]),
-            "last row is not 0 0 0 1",
-        ),
+        (lambda d: d["frames"][0]["transform_matrix"].__setitem__(3, [0, 0, 0, 2]), "last row is not 0 0 0 1"),
         (
             lambda d: d["frames"][0].update(transform_matrix=[*zip(*d["frames"][0]["transform_matrix"])]),
             r"frames\[0\].*last row is not 0 0 0 1: is it transposed",
@@ -220,9 +214,7 @@ def test_the_pose_flip_is_its_own_inverse(tmp_path):
     np.testing.assert_allclose(record.camera_to_world @ OPENGL_TO_OPENCV, stored, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", "", "a/" * 5000]
-)
+@pytest.mark.parametrize("leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", "", "a/" * 5000])
 def test_images_outside_the_data_set_are_not_read(tmp_path, leads):
     inside, outside = tmp_path / "set", tmp_path / "outside.png"
     inside.mkdir()

@@ -78,9 +78,7 @@ def test_opencv_projects_to_the_same_pixels():
         k, d = np.array(entry["K"]), np.array(entry["dist_k1k2p1p2"])
         r, t = np.array(entry["R_world_to_cam"]), np.array(entry["t_world_to_cam"])
         theirs, _ = cv2.projectPoints(points, cv2.Rodrigues(r)[0], t, k, d)
-        local = (
-            points @ se3_inverse(camera.pose.matrix())[:3, :3].T + se3_inverse(camera.pose.matrix())[:3, 3]
-        )
+        local = points @ se3_inverse(camera.pose.matrix())[:3, :3].T + se3_inverse(camera.pose.matrix())[:3, 3]
         np.testing.assert_allclose(camera.intrinsics.project(local), theirs[:, 0] + 0.5, atol=0.01)
         np.testing.assert_allclose(camera.pose.translation_m, entry["camera_center_m"], atol=1e-3)
 

@@ -45,9 +45,7 @@ class NetworkCamera:
                         if not camera.silent.is_set():
                             number = len(camera.sent_ns) % 256
                             data = cv2.imencode(".jpg", picture(number))[1].tobytes()
-                            head = (
-                                f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                            )
+                            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                             camera.sent_ns[len(camera.sent_ns)] = clock.now_ns()
                             self.wfile.write(head.encode() + data + b"\r\n")
                         time.sleep(1.0 / fps)

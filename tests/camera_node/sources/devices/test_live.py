@@ -183,9 +183,7 @@ def test_several_cameras_must_say_which_is_which(tmp_path):
         build_cameras(plan, source_config(plan), plan.cameras)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"width": 3}, {"exposure_us": 0}, {"first_frame_s": 0}, {"kind": "oak", "iso": 1}]
-)
+@pytest.mark.parametrize("wrong", [{"width": 3}, {"exposure_us": 0}, {"first_frame_s": 0}, {"kind": "oak", "iso": 1}])
 def test_wrong_settings_are_refused(tmp_path, wrong):
     plan = scenario(tmp_path, "0", **wrong)
     plan.source.pop("latency_ms", None)
@@ -225,9 +223,7 @@ def test_whatever_a_driver_raises_the_camera_is_opened_again(where):
     opened = []
 
     def open_feed():
-        opened.append(
-            Feed(breaks_after=3, trouble=CameraError("eye: gone") if where == "opening" else trouble)
-        )
+        opened.append(Feed(breaks_after=3, trouble=CameraError("eye: gone") if where == "opening" else trouble))
         if len(opened) == 2 and where == "opening":
             raise trouble
         return opened[-1]
@@ -245,9 +241,7 @@ def test_whatever_a_driver_raises_at_the_start_is_one_line():
     def open_feed():
         raise RuntimeError("xioctl(VIDIOC_S_FMT) failed\nlast error: 5")
 
-    with pytest.raises(
-        CameraError, match=r"^eye: RuntimeError: xioctl\(VIDIOC_S_FMT\) failed last error: 5$"
-    ):
+    with pytest.raises(CameraError, match=r"^eye: RuntimeError: xioctl\(VIDIOC_S_FMT\) failed last error: 5$"):
         LiveSource("eye", Fraction(30), open_feed, STANDING)
     feed = Feed(breaks_after=0, trouble=RuntimeError("no"))
     with pytest.raises(CameraError, match="eye: RuntimeError: no"):
@@ -282,9 +276,7 @@ def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
     plan = scenario(tmp_path, "0", {"eye": CALIBRATION["eye"], "other": CALIBRATION["eye"]})
     both = {**plan.source, "devices": {"eye": "0", "other": "1"}}
     plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": both}, tmp_path / "scenario.yaml")
-    monkeypatch.setattr(
-        "camera_node.sources.devices.live._poses", lambda *_: {"eye": Arm(), "other": STANDING}
-    )
+    monkeypatch.setattr("camera_node.sources.devices.live._poses", lambda *_: {"eye": Arm(), "other": STANDING})
     monkeypatch.setattr("camera_node.sources.devices.live.open_feed", open_feed)
     with pytest.raises(CameraError, match="other: no camera"):
         open_live(plan, source_config(plan), plan.cameras)

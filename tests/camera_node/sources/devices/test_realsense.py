@@ -18,9 +18,10 @@ from freshfield.clock import VirtualClock, WallClock
 from freshfield.scenario import parse
 
 rs = pytest.importorskip(
-    "pyrealsense2", exc_type=ImportError,
+    "pyrealsense2",
+    exc_type=ImportError,
     reason="needs pyrealsense2, pip install -e '.[realsense]', and libusb-1.0, apt install libusb-1.0-0",
-)  # fmt: skip
+)
 
 from camera_node.sources.devices import realsense  # noqa: E402
 
@@ -131,9 +132,7 @@ def test_without_a_device_one_clear_line_within_three_seconds():
 
 
 def test_a_library_that_cannot_be_loaded_is_told_from_one_that_is_not_there(tmp_path, monkeypatch):
-    (tmp_path / "pyrealsense2.py").write_text(
-        "raise ImportError('libusb-1.0.so.0: cannot open shared object file')"
-    )
+    (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
     monkeypatch.delitem(sys.modules, "pyrealsense2")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(CameraError, match=r"libusb-1\.0\.so\.0.*apt install libusb-1\.0-0"):

@@ -50,9 +50,7 @@ def test_the_transmission_at_a_known_distance(distance_m, moving):
 def test_koschmieder_s_constant(visibility_m, threshold):
     """3.912 / visibility at 2 %, 2.996 / visibility at 5 %."""
     haze = make(visibility_m=visibility_m, contrast_threshold=threshold)
-    assert haze.extinction_per_m * visibility_m == pytest.approx(
-        {0.02: 3.912, 0.05: 2.996}[threshold], abs=5e-4
-    )
+    assert haze.extinction_per_m * visibility_m == pytest.approx({0.02: 3.912, 0.05: 2.996}[threshold], abs=5e-4)
     far = np.array([0.0, 0.5 * visibility_m, visibility_m, np.inf])
     assert haze.transmittance(far) == pytest.approx([1.0, threshold**0.5, threshold, 0.0], rel=1e-6)
 

@@ -27,9 +27,7 @@ def test_a_ball_appears_where_opencv_projects_it():
     scene = make_scene("room", {"width": 256, "height": 192, "horizontal_fov_deg": 75.0, "supersample": 3})
     _, pose = scene.cameras["cam00"]
     k = scene.cameras["cam00"][0]
-    matrix = np.array(
-        [[k.fx, 0, k.cx - 0.5], [0, k.fy, k.cy - 0.5], [0, 0, 1]]
-    )  # OpenCV counts pixel centers
+    matrix = np.array([[k.fx, 0, k.cx - 0.5], [0, k.fy, k.cy - 0.5], [0, 0, 1]])  # OpenCV counts pixel centers
     for x, y in ((0.0, 0.0), (1.05, 0.7), (-1.1, 0.6), (-1.0, -0.75), (0.9, 0.0)):
         in_camera = np.array([x, y, 2.0])
         ball = np.eye(4)
@@ -38,9 +36,7 @@ def test_a_ball_appears_where_opencv_projects_it():
         image = made(**LENS).extend(scene.with_world(world, 0.6, False)).render("cam00", 0.0)[..., 0]
         v, u = np.mgrid[0:192, 0:256]
         centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.astype(float).sum()
-        points, _ = cv2.projectPoints(
-            in_camera[None], np.zeros(3), np.zeros(3), matrix, np.array(list(LENS.values()))
-        )
+        points, _ = cv2.projectPoints(in_camera[None], np.zeros(3), np.zeros(3), matrix, np.array(list(LENS.values())))
         assert np.allclose(centroid, points[0, 0], atol=0.15)
         straight = k.project((se3_inverse(pose) @ ball[:, 3])[:3]) - 0.5
         if abs(x) > 0.5 and abs(y) > 0.5:

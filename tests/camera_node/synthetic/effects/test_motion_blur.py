@@ -46,10 +46,7 @@ def test_one_sample_is_the_instant_itself():
 def test_only_what_moves_is_blurred():
     scene = make_scene("room", {"width": 64, "height": 64, "supersample": 1, "speed_m_per_s": 4.0})
     render = scene.renderer("cam00").image
-    sharp, blurred = (
-        render(0.5).astype(int),
-        make(exposure_ms=60.0).expose(scene.renderer("cam00"), 0.5).astype(int),
-    )
+    sharp, blurred = (render(0.5).astype(int), make(exposure_ms=60.0).expose(scene.renderer("cam00"), 0.5).astype(int))
     changed = np.abs(sharp - blurred).max(axis=-1) > 2
     assert 0.02 < changed.mean() < 0.3
     mean = np.mean([render(0.5 + s) for s in (-0.024, -0.012, 0.0, 0.012, 0.024)], axis=0)

@@ -102,9 +102,13 @@ def test_every_file_is_registered_and_follows_the_protocol():
     on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
     assert sorted(fx.NAMES) == on_disk
     methods = {
-        "world": "extend", "lens": "rendered", "exposure": "expose",
-        "image": "apply", "clock": "node_ns", "pose": "reported",
-    }  # fmt: skip
+        "world": "extend",
+        "lens": "rendered",
+        "exposure": "expose",
+        "image": "apply",
+        "clock": "node_ns",
+        "pose": "reported",
+    }
     for name in fx.NAMES:
         cls = fx.effect_class(name)
         assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
@@ -134,10 +138,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
             {"smoke": {}},
             "unknown effect 'smoke'; valid effects: clock_drift, exposure_drift, fog, hot_pixels, lens_dis",
         ),
-        (
-            {"sensor_noise": {"sigma": 1}},
-            "effect sensor_noise.sigma: unknown key; expected one of read_noise",
-        ),
+        ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
         ({"motion_blur": {"exposure_ms": 0}}, "effect motion_blur: exposure_ms is 0, expected 1e-06 to 1000"),
         ({"motion_blur": {"samples": 2.5}}, "whole number"),
         ({"occluder": {"period_s": "6 s"}}, "expected a number"),

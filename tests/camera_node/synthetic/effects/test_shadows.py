@@ -18,9 +18,7 @@ from camera_node.synthetic.textures import Checker, Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse
 from tests.camera_node.synthetic.worlds import body, with_effect
 
-LAMPS = Light(
-    np.array([[0.0, 0.0, 3.0], [0.4, 0.2, 3.0]]), 0.6, 10.0, (0.2,) * 3, (0.2,) * 3, (1.0, 0.9, 0.8)
-)
+LAMPS = Light(np.array([[0.0, 0.0, 3.0], [0.4, 0.2, 3.0]]), 0.6, 10.0, (0.2,) * 3, (0.2,) * 3, (1.0, 0.9, 0.8))
 CAMERA = Pinhole.from_fov(96, 72, 60.0)
 POSE = look_at([2.0, -2.0, 2.5], [0.0, 0.0, 0.0])
 FLOOR = Part(Quad((3.0, 3.0)), Checker((0.5, 0.7, 0.9), (0.9, 0.8, 0.6), 0.4))

@@ -74,10 +74,7 @@ def test_no_more_is_reflected_than_arrives(view, roughness):
     p, a = (m.ravel() for m in np.meshgrid(polar, azimuth))
     light = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
     n = light.shape[1]
-    sent = (
-        Specular(50.0, roughness).reflectance(light, np.repeat(UP, n, 1), -np.repeat(towards(view), n, 1))
-        / np.pi
-    )
+    sent = Specular(50.0, roughness).reflectance(light, np.repeat(UP, n, 1), -np.repeat(towards(view), n, 1)) / np.pi
     whole = float((sent * np.sin(p)).sum() * (np.pi / 2 / 400) * (2 * np.pi / 400))
     assert whole <= 1.0
     if view == 0.0:

@@ -43,9 +43,7 @@ def test_it_follows_the_lens_off_its_center_and_distorted():
     assert np.unravel_index(gain.argmax(), gain.shape) == (20, 30)
     rays = lens.rays()
     assert np.allclose(gain, rays[..., 2] ** 4, atol=1e-6)
-    assert not np.allclose(
-        gain, gains(dataclasses.replace(lens, distortion=(0.0,) * 4), 4.0)[..., 0], atol=1e-3
-    )
+    assert not np.allclose(gain, gains(dataclasses.replace(lens, distortion=(0.0,) * 4), 4.0)[..., 0], atol=1e-3)
 
 
 def test_some_rows_are_those_rows_of_the_whole():

@@ -75,9 +75,7 @@ def asked(monkeypatch):
     """What is asked for of ``bench field``, where nothing is measured."""
     found = []
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    monkeypatch.setattr(
-        bench_field, "_curve", lambda name, *rest: _ask(found, name, rest[0]) or _curve(*rest)
-    )
+    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: _ask(found, name, rest[0]) or _curve(*rest))
     monkeypatch.setattr(bench_field, "_rates", lambda make, still, repeats: {})
     monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: found.append(f"start {name}") or {})
     monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
@@ -100,10 +98,21 @@ def _curve(make, still, planned_s, seeds, lpips):
 
 @pytest.mark.slow  # 9 s
 def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, capsys, monkeypatch, asked, few_cameras):
-    rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
-             "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
-    starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
-              "jit_cached_cpu_s": 0.25, "peak_rss_mb": 456.0}  # fmt: skip
+    rates = {
+        "steps_per_s": 71.5,
+        "rays_per_s": 98765.0,
+        "samples_per_s": 2.5e6,
+        "render_128_ms": 8.25,
+        "render_256_ms": 31.0,
+        "rates_outside_cores": 0.5,
+    }
+    starts = {
+        "jit_cold_s": 11.5,
+        "jit_cold_cpu_s": 10.25,
+        "jit_cached_s": 0.375,
+        "jit_cached_cpu_s": 0.25,
+        "peak_rss_mb": 456.0,
+    }
     monkeypatch.setattr(bench_field, "_rates", lambda make, still, repeats: dict(rates))
     monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
     path = tmp_path / "results" / "field.json"

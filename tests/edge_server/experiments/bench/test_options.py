@@ -75,9 +75,7 @@ def test_every_option_is_measured_off_and_on(tmp_path, tiny, capsys):
 
     text = path.with_suffix(".md").read_text()
     for row in rows.values():
-        line = next(
-            t for t in text.splitlines() if t.startswith(f"| {row['option']} | {row['scene']} | ngp |")
-        )
+        line = next(t for t in text.splitlines() if t.startswith(f"| {row['option']} | {row['scene']} | ngp |"))
         for run, gain in row["gain_psnr_db"].items():
             shown = f"{row['off']['psnr_db'][run]:.2f}, {row['on']['psnr_db'][run]:.2f}, **{gain:+.2f}**"
             assert shown in line

@@ -27,9 +27,7 @@ def test_a_mesh_of_whole_images_is_cut_to_a_box_that_ends_above_the_bench():
     lens = pinhole(scene.params)
     poses = [on_sphere(made.arm.path.target_m, made.arm.path.radius_m, a, 60.0) for a in (0.0, 120.0, 240.0)]
     views = tuple(View(f"v{k}", scene.view(lens, p).image(0.0), p, lens) for k, p in enumerate(poses))
-    maps = [
-        depth_map(exact_depth(scene, v).astype(np.float32), v.image, v.camera_to_world, lens) for v in views
-    ]
+    maps = [depth_map(exact_depth(scene, v).astype(np.float32), v.image, v.camera_to_world, lens) for v in views]
     truth = surface_truth(Scan(scene, views), scanned.SPACING_M)
     whole, cut = (
         scanned._compared(maps, MeshSettings(voxel_m=0.004, bounds=bounds), truth)

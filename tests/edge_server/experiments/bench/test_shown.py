@@ -71,9 +71,7 @@ def test_a_long_run_is_told_minute_by_minute(small: Path, monkeypatch: pytest.Mo
     assert run["charged"]["ms_per_update"] == found["as"]["nothing late"]["7"]["cost"]["update_ms"]
     assert [part["minute"] for part in run["by_minute"]] == [1]
     assert run["by_minute"][0]["age_ms"] == pytest.approx(run["age_ms"]["mean"])
-    assert (
-        f"| long (0 frames left out): mean age, ms | {run['age_ms']['mean']:.0f} |" in capsys.readouterr().out
-    )
+    assert f"| long (0 frames left out): mean age, ms | {run['age_ms']['mean']:.0f} |" in capsys.readouterr().out
 
 
 def test_a_slower_processor_is_charged_more_and_compared_with_one_that_stands_still(
@@ -101,8 +99,9 @@ def test_a_slower_processor_is_charged_more_and_compared_with_one_that_stands_st
 
 def test_the_shares_add_up_to_what_is_shown() -> None:
     def run(error: float, perfect: float) -> dict[str, Any]:
-        return {"7": {"squared_error": {"moving": error},
-                      "perfect": {"newest": {"squared_error": {"moving": perfect}}}}}  # fmt: skip
+        return {
+            "7": {"squared_error": {"moving": error}, "perfect": {"newest": {"squared_error": {"moving": perfect}}}}
+        }
 
     figures = {"x": {"nothing late": run(2.0, 0.1), "computing free": run(5.0, 1.1), "shown": run(10.0, 4.1)}}
     assert output._shares(figures, "x") == pytest.approx([0.2, 0.4, 0.2, 0.2])  # of 10
@@ -146,9 +145,7 @@ def test_growth_varies_one_factor_at_a_time_and_says_what_saturates(small, tmp_p
     assert out.with_name("growth.png").stat().st_size > 5000
     written = out.read_text()
     assert edge_server([*words, "--resume"]) == 0
-    assert json.loads(out.read_text())["growth"] == json.loads(written)["growth"], (
-        "nothing was measured twice"
-    )
+    assert json.loads(out.read_text())["growth"] == json.loads(written)["growth"], "nothing was measured twice"
 
 
 def test_updates_take_in_no_more_frames_than_there_is_time_for() -> None:

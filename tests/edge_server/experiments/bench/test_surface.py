@@ -27,8 +27,10 @@ def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     assert cell["views"] == 51 and 0.0 < cell["exact_chamfer_mm"] < cell["chamfer_mm"]
     (fit,) = found["cases"]["splat"]["fits"]
     assert {(m["depth"], m["method"]) for m in fit["meshes"]} == {
-        ("of the field", "tsdf"), ("sharpened", "tsdf"), ("sharpened", "sdf"),
-    }  # fmt: skip
+        ("of the field", "tsdf"),
+        ("sharpened", "tsdf"),
+        ("sharpened", "sdf"),
+    }
     # What the pictures agree on is nearer to the truth than what the field made of them.
     assert fit["sharpened"]["median_mm"] < fit["of the field"]["median_mm"]
     rough, sharpened = (

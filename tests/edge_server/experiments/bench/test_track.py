@@ -77,11 +77,7 @@ def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_pa
     row = next(line for line in text.splitlines() if line.startswith("| room | ngp |"))
     cells = [cell.strip() for cell in row.split("|")[1:-1]]
     whole, moving = run["whole"], run["moving"]
-    assert cells[2:5] == [
-        f"0.1 s ({run['steps']:.0f} steps)",
-        "3",
-        f"{whole['mean_db']:.2f} ({moving['mean_db']:.2f})",
-    ]
+    assert cells[2:5] == [f"0.1 s ({run['steps']:.0f} steps)", "3", f"{whole['mean_db']:.2f} ({moving['mean_db']:.2f})"]
     assert cells[5] == f"{whole['fresh_mean_db']:.2f} ({moving['fresh_mean_db']:.2f})"
     assert cells[7] == f"{100 * whole['share_near']:.0f} % ({100 * moving['share_near']:.0f} %)"
     assert cells[8] == f"{whole['median_db']:.2f} ({moving['median_db']:.2f})"
@@ -141,9 +137,7 @@ def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, monk
     assert bench(path, *words) == 130
     assert "--resume goes on" in capsys.readouterr().out
     rows = json.loads(path.read_text())["track"]["room"]
-    assert (
-        "tensorf" not in rows and "| room | ngp | 1 s (7 steps) | 3 |" in path.with_suffix(".md").read_text()
-    )
+    assert "tensorf" not in rows and "| room | ngp | 1 s (7 steps) | 3 |" in path.with_suffix(".md").read_text()
     assert (tmp_path / "track.png").is_file()
 
     flat.interrupt, flat.fits = None, 0

@@ -44,9 +44,7 @@ def test_lines_outlive_the_process_and_a_torn_last_one_counts_as_none(tmp_path):
 
 
 def test_a_content_key_is_of_the_content_and_not_of_its_order():
-    assert (
-        content_key({"a": 1, "b": [2]}) == content_key({"b": [2], "a": 1}) != content_key({"a": 1, "b": [3]})
-    )
+    assert content_key({"a": 1, "b": [2]}) == content_key({"b": [2], "a": 1}) != content_key({"a": 1, "b": [3]})
     assert len(content_key([], 40)) == 40
 
 

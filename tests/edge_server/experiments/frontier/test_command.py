@@ -62,8 +62,7 @@ def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch)
     monkeypatch.setattr("edge_server.fields.registry.make_field", lambda *args, **more: Slow())
     for name, factor in (("perf_counter", 1.0), ("process_time", 3.0)):  # of three threads
         monkeypatch.setattr(
-            f"edge_server.experiments.frontier.update_time.time.{name}",
-            lambda factor=factor: factor * clock[0],
+            f"edge_server.experiments.frontier.update_time.time.{name}", lambda factor=factor: factor * clock[0]
         )
     found = measure_compute(TINY, 1.0, "ngp", {}, warm_steps=5)
     assert found.ms_per_step == pytest.approx(5.0) and found.ms_per_update == pytest.approx(90.0)
@@ -97,12 +96,26 @@ def test_steps_that_fit_into_an_update():
 
 def test_seeds_are_averaged_with_their_standard_error():
     base = {
-        "speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "updates": 2, "scored": 2,
-        "aaoi_ms": 100.0, "psnr_moving_db": None, "ssim": 0.5, "lpips": None, "shown_age_ms": 90.0,
-        "shown_psnr_moving_db": None, "shown_psnr_still_db": None, "shown_ssim": 0.5, "shown_lpips": None,
-        "psnr_db": 20.0, "field": "ngp", "effort": "low",
+        "speed_m_per_s": 1.0,
+        "planned_update_s": 0.5,
+        "update_s": 0.5,
+        "steps": 4,
+        "updates": 2,
+        "scored": 2,
+        "aaoi_ms": 100.0,
+        "psnr_moving_db": None,
+        "ssim": 0.5,
+        "lpips": None,
+        "shown_age_ms": 90.0,
+        "shown_psnr_moving_db": None,
+        "shown_psnr_still_db": None,
+        "shown_ssim": 0.5,
+        "shown_lpips": None,
+        "psnr_db": 20.0,
+        "field": "ngp",
+        "effort": "low",
         "options": {"effort": "low"},
-    }  # fmt: skip
+    }
     (row,) = mean_over_seeds([{**base, "shown_psnr_db": 20.0}, {**base, "shown_psnr_db": 22.0}])
     assert row["shown_psnr_db"] == 21.0 and row["shown_psnr_db_error"] == pytest.approx(1.0)
     assert row["shown_psnr_moving_db"] is None and row["shown_psnr_moving_db_error"] is None
@@ -112,13 +125,15 @@ def test_seeds_are_averaged_with_their_standard_error():
 def test_the_conclusion_names_the_best_time_of_each_speed():
     def row(speed, update_s, whole, moving):
         return {
-            "field": "ngp", "effort": "low", "speed_m_per_s": speed, "update_s": update_s,
-            "shown_psnr_db": whole, "shown_psnr_moving_db": moving,
-        }  # fmt: skip
+            "field": "ngp",
+            "effort": "low",
+            "speed_m_per_s": speed,
+            "update_s": update_s,
+            "shown_psnr_db": whole,
+            "shown_psnr_moving_db": moving,
+        }
 
-    said = conclusion(
-        [row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)]
-    )
+    said = conclusion([row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)])
     assert "at 1 m/s 2.00 s (ngp low) for the whole image and 0.10 s (ngp low) where it moves (2.0 s" in said
     assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
 
@@ -126,9 +141,15 @@ def test_the_conclusion_names_the_best_time_of_each_speed():
 @pytest.fixture
 def tiny_sweep(monkeypatch):
     sweep = replace(
-        command.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, warm_steps=3,
-        size=32, moving=TINY,
-    )  # fmt: skip
+        command.QUICK,
+        planned_s=(0.2, 0.4),
+        speeds=(1.0,),
+        update_s=(0.1, 0.4),
+        run_s=0.8,
+        warm_steps=3,
+        size=32,
+        moving=TINY,
+    )
     monkeypatch.setattr(command, "QUICK", sweep)
     return sweep
 
@@ -171,14 +192,10 @@ def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch
     monkeypatch.setattr(effort_sweep, "fit_from_scratch", fit)
     for _ in range(2):
         file = command.FrontierFile(tmp_path / "frontier.json")
-        command.Frontier(
-            tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0
-        )._from_scratch()
+        command.Frontier(tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0)._from_scratch()
     assert len(measured) == 1
     monkeypatch.setitem(settings.EFFORTS, effort.name, {"rays": 77})
-    command.Frontier(
-        tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0
-    )._from_scratch()
+    command.Frontier(tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0)._from_scratch()
     assert len(measured) == 2
 
 

@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.scenes.multiview_sequence import (
-    MultiviewSequence,
-    recorded_sequence,
-    synthetic_sequence,
-)
+from edge_server.experiments.scenes.multiview_sequence import MultiviewSequence, recorded_sequence, synthetic_sequence
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Rendering
@@ -67,9 +63,12 @@ def test_a_recording_is_played_back_and_forth(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("make", "holdout", "told"),
-    [(write_photos, "0", "nothing moves"), (write_recording, "0", "holds out no"),
-     (partial(write_recording, instants=1), "cam00", "nothing moves")],
-)  # fmt: skip
+    [
+        (write_photos, "0", "nothing moves"),
+        (write_recording, "0", "holds out no"),
+        (partial(write_recording, instants=1), "cam00", "nothing moves"),
+    ],
+)
 def test_what_cannot_be_followed_is_said(tmp_path, make, holdout: str, told: str) -> None:
     with pytest.raises(DatasetError, match=told):
         recorded_sequence(make(tmp_path), holdout)

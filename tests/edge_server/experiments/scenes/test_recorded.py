@@ -59,17 +59,24 @@ def test_a_holdout_that_cannot_work_is_said(tmp_path, holdout, message):
 def test_missing_folder_and_empty_folder_are_said(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "transforms.json").write_text("{")
-    for folder, said in (("nowhere", "no such file or folder"), ("empty", r"expected transforms\.json"),
-                         (".", "cannot be read as JSON")):  # fmt: skip
+    for folder, said in (
+        ("nowhere", "no such file or folder"),
+        ("empty", r"expected transforms\.json"),
+        (".", "cannot be read as JSON"),
+    ):
         with pytest.raises(DatasetError, match=said):
             load_recorded(tmp_path / folder)
 
 
 @pytest.mark.parametrize(
     ("name", "holdout", "scale", "training", "held_out"),
-    [("lego_synthetic", "8", 2, 87, 13), ("fox", "8", 4, 43, 7), ("blender_kitchen", "cam00", 1, 18, 1),
-     ("pose2sim_single_person", "cam01", 4, 3, 1)],
-)  # fmt: skip
+    [
+        ("lego_synthetic", "8", 2, 87, 13),
+        ("fox", "8", 4, 43, 7),
+        ("blender_kitchen", "cam00", 1, 18, 1),
+        ("pose2sim_single_person", "cam01", 4, 3, 1),
+    ],
+)
 def test_real_sets(name, holdout, scale, training, held_out):
     found = load_recorded(data_dir(name), holdout, scale)
     assert (len(found.training), len(found.held_out)) == (training, held_out)

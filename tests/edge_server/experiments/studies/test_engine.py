@@ -18,8 +18,9 @@ from edge_server.experiments.studies.trial import Trial, last_images, run_trial
 from freshfield.scenario import ScenarioError
 
 TINY = {"gaussians": 256, "start": 256}
-TRIAL = Trial("room", 1, {"preset": "ch5"}, "threshold", 120.0, size=24, cameras=5, field_options=TINY,
-              steps=4, lpips=False)  # fmt: skip
+TRIAL = Trial(
+    "room", 1, {"preset": "ch5"}, "threshold", 120.0, size=24, cameras=5, field_options=TINY, steps=4, lpips=False
+)
 NO_DATA = Folders()
 
 
@@ -102,8 +103,7 @@ def test_nothing_is_old_where_nothing_is_delayed_and_flushing_frees_the_links():
     assert ideal["aaoi_ms"] < 30.0 and ideal["views"] == 4.0
     slow = {"preset": "ch5", "service": {"law": "deterministic", "mean_ms": 200.0}}
     waits = [
-        run_trial(replace(TRIAL, channel=slow, policy=p, value=240.0, seed=4), NO_DATA)
-        for p in ("wait", "wait-flush")
+        run_trial(replace(TRIAL, channel=slow, policy=p, value=240.0, seed=4), NO_DATA) for p in ("wait", "wait-flush")
     ]
     # Frames that were on their way block the links for up to 200 ms: none of their successors is in time, and
     # the wait goes on until the first is. Broken off, the cameras' next frames are there when it ends.

@@ -45,11 +45,18 @@ def invented(tmp_path: Path, rule) -> Invented:
 
 def figures(quality: float, age: float, views: float = 9.0) -> dict[str, Any]:
     return {
-        "psnr_db": 20.0 + quality, "psnr_moving_db": 18.0 + quality, "ssim": 0.8 + quality / 50,
-        "shown_psnr_db": 20.0 + quality, "shown_psnr_moving_db": 18.0 + quality,
-        "lpips": 0.2 - quality / 50, "views": views, "aaoi_ms": age, "age_sum_ms": 18 * age, "wait_ms": 0.0,
+        "psnr_db": 20.0 + quality,
+        "psnr_moving_db": 18.0 + quality,
+        "ssim": 0.8 + quality / 50,
+        "shown_psnr_db": 20.0 + quality,
+        "shown_psnr_moving_db": 18.0 + quality,
+        "lpips": 0.2 - quality / 50,
+        "views": views,
+        "aaoi_ms": age,
+        "age_sum_ms": 18 * age,
+        "wait_ms": 0.0,
         "decisions": 1,
-    }  # fmt: skip
+    }
 
 
 def noise(seed: int, value: float | None) -> float:
@@ -119,8 +126,11 @@ def test_the_file_of_a_study_says_what_was_run_and_found(tmp_path: Path):
     assert f"{mean:.2f} [{low:.2f}, {high:.2f}] better than the largest threshold" in first["found"]
     rows = [r for r in found["rows"] if (r["discipline"], r.get("gamma_ms")) == ("drop-new", 120.0)]
     assert [r["policy"] for r in rows] == ["threshold"]
-    of = [float(r["psnr_db"]) for r in csv.DictReader((tmp_path / "mat.csv").open())
-          if (r["discipline"], r["gamma_ms"]) == ("drop-new", "120.0")]  # fmt: skip
+    of = [
+        float(r["psnr_db"])
+        for r in csv.DictReader((tmp_path / "mat.csv").open())
+        if (r["discipline"], r["gamma_ms"]) == ("drop-new", "120.0")
+    ]
     assert rows[0]["psnr_db"][0] == pytest.approx(sum(of) / 6, abs=1e-4)
 
 
@@ -225,9 +235,9 @@ def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: 
     assert {v.verdict for v in found} == {said}
     assert all("wait-arrived" in v.about for v in found)
     states = ("high traffic", "low traffic", "high traffic, parallel")
-    assert {v.about.partition(", ")[2].partition(", wait")[0] for v in found} == set(states) and len(
-        found
-    ) == 8 * len(states)
+    assert {v.about.partition(", ")[2].partition(", wait")[0] for v in found} == set(states) and len(found) == 8 * len(
+        states
+    )
 
 
 @pytest.mark.usefixtures("no_curves")
@@ -238,8 +248,9 @@ def test_the_sign_of_ssim_in_f_w_can_turn_what_is_better(tmp_path: Path):
 
     found = {
         v.about.rpartition(", ")[2]: v.verdict
-        for v in judged("omega", tmp_path, rule) if "arrive meanwhile" in v.claim and "F_w" in v.about
-    }  # fmt: skip
+        for v in judged("omega", tmp_path, rule)
+        if "arrive meanwhile" in v.claim and "F_w" in v.about
+    }
     assert found == {"F_w (6.37)": "does not hold", "F_w with w_s = -0.2": "holds"}
 
 
@@ -294,9 +305,7 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
 def test_a_table_selects_by_labels():
     from edge_server.experiments.studies.trial import Trial
 
-    points = [
-        Point({"policy": p, "x": x}, Trial("room", s, {})) for p in "ab" for x in (1, 2) for s in (0, 1)
-    ]
+    points = [Point({"policy": p, "x": x}, Trial("room", s, {})) for p in "ab" for x in (1, 2) for s in (0, 1)]
     table = Table(points, [figures(i, i) for i in range(8)])
     assert table.curve("x", "aaoi_ms", policy="b") == {1.0: {0: 4, 1: 5}, 2.0: {0: 6, 1: 7}}
     assert table.distinct("policy") == ["a", "b"] and table.values("aaoi_ms", policy="a", x=2) == {0: 2, 1: 3}

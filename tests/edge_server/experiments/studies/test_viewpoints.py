@@ -23,11 +23,17 @@ TINY = viewpoints.Workload((3, 8), 16, 3, 24)
 
 def rows(better_db):
     return [
-        {"arm": arm, "seed": s, "views": v,
-         "psnr_db": 20 + v * better_db + 0.01 * s + (arm != "random") * better_db,
-         "path_m": 5.0 - better_db + 0.01 * s * (arm == "random")}
-        for arm in viewpoints.ARMS for s in range(4) for v in (3, 8)
-    ]  # fmt: skip
+        {
+            "arm": arm,
+            "seed": s,
+            "views": v,
+            "psnr_db": 20 + v * better_db + 0.01 * s + (arm != "random") * better_db,
+            "path_m": 5.0 - better_db + 0.01 * s * (arm == "random"),
+        }
+        for arm in viewpoints.ARMS
+        for s in range(4)
+        for v in (3, 8)
+    ]
 
 
 def test_verdicts_of_viewpoints_follow_the_figures():
@@ -39,10 +45,19 @@ def test_verdicts_of_viewpoints_follow_the_figures():
 def test_verdicts_of_preferences_follow_the_figures():
     def answers(share, knows):
         return [
-            {"taste": t, "habit": h, "answers": 60, "seed": s, "agreement": 0.82 * share + 0.001 * s,
-             "with_itself": 0.82, "knows": knows}
-            for t in preferences.TASTES for h in preferences.HABITS for s in range(4)
-        ]  # fmt: skip
+            {
+                "taste": t,
+                "habit": h,
+                "answers": 60,
+                "seed": s,
+                "agreement": 0.82 * share + 0.001 * s,
+                "with_itself": 0.82,
+                "knows": knows,
+            }
+            for t in preferences.TASTES
+            for h in preferences.HABITS
+            for s in range(4)
+        ]
 
     assert {v.verdict for v in preferences.judge_answers("tile", answers(0.95, False))} == {"holds"}
     assert {v.verdict for v in preferences.judge_answers("tile", answers(0.85, True))} == {"does not hold"}
@@ -77,9 +92,11 @@ def test_a_capture_of_a_transparent_object_is_scored_over_the_scenes_background(
 
     view = View("test", image, pose, lens)
     stage = SimpleNamespace(
-        background=(1.0, 1.0, 1.0), held_out=(view,), fit=lambda *_: Perfect(),
+        background=(1.0, 1.0, 1.0),
+        held_out=(view,),
+        fit=lambda *_: Perfect(),
         score=lambda made, scorer: score_views(made, (view,), scorer)[0],
-    )  # fmt: skip
+    )
     made = SimpleNamespace(views=[view], stops=[SimpleNamespace(seconds=0.0)] * 2, path_m=1.0)
     assert preferences._measured(stage, made, TINY, 0)["psnr_db"] > 60.0
 

@@ -33,16 +33,12 @@ def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
     assert len({str(scenario_of(seed).channel) for seed in range(50)}) > 10
 
 
-CRASHES = tuple(
-    Fault(k, "crash", 500.0 + 200 * k, 150.0, role) for k, role in enumerate(("node", "emulator", "edge"))
-)
+CRASHES = tuple(Fault(k, "crash", 500.0 + 200 * k, 150.0, role) for k, role in enumerate(("node", "emulator", "edge")))
 
 
 def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeployment:
     scenario = scenario_of(seed)
-    deployment = ChaosDeployment(
-        scenario, chaos.training_cameras(scenario), chaos._SETTINGS, faults, tmp_path
-    )
+    deployment = ChaosDeployment(scenario, chaos.training_cameras(scenario), chaos._SETTINGS, faults, tmp_path)
     deployment.run(2.0)
     deployment.end()
     return deployment
@@ -63,9 +59,7 @@ def test_an_edge_goes_on_from_its_checkpoint_if_it_is_told_to(tmp_path: Path) ->
     state = []
     for resume in (0.0, 1.0):
         (folder := tmp_path / str(resume)).mkdir()
-        crash = replace(
-            CRASHES[2], at_ms=1000.0, for_ms=990.0, value=resume
-        )  # it is back just before the end
+        crash = replace(CRASHES[2], at_ms=1000.0, for_ms=990.0, value=resume)  # it is back just before the end
         state.append(run(folder, (saved, crash)).updates.field.state())
     kept = np.load(tmp_path / "1.0" / "field.npz")
     trained = [name for name in state[0] if not np.array_equal(state[0][name], kept[name])]
@@ -122,9 +116,7 @@ def forget_kills(patch: pytest.MonkeyPatch) -> None:
 
 def never_restart_the_edge(patch: pytest.MonkeyPatch) -> None:
     whole = ChaosDeployment._restart
-    patch.setattr(
-        ChaosDeployment, "_restart", lambda self, role, *_: role == "edge" or whole(self, role, False)
-    )
+    patch.setattr(ChaosDeployment, "_restart", lambda self, role, *_: role == "edge" or whole(self, role, False))
 
 
 def learn_what_is_no_number(patch: pytest.MonkeyPatch) -> None:
@@ -182,7 +174,7 @@ def break_a_part(patch: pytest.MonkeyPatch) -> None:
         (break_a_part, 7, "KeyError in test_chaos.py, policy: 'omega'", "policy"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
-)  # fmt: skip
+)
 def test_what_is_broken_is_found_and_its_faults_are_reduced(
     broken, seed: int, says: str, kind: str | None, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
@@ -205,9 +197,7 @@ def test_known_results_are_not_run_again(tmp_path: Path, monkeypatch: pytest.Mon
     assert capsys.readouterr().out.count("2 seeds, 0 failed") == 2
 
 
-@pytest.mark.parametrize(
-    "words", [["--seeds", "3..1"], ["--seeds", "a"], ["--seeds", "1", "--faults", "x"], []]
-)
+@pytest.mark.parametrize("words", [["--seeds", "3..1"], ["--seeds", "a"], ["--seeds", "1", "--faults", "x"], []])
 def test_wrong_words_are_refused(words: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         chaos.main(words)

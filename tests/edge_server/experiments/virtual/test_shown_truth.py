@@ -13,9 +13,7 @@ from edge_server.fields import Rendering
 from edge_server.live.state import Publication
 from freshfield.scenario import ScenarioError, parse
 
-SOURCE = {
-    "kind": "world", "scene": "room", "width": 64, "height": 64, "params": {"supersample": 1},
-}  # fmt: skip
+SOURCE = {"kind": "world", "scene": "room", "width": 64, "height": 64, "params": {"supersample": 1}}
 HALF_A_STEP_MS = GRID_NS / 2e6
 NOW = 400  # of the grid: 2 s
 
@@ -43,9 +41,16 @@ class Delayed:
 
 def publication(published_ns: int, ages_ms: tuple[float, ...]) -> Publication:
     return Publication(
-        0, published_ns / 1e9, published_ns, None, ("a", "b"), ages_ms, float(np.mean(ages_ms)),
-        update_ms=20.0, network_ms=30.0,
-    )  # fmt: skip
+        0,
+        published_ns / 1e9,
+        published_ns,
+        None,
+        ("a", "b"),
+        ages_ms,
+        float(np.mean(ages_ms)),
+        update_ms=20.0,
+        network_ms=30.0,
+    )
 
 
 def looked_at(world: KnownWorld, field: Delayed, now: int = NOW) -> dict[str, Any]:
@@ -77,9 +82,7 @@ def test_the_ages_add_up(world: KnownWorld) -> None:
     assert sum(ages[name] for name in split) == pytest.approx(ages["mean"])
 
 
-def test_a_perfect_field_knows_less_from_older_views_and_more_than_one_that_stands_still(
-    world: KnownWorld,
-) -> None:
+def test_a_perfect_field_knows_less_from_older_views_and_more_than_one_that_stands_still(world: KnownWorld) -> None:
     assert np.abs(world.carried(NOW * GRID_NS, NOW * GRID_NS).astype(int) - world.image(NOW)).max() <= 1
     for now in (NOW, NOW + 37, NOW + 211):
         late = looked_at(world, Delayed(world, 18), now)  # shows what it knew 90 ms ago

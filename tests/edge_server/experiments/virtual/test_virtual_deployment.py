@@ -31,12 +31,16 @@ def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any)
         "seed": seed,
         "cameras": {"count": 5, "held_out": ["cam00"]},
         "source": {
-            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+            "kind": "world",
+            "scene": "room",
+            "width": 32,
+            "height": 32,
+            "fps": 15,
             "params": {"supersample": 1},
         },
         "channel": {"preset": "ch5"} if channel is None else channel,
         "edge": {"field": "ngp", "field_options": SMALL},
-    }  # fmt: skip
+    }
     return parse({**data, **other}, Path("virtual.yaml"))
 
 
@@ -82,9 +86,14 @@ def test_treated_views_are_the_same_in_every_run(policy, channel):
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
     edge = {"field": "splat", "field_options": small, "policy": {"name": policy}}
     source = {
-        "kind": "world", "scene": "room", "width": 64, "height": 64, "fps": 15, "speed_m_per_s": 3.0,
+        "kind": "world",
+        "scene": "room",
+        "width": 64,
+        "height": 64,
+        "fps": 15,
+        "speed_m_per_s": 3.0,
         "params": {"supersample": 1},
-    }  # fmt: skip
+    }
     first, second = (run(scenario(channel, edge=edge, source=source), seconds=1.5) for _ in range(2))
     assert first.publications and first.publications == second.publications
     a, b = (d.updates.field.state() for d in (first, second))
@@ -124,10 +133,9 @@ def test_a_fault_of_the_rate_takes_longer_for_what_the_frames_hold(fault):
 
 @pytest.mark.parametrize(
     "channel",
-    [{"preset": "ch5"},
-     {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True}}],
+    [{"preset": "ch5"}, {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True}}],
     ids=["own lines", "one line"],
-)  # fmt: skip
+)
 def test_the_links_decide_as_the_simulation_does(channel):
     what = scenario(channel)
     deployment = run(what, RunSettings(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
@@ -171,10 +179,7 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
     )
     ages = []
     for fps in (15.0, 30.0):
-        source = {
-            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": fps,
-            "params": {"supersample": 1},
-        }  # fmt: skip
+        source = {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": fps, "params": {"supersample": 1}}
         deployment = run(scenario({}, edge=edge, source=source), settings, seconds=6.0)
         late = [p for p in deployment.publications if p.t_s > 2.0]
         assert max(p.update_ms for p in late) <= 80.0
@@ -188,9 +193,7 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
 
 def test_wait_uses_only_what_was_generated_after_the_decision():
     edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
-    deployment = run(
-        scenario(edge=edge), RunSettings(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0
-    )
+    deployment = run(scenario(edge=edge), RunSettings(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0)
     assert len(deployment.publications) > 3
     for p in deployment.publications:
         assert p.update_ms >= 10.0 and max(p.ages_ms) <= 150.0 + 10.0 + 200.0
@@ -206,9 +209,13 @@ def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
 
 def test_node_clocks_may_be_wrong_and_ages_are_still_true():
     source = {
-        "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+        "kind": "world",
+        "scene": "room",
+        "width": 32,
+        "height": 32,
+        "fps": 15,
         "effects": {"clock_drift": {"offset_ms": 80.0, "drift_ppm": 200.0}},
-    }  # fmt: skip
+    }
     wrong, right = run(scenario(source=source)), run(scenario())
     assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in right.publications]
 
@@ -276,9 +283,7 @@ def test_wrong_poses_reach_the_field_and_wrong_lenses_are_believed():
 
 
 def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants() -> None:
-    settings = RunSettings(
-        steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0), shown_every_ms=70.0
-    )
+    settings = RunSettings(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0), shown_every_ms=70.0)
     deployment = build_deployment(scenario(), settings)
     asked: list[tuple[int, int]] = []
     take = deployment.updates.field.snapshot

@@ -122,9 +122,7 @@ def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
     assert all(np.isfinite(pair).all() for pair in exposures.known.values())
     poses, rng = PoseCorrections(0.1, 2.0), np.random.default_rng(0)
     for value in (0.5, np.nan):
-        poses.correct(
-            SEEN[0], lambda pose, at, v=value: np.full((len(at), 3), v, np.float32), 0.01, rng, np.zeros(3)
-        )  # fmt: skip
+        poses.correct(SEEN[0], lambda pose, at, v=value: np.full((len(at), 3), v, np.float32), 0.01, rng, np.zeros(3))
         np.testing.assert_allclose(poses.pose(SEEN[0]), SEEN[0].camera_to_world, atol=1e-12)
 
 

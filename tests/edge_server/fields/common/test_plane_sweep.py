@@ -37,9 +37,7 @@ def test_depth_is_where_the_scene_is(size: int) -> None:
     assert (size > 48) == (data.first[-1] > GUIDE_RAYS)
     found = _guide(views, data, box)
     assert found.shape == (data.first[-1],) and found.dtype == np.float32
-    truth = np.concatenate([
-        seen(v.intrinsics, v.camera_to_world)[1].reshape(-1) for v in views
-    ]) / box.radius_m  # fmt: skip
+    truth = np.concatenate([seen(v.intrinsics, v.camera_to_world)[1].reshape(-1) for v in views]) / box.radius_m
     told, there = found > 0, np.isfinite(truth)
     assert told[there].mean() > 0.5, "most of what can be seen has a guide"
     assert told[~there].mean() < 0.01, "and next to none of the plain sky"

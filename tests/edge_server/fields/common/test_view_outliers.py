@@ -27,9 +27,7 @@ BALL = np.array([0.3, 0.0, 0.5])
 def _later(views: list[View], ages_ms: tuple[float, ...] = AGES_MS) -> list[View]:
     """The ball has moved; the views are so old."""
     return [
-        replace(
-            v, image=picture(v.intrinsics, v.camera_to_world, BALL), generated_ns=round((1000 - age) * MS)
-        )
+        replace(v, image=picture(v.intrinsics, v.camera_to_world, BALL), generated_ns=round((1000 - age) * MS))
         for v, age in zip(views, ages_ms)
     ]
 
@@ -51,10 +49,7 @@ def test_off_is_nothing_at_all() -> None:
     assert pixel_weights(now, _memory(STILL, now), _settings(mask_grow_px_s=50.0)) is None
     assert pixel_weights([], {}, _settings(age_tau_ms=10.0)) is None
     same_age = _later(STILL, (0, 0, 0, 0))
-    assert (
-        pixel_weights(same_age, _memory(STILL, same_age), _settings(age_tau_ms=9.0, mask_stale_ms=9.0))
-        is None
-    )
+    assert pixel_weights(same_age, _memory(STILL, same_age), _settings(age_tau_ms=9.0, mask_stale_ms=9.0)) is None
 
 
 def test_weights_fall_with_age_beside_the_newest() -> None:
@@ -163,9 +158,7 @@ def test_masked_pixels_teach_nothing(name: str, monkeypatch: pytest.MonkeyPatch)
         mask[4:24, 4:24] = True
         mask |= k == 0
     real = supervision.moved_pixels
-    monkeypatch.setattr(
-        supervision, "moved_pixels", lambda before, now: masks.get(now.camera, real(before, now))
-    )
+    monkeypatch.setattr(supervision, "moved_pixels", lambda before, now: masks.get(now.camera, real(before, now)))
     states = []
     for other in (False, True):
         stale = []
@@ -288,11 +281,7 @@ def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_ag
     other.load_state(field.state())
     resumed = other.fit(wrong, Budget(steps=26))
     assert again.refused == resumed.refused == ("cam03",)
-    assert (
-        field.view_store.memory["cam03"].refusals_left
-        == other.view_store.memory["cam03"].refusals_left
-        == credit
-    )
+    assert field.view_store.memory["cam03"].refusals_left == other.view_store.memory["cam03"].refusals_left == credit
     assert field.fit([replace(v, generated_ns=600 * MS) for v in views], Budget(steps=26)).refused == ()
 
 

@@ -34,8 +34,7 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
     still = synthetic_still("room", cameras=13, size=48)
     gains = np.exp(np.random.default_rng(2).permutation(np.linspace(-0.35, 0.35, 12)))
     views = [
-        replace(v, image=np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8))
-        for v, g in zip(still.training, gains)
+        replace(v, image=np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8)) for v, g in zip(still.training, gains)
     ]
     scores, looks = [], None
     for appearance in (0, 4):

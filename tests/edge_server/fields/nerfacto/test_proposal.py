@@ -173,9 +173,8 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     group, share = _allocated(weight, 16, 0.2, shift)
     x, line = np.empty((3, 99), F), np.empty((3, 99), F)
     n = place_samples(
-        True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), np.int64(99), x,
-        line,
-    )  # fmt: skip
+        True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), np.int64(99), x, line
+    )
     t, length, of = line[:, 2:n]
     assert n - 2 == share.sum() and (np.diff(t) > 0).all()
     assert length.sum() == pytest.approx((edges[1] - edges[0]).sum(), rel=1e-5)
@@ -227,9 +226,21 @@ def test_interlevel_loss_and_gradient_equal_the_oracle_and_finite_differences(se
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
     bin_weights(depth, 2, 12, weight)
     loss = interlevel_loss(
-        encoding, np.r_[0, 0, cell].astype(np.int32), depth, weight, group, 2, 12, w, of, 0, len(of),
-        ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04)), np.empty((2, BINS), F), grad,
-    )  # fmt: skip
+        encoding,
+        np.r_[0, 0, cell].astype(np.int32),
+        depth,
+        weight,
+        group,
+        2,
+        12,
+        w,
+        of,
+        0,
+        len(of),
+        ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04)),
+        np.empty((2, BINS), F),
+        grad,
+    )
     values = torch.as_tensor(encoding.table[SEGMENT:].reshape(-1), dtype=torch.float64).requires_grad_(True)
     rest = cell, length, group[2:], of, torch.as_tensor(w, dtype=torch.float64)
     expected, total = _interlevel_oracle(values, *rest)
@@ -297,10 +308,23 @@ def test_appearances_equal_the_oracle_and_finite_differences() -> None:
 def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     """Of the color error, by the network's parameters and by the cameras' embeddings."""
     settings = NerfactoSettings(
-        levels=3, log2_table=9, base_resolution=4, finest_resolution=24, hidden=8, rays=64,
-        batch_samples=4096, samples=12, samples_start=12, bins=24, cells=16, proposal_cells=8,
-        appearance=2, harmonics=4, threads=1, contracted=True,
-    )  # fmt: skip
+        levels=3,
+        log2_table=9,
+        base_resolution=4,
+        finest_resolution=24,
+        hidden=8,
+        rays=64,
+        batch_samples=4096,
+        samples=12,
+        samples_start=12,
+        bins=24,
+        cells=16,
+        proposal_cells=8,
+        appearance=2,
+        harmonics=4,
+        threads=1,
+        contracted=True,
+    )
     field, views = NerfactoField(settings), ring(5, size=16)
     field.fit(views, Budget(steps=30))
     # A thin fog: no ray becomes opaque, where one sample more or less would be a step in the loss.

@@ -21,9 +21,21 @@ from tests.edge_server.fields.scenes import ring
 
 VIEWS = ring(6, size=24)
 SETTINGS = NerfactoSettings(
-    levels=4, log2_table=10, finest_resolution=32, hidden=16, rays=256, batch_samples=4096, samples=16,
-    samples_start=24, bins=32, cells=16, proposal_cells=16, anneal=20, harmonics=4, threads=1,
-)  # fmt: skip
+    levels=4,
+    log2_table=10,
+    finest_resolution=32,
+    hidden=16,
+    rays=256,
+    batch_samples=4096,
+    samples=16,
+    samples_start=24,
+    bins=32,
+    cells=16,
+    proposal_cells=16,
+    anneal=20,
+    harmonics=4,
+    threads=1,
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,17 +50,26 @@ def _render(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Places (N, 3), distances and lengths (2, N) of the samples that stay in the scratch; RGBDA (P, 5)."""
     view, n = VIEWS[2], len(pixels)
-    x, line = (
-        np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32),
-        np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32),
-    )
+    x, line = (np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32), np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32))
     out = np.full((n, 3), np.nan, np.float32), np.full(n, np.nan, np.float32), np.full(n, np.nan, np.float32)
     CallerPool().run(
-        render_with_proposal, np.array(lens_row(view.intrinsics)), view.camera_to_world[:3, :3].copy(),
-        snapshot.box.normalise(view.camera_to_world[:3, 3]), pixels, snapshot.sampling, snapshot.space,
-        snapshot.encoding, snapshot.levels, snapshot.net, snapshot.harmonics, snapshot.background,
-        np.empty((1, int(snapshot.net.widths.sum()), SAMPLE_BATCH), np.float32), x, line, *out,
-    )  # fmt: skip
+        render_with_proposal,
+        np.array(lens_row(view.intrinsics)),
+        view.camera_to_world[:3, :3].copy(),
+        snapshot.box.normalise(view.camera_to_world[:3, 3]),
+        pixels,
+        snapshot.sampling,
+        snapshot.space,
+        snapshot.encoding,
+        snapshot.levels,
+        snapshot.net,
+        snapshot.harmonics,
+        snapshot.background,
+        np.empty((1, int(snapshot.net.widths.sum()), SAMPLE_BATCH), np.float32),
+        x,
+        line,
+        *out,
+    )
     here = np.isfinite(x[0, 0])
     return x[0][:, here].T, line[0, 0, here], line[0, 1, here], np.column_stack(out)
 

@@ -11,14 +11,16 @@ from edge_server.fields.splat.settings import SplatSettings
 FIELD = SplatField
 SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)
 TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
-POISONED = SplatSettings(
-    gaussians=600, start=400, seed_cells=24, densify_every=20, views_a_step=3, threads=2
-)  # fmt: skip
+POISONED = SplatSettings(gaussians=600, start=400, seed_cells=24, densify_every=20, views_a_step=3, threads=2)
 FINITE = ("params", "m", "v", "slope", "looks", "reach", "behind")
 REACHED_DB = {
-    "held out": 23.1, "moved": 22.69, "one view": 33.09, "after noise": 22.17, "moving cameras": 25.86,
+    "held out": 23.1,
+    "moved": 22.69,
+    "one view": 33.09,
+    "after noise": 22.17,
+    "moving cameras": 25.86,
     "after no weights": 23.01,
-}  # fmt: skip
+}
 
 
 def check_bounds(field: SplatField, out: Rendering) -> None:

@@ -29,9 +29,7 @@ from tests.edge_server.fields.splat.small import SMALL
 def test_a_state_knows_the_views_it_was_fitted_to() -> None:
     """The same frames after ``load_state`` are not new: nothing is tested for outliers or tracked twice."""
     ball_m = np.array([0.3, 0, 0.5])
-    moved = [
-        replace(v, image=picture(v.intrinsics, v.camera_to_world, ball_m), generated_ns=10**8) for v in SEEN
-    ]
+    moved = [replace(v, image=picture(v.intrinsics, v.camera_to_world, ball_m), generated_ns=10**8) for v in SEEN]
     a, b = SplatField(SMALL), SplatField(replace(SMALL, threads=1))
     a.fit(SEEN, Budget(steps=100))
     a.fit(moved, Budget(steps=10))
@@ -70,8 +68,20 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
 
     def scores(says: np.ndarray) -> np.ndarray:
         found = np.zeros(cells**3, np.float32)
-        pool.run(score_cells, cams, data, pixels, says, False, np.zeros(3, np.float32), np.float32(0.3),
-                 contracted, cells, 2, found)  # fmt: skip
+        pool.run(
+            score_cells,
+            cams,
+            data,
+            pixels,
+            says,
+            False,
+            np.zeros(3, np.float32),
+            np.float32(0.3),
+            contracted,
+            cells,
+            2,
+            found,
+        )
         return found
 
     everywhere, where_marked = scores(np.zeros(0, np.int32)), scores(says)
@@ -139,9 +149,7 @@ def _ball_at(t_ms: int, late: bool = False) -> list[View]:
 
 @pytest.mark.parametrize("late", [False, True])
 def test_motion_is_tracked_and_extrapolated_to_the_present(late: bool) -> None:
-    truth, then = (
-        picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * t) / 255.0 for t in (0.65, 0.5)
-    )
+    truth, then = (picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * t) / 255.0 for t in (0.65, 0.5))
     moving = np.abs(truth - then).max(axis=2) > 0.03
     found = []
     for seed in range(3):  # of a few dozen Gaussians, one seed's median is off by .1 m/s more or less
@@ -281,10 +289,19 @@ def test_the_default_rates_find_positions() -> None:
     assert score(field) > 21.4
 
 
-@pytest.mark.parametrize("options", [
-    {"harmonics": 4}, {"harmonics": 9}, {"loss": "l1"}, {"dssim": 0.02}, {"opacity_reset": 80},
-    {"views_a_step": 3}, {"seed_cells": 0}, {"fade": 1e-3},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"harmonics": 4},
+        {"harmonics": 9},
+        {"loss": "l1"},
+        {"dssim": 0.02},
+        {"opacity_reset": 80},
+        {"views_a_step": 3},
+        {"seed_cells": 0},
+        {"fade": 1e-3},
+    ],
+)
 def test_every_option_learns(options: dict) -> None:
     field = SplatField(replace(SMALL, **options))
     field.fit(SEEN, Budget(steps=200))

@@ -25,9 +25,20 @@ VIEWS = ring(4, size=16)
 
 
 def rasterize(
-    *, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor,
-    Ks: Tensor, width: int, height: int, near_plane: float, backgrounds: Tensor, packed: bool,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    *,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    backgrounds: Tensor,
+    packed: bool,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """gsplat's ``rasterization`` for one camera, made of the oracle's parts."""
     assert not packed and len(viewmats) == len(Ks) == len(backgrounds) == 1
     view, k = viewmats[0], Ks[0]
@@ -36,14 +47,12 @@ def rasterize(
     z = torch.where(seen, z, torch.ones_like(z))
     none = torch.zeros_like(z)
     mean = torch.stack([k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], dim=-1)
-    plane = torch.stack(
-        [k[0, 0] / z, none, -k[0, 0] * x / z**2, none, k[1, 1] / z, -k[1, 1] * y / z**2], dim=-1
-    ).view(-1, 2, 3)
+    plane = torch.stack([k[0, 0] / z, none, -k[0, 0] * x / z**2, none, k[1, 1] / z, -k[1, 1] * y / z**2], dim=-1).view(
+        -1, 2, 3
+    )
     half = plane @ view[:3, :3] @ rotations(quats) * scales[:, None, :]
     covariance = half @ half.mT + 0.3 * torch.eye(2)
-    color, _, opacity = composite(
-        Flat(mean, covariance, opacities, colors, z, seen), width, height, backgrounds[0]
-    )
+    color, _, opacity = composite(Flat(mean, covariance, opacities, colors, z, seen), width, height, backgrounds[0])
     radii = 3.0 * covariance.detach().diagonal(dim1=1, dim2=2).amax(-1).sqrt() * seen
     return color[None], opacity[None, ..., None], {"means2d": mean[None], "radii": radii.ceil().int()[None]}
 

@@ -11,9 +11,13 @@ TINY = VoxelSettings(sizes=(12, 20, 32), refine_at=(10, 25), rays=512, cells=16,
 POISONED = SMALL
 FINITE = ("table", "density", "behind")
 REACHED_DB = {
-    "held out": 22.64, "moved": 22.4, "one view": 27.01, "after noise": 18.81, "moving cameras": 28.12,
+    "held out": 22.64,
+    "moved": 22.4,
+    "one view": 27.01,
+    "after noise": 18.81,
+    "moving cameras": 28.12,
     "after no weights": 26.43,
-}  # fmt: skip
+}
 
 
 def check_bounds(field: VoxelField, out: Rendering) -> None:

@@ -15,14 +15,7 @@ from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.voxel.kernels.rays import (
-    SEGMENT,
-    SkipGrid,
-    Voxels,
-    march_ray,
-    march_ray_backward,
-    train_rays,
-)
+from edge_server.fields.voxel.kernels.rays import SEGMENT, SkipGrid, Voxels, march_ray, march_ray_backward, train_rays
 from edge_server.fields.voxel.kernels.update import (
     MAX_CLEARANCE,
     MAX_DENSITY,
@@ -101,9 +94,7 @@ def _sampled(space: SkipGrid, ray: Ray) -> tuple[NDArray, NDArray]:
     return np.array(places).reshape(-1, 3), np.array(ts)
 
 
-def _oracle(
-    table: torch.Tensor, places: NDArray, ts: NDArray
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _oracle(table: torch.Tensor, places: NDArray, ts: NDArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Color (3,) over BACK, weighted distance and opacity of one ray, by torch's own interpolation."""
     grid = table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4).permute(3, 0, 1, 2)[None]
     at = torch.as_tensor(2.0 * places - 1.0)[None, None, None]
@@ -120,9 +111,15 @@ def _oracle(
 def _traced(space: SkipGrid, voxels: Voxels, ray: Ray):
     memory = make_ray_scratch(1)
     found = march_ray(
-        space, voxels, *ray.origin, *ray.direction, np.float32(ray.enter), np.float32(ray.leave),
-        memory.row[0], memory.line[0],
-    )  # fmt: skip
+        space,
+        voxels,
+        *ray.origin,
+        *ray.direction,
+        np.float32(ray.enter),
+        np.float32(ray.leave),
+        memory.row[0],
+        memory.line[0],
+    )
     return memory, found
 
 
@@ -169,9 +166,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
     mine = np.array([red, green, blue]) + transmittance * BACK
     d = (2.0 * (mine - target)).astype(np.float32)
     gradient, dirty = np.zeros_like(voxels.table), np.zeros(len(voxels.table) // SEGMENT, np.uint8)
-    march_ray_backward(
-        memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), np.float32(0), gradient, dirty
-    )
+    march_ray_backward(memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), np.float32(0), gradient, dirty)
     largest = np.argsort(-np.abs(gradient), axis=0)[:15]  # of each channel
     for k in (4 * largest + np.arange(4)).ravel():
         flat = voxels.table.reshape(-1)
@@ -254,8 +249,21 @@ def _training(parts: int, rays: int, outline: float = 0.0, alpha: int | None = N
     samples, dropped, loss = np.zeros(parts, np.int64), np.zeros(parts, np.int64), np.zeros(parts)
     recipe = RaySampling(np.uint64(77), rays, 1, 1, np.float32(0.0), BACK, False)
     pool = CallerPool()
-    pool.run(train_rays, data, recipe, _space(False), voxels, rays, np.float32(outline), make_ray_scratch(1),
-             gradient, dirty, samples, dropped, loss)  # fmt: skip
+    pool.run(
+        train_rays,
+        data,
+        recipe,
+        _space(False),
+        voxels,
+        rays,
+        np.float32(outline),
+        make_ray_scratch(1),
+        gradient,
+        dirty,
+        samples,
+        dropped,
+        loss,
+    )
     return gradient, dirty, samples, dropped, loss
 
 
@@ -295,8 +303,7 @@ def test_adam_equals_torch_without_its_first_moment() -> None:
             theirs.clamp_(min=0.0)
             theirs.clamp_(max=torch.tensor([MAX_DENSITY, 1.0, 1.0, 1.0], dtype=torch.float64))
         constants = adam_constants((0.05, 0.05), (0, 0), (0, 0), (MAX_DENSITY, 1))
-        rule = AdamRule(constants, np.float32(0.95), np.float32(5e-3),
-                         np.float32(1.0 / (1.0 - 0.95**step)))  # fmt: skip
+        rule = AdamRule(constants, np.float32(0.95), np.float32(5e-3), np.float32(1.0 / (1.0 - 0.95**step)))
         pool.run(voxel_adam, table, second, gradient, dirty, rule, dropped)
         np.testing.assert_allclose(table[: 4 * SEGMENT], theirs.detach().numpy(), atol=1e-5)
     np.testing.assert_array_equal(table[4 * SEGMENT :], kept)
@@ -357,9 +364,8 @@ def _diffused_by_numpy(
 
 @pytest.mark.parametrize(
     ("size", "cells", "empty", "phases"),
-    [(9, 8, 0.0, 4), (9, 8, 0.3, 2), (10, 8, 0.3, 4), (9, 4, 0.5, 4), (9, 12, 0.5, 4), (4, 16, 0.3, 3),
-     (9, 8, 1.0, 4)],
-)  # fmt: skip
+    [(9, 8, 0.0, 4), (9, 8, 0.3, 2), (10, 8, 0.3, 4), (9, 4, 0.5, 4), (9, 12, 0.5, 4), (4, 16, 0.3, 3), (9, 8, 1.0, 4)],
+)
 def test_diffusion_is_that_of_numpy_and_leaves_empty_cells_alone(
     size: int, cells: int, empty: float, phases: int
 ) -> None:
@@ -415,9 +421,8 @@ def test_the_densest_vertex_that_reaches_into_a_cell_is_found() -> None:
     seen[100] = 1
     for phase in range(phases):
         CallerPool().run(
-            update_cell_density, phase, phases, np.float32(0.5), voxels, np.float32(3.0), CELLS, seen, 2,
-            density,
-        )  # fmt: skip
+            update_cell_density, phase, phases, np.float32(0.5), voxels, np.float32(3.0), CELLS, seen, 2, density
+        )
     cells = density.reshape(CELLS, CELLS, CELLS)
     assert density[100] == 0.0 and cells[0, 0, 7] == 3000.0  # not a number: looked at again, not left out
     for k, j, i in ((1, 1, 1), (4, 0, 6), (7, 7, 7), (3, 5, 2)):

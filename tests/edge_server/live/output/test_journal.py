@@ -27,11 +27,7 @@ def test_series_keeps_the_order_of_publication_and_waits_for_scores(tmp_path):
     assert lines(tmp_path / "series.jsonl") == []
     journal.scored(publication(0, 20.0), final=True)
     journal.close()
-    assert [(s["number"], s["psnr_db"]) for s in lines(tmp_path / "series.jsonl")] == [
-        (0, 20.0),
-        (1, 21.0),
-        (2, None),
-    ]
+    assert [(s["number"], s["psnr_db"]) for s in lines(tmp_path / "series.jsonl")] == [(0, 20.0), (1, 21.0), (2, None)]
 
 
 def test_a_score_that_never_comes_holds_nothing_up(tmp_path):

@@ -103,9 +103,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(scale):
         assert logits.grad[row, column].item() == pytest.approx(slope, abs=2e-5)
 
 
-@pytest.mark.parametrize(
-    "logits", [[0.4, -1.0, -0.3, 0.9], [-6.0, -5.0, -7.0, -5.5], [-700.0, -701.0, -699.0, -702.0]]
-)
+@pytest.mark.parametrize("logits", [[0.4, -1.0, -0.3, 0.9], [-6.0, -5.0, -7.0, -5.5], [-700.0, -701.0, -699.0, -702.0]])
 def test_sets_are_drawn_as_often_as_their_probability_says(logits):
     logits = np.array(logits)
     count = 20_000

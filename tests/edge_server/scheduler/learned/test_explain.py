@@ -124,6 +124,4 @@ def test_a_policy_that_looks_at_no_pictures_says_so():
     learner = Learner(Spec("select", FreshOnes.layout), 0)
     s = state(3, np.random.default_rng(0))
     with pytest.raises(ValueError, match="no pictures"):
-        occlusion_map(
-            learner.actor, s, learner.actor.act([s])[0][0], 0, np.zeros((8, 8, 3), np.uint8), brightness
-        )
+        occlusion_map(learner.actor, s, learner.actor.act([s])[0][0], 0, np.zeros((8, 8, 3), np.uint8), brightness)

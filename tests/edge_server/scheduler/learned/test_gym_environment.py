@@ -115,9 +115,16 @@ def test_stable_baselines_and_our_learner_reach_the_same_optimum(problem, spec):
     decisions alike, our learner must not be worse by more than the noise of the test."""
     sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra gym")
     oracle = sb3.PPO(
-        "MlpPolicy", BanditEnvironment(problem, spec, 6), n_steps=256, batch_size=64, gamma=0.0,
-        gae_lambda=1.0, learning_rate=1e-3, seed=0, device="cpu",
-    )  # fmt: skip
+        "MlpPolicy",
+        BanditEnvironment(problem, spec, 6),
+        n_steps=256,
+        batch_size=64,
+        gamma=0.0,
+        gae_lambda=1.0,
+        learning_rate=1e-3,
+        seed=0,
+        device="cpu",
+    )
     oracle.learn(10_240)
     drawn = [problem.draw(10**6 + i) for i in range(300)]
     theirs = []

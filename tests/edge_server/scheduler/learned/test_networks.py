@@ -33,9 +33,7 @@ def test_one_set_of_weights_takes_any_number_of_cameras(spec, n):
     found = networks.logits(np, spec, actor(spec), features(n))
     assert found.shape == ((5, n) if spec.action == "select" else (5, len(OMEGAS_MS)))
     assert np.isfinite(found).all()
-    assert networks.value(
-        np, spec, networks.init_value(spec, np.random.default_rng(0)), features(n)
-    ).shape == (5,)
+    assert networks.value(np, spec, networks.init_value(spec, np.random.default_rng(0)), features(n)).shape == (5,)
 
 
 def test_cameras_have_no_order():
@@ -45,18 +43,14 @@ def test_cameras_have_no_order():
         networks.logits(np, SELECT, actor(SELECT), x[:, order]), each[:, order], rtol=1e-9, atol=1e-12
     )
     whole = networks.logits(np, WAIT, actor(WAIT), x)
-    np.testing.assert_allclose(
-        networks.logits(np, WAIT, actor(WAIT), x[:, order]), whole, rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(networks.logits(np, WAIT, actor(WAIT), x[:, order]), whole, rtol=1e-9, atol=1e-12)
 
 
 def test_what_never_reported_changes_nothing_for_the_others():
     x = features(6, silent=2)
     for spec, keep in ((SELECT, np.s_[:, :4]), (WAIT, np.s_[:])):
         all_rows = networks.logits(np, spec, actor(spec), x)[keep]
-        np.testing.assert_allclose(
-            all_rows, networks.logits(np, spec, actor(spec), x[:, :4])[keep], rtol=1e-9
-        )
+        np.testing.assert_allclose(all_rows, networks.logits(np, spec, actor(spec), x[:, :4])[keep], rtol=1e-9)
 
 
 def test_each_camera_sees_what_the_others_are_like():

@@ -16,15 +16,7 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from tests.edge_server.scheduler.learned.problems import (
-    OMEGAS_MS,
-    FreshOnes,
-    Waits,
-    collect,
-    regret,
-    state,
-    teach,
-)
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, collect, regret, state, teach
 
 
 def same(a: Learner, b: Learner) -> bool:
@@ -185,8 +177,7 @@ def damaged(path, what):
 
 
 @pytest.mark.parametrize(
-    "what",
-    ["cut", "text", "empty", "array", "field", "pickle", "nan", "shape", "words", "lacks", "spec", "key"],
+    "what", ["cut", "text", "empty", "array", "field", "pickle", "nan", "shape", "words", "lacks", "spec", "key"]
 )
 def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, what):
     path = damaged(save(Learner(select(), 0), tmp_path / "policy.npz"), what)
@@ -215,9 +206,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("change", [*LARGE.values(), *WRONG.values()], ids=[*LARGE, *WRONG])
-def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(
-    tmp_path, monkeypatch, change
-):
+def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(tmp_path, monkeypatch, change):
     path = save(Learner(select(), 0), tmp_path / "policy.npz")
     arrays, about = checkpoint.load(path, kind="scheduler")
     layout = {**about["spec"]["layout"], **change.get("layout", {})}
@@ -249,15 +238,22 @@ def _filled(name, value):
 @pytest.mark.parametrize(
     "change",
     [
-        _cut("adam.0.exp_avg"), _cut("adam.3.exp_avg_sq"), _cut("usual"), _cut("value.mid"),
-        _filled("adam.0.step", np.nan), _filled("adam.0.exp_avg_sq", -1.0),
+        _cut("adam.0.exp_avg"),
+        _cut("adam.3.exp_avg_sq"),
+        _cut("usual"),
+        _cut("value.mid"),
+        _filled("adam.0.step", np.nan),
+        _filled("adam.0.exp_avg_sq", -1.0),
         _fact("rewards", {"count": 5, "mean": float("nan"), "variance": 1.0}),
         _fact("rewards", {"count": 5, "mean": 0.0, "variance": -1.0}),
         _fact("rewards", {"count": -5, "mean": 0.0, "variance": 1.0}),
         _fact("rewards", [1, 2, 3]),
-        _fact("seed", "zz"), _fact("seed", -3), _fact("updates", float("inf")), _fact("streams", {}),
+        _fact("seed", "zz"),
+        _fact("seed", -3),
+        _fact("updates", float("inf")),
+        _fact("streams", {}),
     ],
-)  # fmt: skip
+)
 def test_what_a_learner_cannot_have_saved_is_refused(tmp_path, change):
     learner = Learner(select(), 0)
     teach(learner, FreshOnes(), 1)
@@ -296,9 +292,7 @@ def test_diagnostics_say_what_an_update_did():
     assert diagnostics.entropy == pytest.approx(6 * np.log(2), rel=0.1)
 
 
-@pytest.mark.parametrize(
-    "spec", [select(start=0.9), Spec("wait", Waits().layout, OMEGAS_MS)], ids=lambda s: s.action
-)
+@pytest.mark.parametrize("spec", [select(start=0.9), Spec("wait", Waits().layout, OMEGAS_MS)], ids=lambda s: s.action)
 def test_the_entropy_bonus_raises_the_entropy(spec):
     """Of equal rewards only the entropy's gradient is left in the policy: its sign decides where it moves."""
     learner = Learner(replace(spec, entropy=0.1), 0)

@@ -90,9 +90,7 @@ def test_a_view_costs_its_price_in_a_simulated_update_and_in_a_live_one():
     priced = make_reward("set", views=-0.01)
     assert priced.of(outcome()).terms["views"] == pytest.approx(-0.03)
     assert priced.of(outcome()).total == pytest.approx(make_reward("set").of(outcome()).total - 0.03)
-    live = Publication(
-        0, 1.0, 10**9, None, ("a", "b"), (1.0, 2.0), 1.5, 100.0, psnr_db=20.0, ssim=0.5, lpips=0.1
-    )
+    live = Publication(0, 1.0, 10**9, None, ("a", "b"), (1.0, 2.0), 1.5, 100.0, psnr_db=20.0, ssim=0.5, lpips=0.1)
     assert priced.of(live).terms["views"] == pytest.approx(-0.02)
     assert priced.of(score()).missing == ("views",)  # a score alone does not know
 

@@ -130,9 +130,7 @@ def test_one_update_moves_it_by_at_most_target_kl(seed: int):
 def test_it_is_compared_with_the_exploring_policy_that_acted(action: str, cameras: int):
     """In the first pass nothing has been learned yet, so that even a nearly sure policy has not moved."""
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, start=0.99, passes=1)
-    policy = OnlinePolicy(
-        Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), OnlineSettings(warmup=0)
-    )
+    policy = OnlinePolicy(Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), OnlineSettings(warmup=0))
     for number in range(60):
         seen = state(cameras, rng(number))
         now_ns = 10**12 + number * 100 * MS
@@ -162,8 +160,10 @@ def test_the_offset_of_live_rewards_does_not_matter():
         use(policy, lambda omega, zero=zero: zero + 0.3 * (omega == 320.0), 200)
         assert policy.updates >= 4
         learned.append(policy._bandit.actor)
-    share = [np.bincount(a.act([state(5, rng(k)) for k in range(400)], rng(9))[0], minlength=3)[2] / 400
-             for a in (trained().actor, *learned)]  # fmt: skip
+    share = [
+        np.bincount(a.act([state(5, rng(k)) for k in range(400)], rng(9))[0], minlength=3)[2] / 400
+        for a in (trained().actor, *learned)
+    ]
     assert share[1] > 1.5 * share[0] and share[2] == share[3] == share[1]
     for other in learned[1:]:
         assert all(np.allclose(w, other.weights[n], atol=1e-6) for n, w in learned[0].weights.items())
@@ -226,8 +226,10 @@ def test_few_decisions_are_not_compared():
 def test_mean_kl_agrees_with_torch_and_is_finite_at_the_edges(action):
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, hidden=8)
     a, b = (Learner(spec, s).actor for s in (1, 2))
-    a, b = (Actor(spec, {n: w + 0.5 * rng(9).standard_normal(w.shape) * k for n, w in x.weights.items()})
-            for k, x in ((1, a), (-1, b)))  # fmt: skip
+    a, b = (
+        Actor(spec, {n: w + 0.5 * rng(9).standard_normal(w.shape) * k for n, w in x.weights.items()})
+        for k, x in ((1, a), (-1, b))
+    )
     features = spec.layout.batch([state(5, rng(k), silent=k % 2) for k in range(7)])
     p, q = (torch.tensor(x.logits(features)) for x in (a, b))
     if action == "select":
@@ -310,6 +312,4 @@ def test_exploration_is_part_of_every_action_and_of_its_probability(action):
         return
     assert np.allclose(np.bincount(draws, minlength=3) / 600, [1 - 0.4 / 3, 0.2 / 3, 0.2 / 3], atol=0.04)
     probabilities = {int(a): float(p) for k in range(60) for a, p in [np.ravel(chance.act([seen], rng(k)))]}
-    assert np.exp(probabilities[0]) == pytest.approx(1 - 0.4 / 3) and np.exp(
-        probabilities[1]
-    ) == pytest.approx(0.2 / 3)
+    assert np.exp(probabilities[0]) == pytest.approx(1 - 0.4 / 3) and np.exp(probabilities[1]) == pytest.approx(0.2 / 3)

@@ -13,9 +13,7 @@ Rewards = Callable[[bool, float], float]
 """Who decided, and the noise of the moment -> what came of it."""
 
 
-def decisions(
-    test: SequentialTest, rewards: Rewards, count: int, seed: int = 0, rho: float = 0.0
-) -> int | None:
+def decisions(test: SequentialTest, rewards: Rewards, count: int, seed: int = 0, rho: float = 0.0) -> int | None:
     """Decisions until detection; None: not detected. rho: autocorrelation of the noise."""
     rng = np.random.default_rng([5, seed])
     noise = 0.0
@@ -58,9 +56,7 @@ def test_a_difference_is_found_the_sooner_the_larger_it_is(gap: float, most: int
     for seed in range(5):
         found = decisions(SequentialTest(better, 20_000.0), lambda a, x: x + gap * a, 2000, seed, 0.5)
         assert found is not None and found < most
-        assert (
-            decisions(SequentialTest(not better, 20_000.0), lambda a, x: x + gap * a, 500, seed, 0.5) is None
-        )
+        assert decisions(SequentialTest(not better, 20_000.0), lambda a, x: x + gap * a, 500, seed, 0.5) is None
 
 
 def test_a_long_good_past_does_not_delay_detection():

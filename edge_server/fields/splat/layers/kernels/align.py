@@ -67,10 +67,17 @@ _I64 = ir.IntType(64)
 
 
 def align_view(
-    raster: Any, camera: NDArray[np.float32], places: NDArray[np.float32], image: NDArray[np.uint8],
-    plate: NDArray[np.float32], weight: NDArray[np.float32], anchor: NDArray[np.int64],
-    share: NDArray[np.float32], anchors: int, slot: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    raster: Any,
+    camera: NDArray[np.float32],
+    places: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    plate: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    anchor: NDArray[np.int64],
+    share: NDArray[np.float32],
+    anchors: int,
+    slot: int = 0,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Normal matrix (3K, 3K) and right side (3K,) of one view, see ``motion.ViewRow``; what is shown, float32
     (H, W, 3), and the Gaussians' opacity, float32 (H, W). Tiles of weight 0 show the plate alone.
 
@@ -83,15 +90,43 @@ def align_view(
     matrix, vector = np.empty((3 * anchors, 3 * anchors)), np.empty(3 * anchors)
     shown, opacity = np.empty(image.shape, np.float32), np.empty(image.shape[:2], np.float32)
     raster.pool.run(
-        add_view, image, plate, weight, slot, int(raster.columns[slot]), camera[None], places,
-        raster.projected, raster.lists, anchor, share, matrix, vector, shown, opacity,
-    )  # fmt: skip
+        add_view,
+        image,
+        plate,
+        weight,
+        slot,
+        int(raster.columns[slot]),
+        camera[None],
+        places,
+        raster.projected,
+        raster.lists,
+        anchor,
+        share,
+        matrix,
+        vector,
+        shown,
+        opacity,
+    )
     return matrix, vector, shown, opacity
 
 
 @intrinsic
-def _spread(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any, behind: Any,
-            first: Any, saved: Any, scale: Any, anchor: Any, share: Any, slopes: Any) -> Any:  # fmt: skip
+def _spread(
+    typingctx: Any,
+    pairs: Any,
+    count: Any,
+    owner: Any,
+    projected: Any,
+    x0: Any,
+    y0: Any,
+    behind: Any,
+    first: Any,
+    saved: Any,
+    scale: Any,
+    anchor: Any,
+    share: Any,
+    slopes: Any,
+) -> Any:
     """Add a strip's slopes of color to its anchors' columns, back to front; see ``composite`` for arguments
     not here.
 
@@ -151,9 +186,7 @@ def _multiply(typingctx: Any, slopes: Any, a0: Any, a1: Any, b0: Any, b1: Any, o
     require_contiguous(slopes, out)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data, out_data = (
-            context.make_array(signature.args[n])(context, builder, args[n]).data for n in (0, 5)
-        )
+        data, out_data = (context.make_array(signature.args[n])(context, builder, args[n]).data for n in (0, 5))
         bases = [builder.gep(data, [builder.mul(n, _I64(_ANCHOR))]) for n in args[1:5]]
         left, right = (
             [builder.gep(base, [_I64(k * _COLUMN)]) for base in pair for k in range(2)]
@@ -210,9 +243,7 @@ def _lift(flat, flat_vector, across, matrix, vector):
     """From U and V, flat (2, 2, K + 1, K + 1) of which anchors a <= b are filled, to three axes."""
     for a in range(across.shape[0]):
         for d in range(3):
-            vector[3 * a + d] = _PRECISION * (
-                across[a, 0, d] * flat_vector[a, 0] + across[a, 1, d] * flat_vector[a, 1]
-            )
+            vector[3 * a + d] = _PRECISION * (across[a, 0, d] * flat_vector[a, 0] + across[a, 1, d] * flat_vector[a, 1])
         for b in range(a, across.shape[0]):
             for d in range(3):
                 u = across[a, 0, d] * flat[0, 0, a, b] + across[a, 1, d] * flat[1, 0, a, b]
@@ -260,8 +291,25 @@ def _heaviest(image, plate, weight, x0, y0, behind):
 
 
 @kernel
-def add_view(counter, worker, image, plate, weight, slot, columns, cams, places, projected, lists, anchor,
-             share, matrix, vector, shown, opacity):  # fmt: skip
+def add_view(
+    counter,
+    worker,
+    image,
+    plate,
+    weight,
+    slot,
+    columns,
+    cams,
+    places,
+    projected,
+    lists,
+    anchor,
+    share,
+    matrix,
+    vector,
+    shown,
+    opacity,
+):
     """See ``align_view``; one task, so that sums do not depend on the number of threads."""
     if draw(counter, worker, 1) >= 1:
         return
@@ -291,9 +339,17 @@ def add_view(counter, worker, image, plate, weight, slot, columns, cams, places,
         bin_strips(lists, slot, begin, end, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             composited[n] = composite(
-                strip_pairs[n], count[n], lists.owner[slot], projected[slot], np.float32(x0),
-                np.float32(y0 + 2 * n), s, _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
-            )  # fmt: skip
+                strip_pairs[n],
+                count[n],
+                lists.owner[slot],
+                projected[slot],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                _T + n * STRIP,
+                store[n * size : (n + 1) * size],
+                SAVED,
+            )
         _compare(s, image, weight, x0, y0, behind, rest, shown, opacity)
         many = 0
         for j in range(begin, end):
@@ -308,10 +364,20 @@ def add_view(counter, worker, image, plate, weight, slot, columns, cams, places,
         touched[many] = anchors
         for n in range(STRIPS):
             _spread(
-                strip_pairs[n], composited[n], lists.owner[slot], projected[slot], np.float32(x0),
-                np.float32(y0 + 2 * n), behind, n * STRIP, store[n * size : (n + 1) * size], scale, anchor,
-                share, slopes,
-            )  # fmt: skip
+                strip_pairs[n],
+                composited[n],
+                lists.owner[slot],
+                projected[slot],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                behind,
+                n * STRIP,
+                store[n * size : (n + 1) * size],
+                scale,
+                anchor,
+                share,
+                slopes,
+            )
         for u in range(many):
             for d in range(2):
                 total, at = _F0, (2 * touched[u] + d) * _COLUMN

@@ -56,15 +56,12 @@ class PlateArrays(NamedTuple):
 @part
 def _difference(a, b, k, y, x):
     """Largest difference of a channel between a[y, x] and b[k, y, x]."""
-    d0, d1, d2 = abs(a[y, x, 0] - b[k, y, x, 0]), abs(a[y, x, 1] - b[k, y, x, 1]), (
-        abs(a[y, x, 2] - b[k, y, x, 2]))  # fmt: skip
+    d0, d1, d2 = abs(a[y, x, 0] - b[k, y, x, 0]), abs(a[y, x, 1] - b[k, y, x, 1]), (abs(a[y, x, 2] - b[k, y, x, 2]))
     return max(d0, max(d1, d2))
 
 
 @kernel
-def compare_with_plate(
-    counter, worker, blurred, plate, earlier, earlier_count, static, has_static, difference, flags
-):
+def compare_with_plate(counter, worker, blurred, plate, earlier, earlier_count, static, has_static, difference, flags):
     """Compare a blurred frame with the plate and with earlier frames. Tasks are runs of rows.
 
     blurred: float32 (H, W, 3). plate: ``PlateArrays``.
@@ -93,9 +90,7 @@ def compare_with_plate(
                 like = has_static & (off <= least)
                 difference[y, x] = d
                 flags[y, x] = (
-                    np.uint8(foreground) * FOREGROUND
-                    + np.uint8(changing) * CHANGING
-                    + np.uint8(like) * LIKE_STATIC
+                    np.uint8(foreground) * FOREGROUND + np.uint8(changing) * CHANGING + np.uint8(like) * LIKE_STATIC
                 )
 
 
@@ -159,9 +154,7 @@ def _is_known(weight, total):
 
 
 @kernel
-def vote(
-    counter, worker, image, blurred, difference, foreground, votes, held, plate, static, has_static, picture
-):
+def vote(counter, worker, image, blurred, difference, foreground, votes, held, plate, static, has_static, picture):
     """Update the plate by a frame. Tasks are runs of rows.
 
     image: uint8 (H, W, 3). blurred, difference: as in ``compare_with_plate``.

@@ -200,9 +200,7 @@ def _dot(a, b):
 
 
 @kernel
-def solve_knots(
-    counter, worker, band, right, knots, fixed, differences, steady, alike, laplacian, iterations
-):
+def solve_knots(counter, worker, band, right, knots, fixed, differences, steady, alike, laplacian, iterations):
     """Improve the knots after the first ``fixed`` until they solve the least squares.
 
     band: float32 (T, BAND, n, n), blocks (k, k + q) of the views' normal matrix. right: float64 (T, n).
@@ -218,9 +216,12 @@ def solve_knots(
     _multiply_band(band, knots, y, 0)
     _multiply_prior(knots, y, differences, steady, alike, laplacian)
     r, z, p, step, product = (
-        np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32), np.zeros(shape, np.float32),
-    )  # fmt: skip
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+    )
     for k in range(fixed, shape[0]):
         for i in range(n):
             r[k, i] = right[k, i] - y[k, i]

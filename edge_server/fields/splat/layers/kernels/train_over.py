@@ -25,9 +25,7 @@ _BYTE = np.float32(1.0 / 255.0)
 
 
 @kernel
-def train_over(
-    counter, worker, image, plate, weight, tasks, columns, projected, lists, memory, saved, sums, losses
-):
+def train_over(counter, worker, image, plate, weight, tasks, columns, projected, lists, memory, saved, sums, losses):
     """Render tiles of camera slot 0 over the plate, compare them with the image, and backpropagate to the
     pairs. The loss is the sum over pixels of weight times the squared color error.
 
@@ -63,9 +61,17 @@ def train_over(
         bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             composited[n] = composite(
-                strip_pairs[n], count[n], lists.owner[0], projected[0], np.float32(x0),
-                np.float32(y0 + 2 * n), s, _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
-            )  # fmt: skip
+                strip_pairs[n],
+                count[n],
+                lists.owner[0],
+                projected[0],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                _T + n * STRIP,
+                store[n * size : (n + 1) * size],
+                SAVED,
+            )
         total = _F0
         for k in range(PIXELS):
             s[_BEHIND + k] = _F0
@@ -85,6 +91,14 @@ def train_over(
         losses[task] = total
         for n in range(STRIPS):
             composite_backward(
-                strip_pairs[n], composited[n], lists.owner[0], projected[0], np.float32(x0),
-                np.float32(y0 + 2 * n), s, _ER + n * STRIP, store[n * size : (n + 1) * size], sums[0],
-            )  # fmt: skip
+                strip_pairs[n],
+                composited[n],
+                lists.owner[0],
+                projected[0],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                _ER + n * STRIP,
+                store[n * size : (n + 1) * size],
+                sums[0],
+            )

@@ -27,10 +27,7 @@ def count_foreground(counter, worker, cams, points, mask, seen, marked):
             return
         for i in range(base, min(base + _POINTS, points.shape[0])):
             x, y, z = rotate_to_camera(
-                cam,
-                points[i, 0] - cam[ORIGIN],
-                points[i, 1] - cam[ORIGIN + 1],
-                points[i, 2] - cam[ORIGIN + 2],
+                cam, points[i, 0] - cam[ORIGIN], points[i, 1] - cam[ORIGIN + 1], points[i, 2] - cam[ORIGIN + 2]
             )
             if not z > cam[NEAR]:
                 continue

@@ -70,8 +70,13 @@ class Replay:
 
 
 def scenario(folder, camera=None):
-    arm = {"host": "127.0.0.9", "simulated": True, "base_m": [0.4, -0.3, 0.1], "base_yaw_deg": 30.0,
-           "cameras": {"eye": camera}}  # fmt: skip
+    arm = {
+        "host": "127.0.0.9",
+        "simulated": True,
+        "base_m": [0.4, -0.3, 0.1],
+        "base_yaw_deg": 30.0,
+        "cameras": {"eye": camera},
+    }
     source = {"kind": "world", "scene": "tile", "codec": "png", "fps": 500, "arm": arm}
     file = folder / "bench.yaml"
     file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
@@ -126,9 +131,7 @@ def test_the_cameras_own_stamps_are_kept_with_what_was_seen():
     stamps = [10**18 + 70_000_001 * k for k in range(6)]
     hands, tracks = hands_of(EYE_IN_HAND)[:6], StreamRecorder()
     session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True)
-    step = live.guide(
-        Replay(hands, stamps), "png", None, session, lambda tick: True, lambda *_: None, tracks=tracks
-    )
+    step = live.guide(Replay(hands, stamps), "png", None, session, lambda tick: True, lambda *_: None, tracks=tracks)
     seen = tracks.target()
     assert seen.times_ns.tolist() == stamps
     expected = simulate.observed_targets(hands)
@@ -145,8 +148,10 @@ def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
             add(int(t_ns) + epoch_ns, pose)
     assert MIN_SECONDS < tracks.seen_s < MIN_SECONDS + 3.1
     tracks.write(tmp_path)
-    for a, b in ((tracks.hand(), tracks.target()),
-                 (read_track(tmp_path / HAND_FILE), read_track(tmp_path / TARGET_FILE))):  # fmt: skip
+    for a, b in (
+        (tracks.hand(), tracks.target()),
+        (read_track(tmp_path / HAND_FILE), read_track(tmp_path / TARGET_FILE)),
+    ):
         found = calibrate_tracks(a, b, EYE_IN_HAND)
         assert found.time_offset_s == pytest.approx(0.0371, abs=5e-4)
         assert distance_mm(found.transform, X) < 1.0
@@ -317,8 +322,20 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
         try:
             # Real clocks on a machine that may be held up for a moment: of two recordings, one is not.
             for tracks in ("first", "second"):
-                arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--moving", "--json",
-                             "--tracks", str(tmp_path / tracks), "--seconds", "60"]  # fmt: skip
+                arguments = [
+                    "--live",
+                    str(file),
+                    "--camera",
+                    "eye",
+                    "--board",
+                    BOARD,
+                    "--moving",
+                    "--json",
+                    "--tracks",
+                    str(tmp_path / tracks),
+                    "--seconds",
+                    "60",
+                ]
                 assert main(["calibrate", "hand-eye", *arguments]) == 0
                 found = json.loads(capsys.readouterr().out)
                 if distance_mm(np.array(found["transform"]), X) < 2.0:

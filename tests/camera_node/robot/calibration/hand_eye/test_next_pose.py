@@ -40,9 +40,7 @@ def test_the_target_is_seen_and_the_bound_falls(seed, setup):
 
 
 def test_eight_planned_poses_are_worth_fifteen_of_chance():
-    planned = [
-        cramer_rao_bound(_proposed_hands(8, np.random.default_rng(k))[0], X, Y, NOISE) for k in range(8)
-    ]
+    planned = [cramer_rao_bound(_proposed_hands(8, np.random.default_rng(k))[0], X, Y, NOISE) for k in range(8)]
     chance = [cramer_rao_bound(known(15, k), X, Y, NOISE) for k in range(8)]
     assert np.mean(planned, axis=0)[1] < 1.05 * np.mean(chance, axis=0)[1]
 

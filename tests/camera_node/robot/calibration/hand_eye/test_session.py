@@ -111,9 +111,14 @@ def test_it_moves_a_hand_by_itself_from_one_look_at_the_target(reach_m):
     session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, want_mm=0.4)
     outcomes = []
     last = guide(
-        cell, "png", None, session, lambda tick: tick < 100,
-        lambda image, step, session: outcomes.append(step.outcome), move=cell.move,
-    )  # fmt: skip
+        cell,
+        "png",
+        None,
+        session,
+        lambda tick: tick < 100,
+        lambda image, step, session: outcomes.append(step.outcome),
+        move=cell.move,
+    )
     assert last.enough and last.std_mm <= 0.4 and last.count <= 16
     assert (cell.refused > 0) == (reach_m < simulated.REACH_M)
     assert outcomes.count("kept") == last.count and "hand moving" in outcomes
@@ -152,8 +157,20 @@ def test_hand_poses_from_a_file_by_time(scenario, tmp_path, capsys):
     _, hands = taken()
     known = np.delete(np.arange(len(hands)), 4)
     write_poses(tmp_path / "hand.csv", known * 2_000_000, hands[known])
-    arguments = ["--live", str(scenario), "--camera", "eye", "--board", BOARD, "--moving", "--json",
-                 "--hand", str(tmp_path / "hand.csv"), "--max-gap-ms", "1"]  # fmt: skip
+    arguments = [
+        "--live",
+        str(scenario),
+        "--camera",
+        "eye",
+        "--board",
+        BOARD,
+        "--moving",
+        "--json",
+        "--hand",
+        str(tmp_path / "hand.csv"),
+        "--max-gap-ms",
+        "1",
+    ]
     assert main(["calibrate", "hand-eye", *arguments]) == 0
     said = capsys.readouterr()
     assert "nearest pose is 2.0 ms away" in said.err
@@ -161,6 +178,22 @@ def test_hand_poses_from_a_file_by_time(scenario, tmp_path, capsys):
 
 
 def test_time_that_runs_out_ends_with_what_there_is(scenario, capsys):
-    assert main(["calibrate", "hand-eye", "--live", str(scenario), "--board", BOARD, "--camera", "eye",
-                 "--moving", "--seconds", "0.003"]) == 2  # fmt: skip
+    assert (
+        main(
+            [
+                "calibrate",
+                "hand-eye",
+                "--live",
+                str(scenario),
+                "--board",
+                BOARD,
+                "--camera",
+                "eye",
+                "--moving",
+                "--seconds",
+                "0.003",
+            ]
+        )
+        == 2
+    )
     assert "too few poses: 2" in capsys.readouterr().err

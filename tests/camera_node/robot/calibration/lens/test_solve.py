@@ -83,15 +83,17 @@ def test_from_pictures_to_a_file_that_the_node_reads(tmp_path, capsys):
         cv2.imwrite(str(tmp_path / f"view-{k}.png"), picture)
     cv2.imwrite(str(tmp_path / "view-99.png"), np.zeros_like(taken[0]))
     out = tmp_path / "lens.json"
-    assert main(["calibrate", "intrinsics", str(tmp_path), "--board", pictures.BOARD, "--camera", "eye",
-                 "--out", str(out)]) == 0  # fmt: skip
+    assert (
+        main(
+            ["calibrate", "intrinsics", str(tmp_path), "--board", pictures.BOARD, "--camera", "eye", "--out", str(out)]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "12 pictures of 320 x 240" in said and "view-99.png: charuco" in said
     lens = load_calibration(out)["eye"].intrinsics
     assert read_lens(out) == lens
-    assert (
-        abs(lens.fx / pictures.LENS.fx - 1) < 0.005 and abs(lens.cx - 160) < 1.5 and abs(lens.cy - 120) < 1.5
-    )
+    assert abs(lens.fx / pictures.LENS.fx - 1) < 0.005 and abs(lens.cx - 160) < 1.5 and abs(lens.cy - 120) < 1.5
     assert np.abs(lens.distortion[:2]).max() < 0.1
     assert json.loads(out.read_text())["eye"]["error_px"] < 0.15
 

@@ -196,9 +196,7 @@ def test_a_flush_holds_if_and_only_if_it_serves_better_learnt_and_fixed(gap, sai
     flushed = {**kept, **{name: level + gap for name, level in kept.items()}}
     for name in list(state_ablation.LEFT_OUT)[1:]:
         flushed |= runs(state_ablation.learnt("wait", name), 2.0)
-    verdicts = state_ablation.judge_flushed(
-        evaluation_of(flushed), evaluation_of(kept), list(state_ablation.LEFT_OUT)
-    )
+    verdicts = state_ablation.judge_flushed(evaluation_of(flushed), evaluation_of(kept), list(state_ablation.LEFT_OUT))
     assert len(verdicts) == 7 + 2 and answers(verdicts, "a flush before") == {said}
     assert answers(verdicts, "better by Z, age, pose than") == {HOLDS}
 
@@ -273,7 +271,7 @@ def drifting(still: float, there: float, count: int = 3) -> list[list[dict[str, 
         return {
             name: [*(1.0 + 0.01 * rng.normal(size=before)), *(level + 0.01 * rng.normal(size=after))]
             for name, level in late.items()
-        }  # fmt: skip
+        }
 
     return [[run() for _ in range(count)] for _ in range(3)]
 
@@ -341,13 +339,13 @@ def test_verdicts_follow_from_the_paired_differences():
     base = {s: 1.0 + 0.1 * s for s in range(8)}
     up, down = ({s: v + d + 0.001 * (s % 3) for s, v in base.items()} for d in (0.2, -0.2))
     same = {s: v + 0.001 * (-1) ** s for s, v in base.items()}
-    assert [better("a", "b", x, base).verdict for x in (up, down, same)] == [
-        "holds", "does not hold", "undecided"
-    ]  # fmt: skip
+    assert [better("a", "b", x, base).verdict for x in (up, down, same)] == ["holds", "does not hold", "undecided"]
     evaluation = evaluation_of({"random": 0.5, "all": 1.5})
     assert [no_worse("a", "b", x, base, evaluation).verdict for x in (up, down, same)] == [
-        "holds", "does not hold", "holds"
-    ]  # fmt: skip
+        "holds",
+        "does not hold",
+        "holds",
+    ]
     assert "-20 % of the way from random to hindsight" in no_worse("a", "b", down, base, evaluation).found
     # A hundredth of next to nothing is no limit.
     near_zero = {s: 0.01 * (-1) ** s for s in base}

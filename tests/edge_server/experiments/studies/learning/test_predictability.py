@@ -30,9 +30,7 @@ def evaluation(informative: bool) -> tuple[Evaluation, list[DecisionPoint]]:
         for number in range(4):
             young = (seed + number) % 2 == 0
             now = young if informative else bool(rng.random() < 0.5)
-            moments.append(
-                moment(seed, number, (rng.uniform(0.5, 1.0, 3) * (30.0 if young else 300.0)).tolist())
-            )
+            moments.append(moment(seed, number, (rng.uniform(0.5, 1.0, 3) * (30.0 if young else 300.0)).tolist()))
             for name, better in (("wait:0", now), ("wait:60", not now)):
                 psnr = 20.0 + better + 0.01 * rng.normal()
                 found.outcomes[name][seed, number] = Outcome(psnr, None, None, None, None, 0.0, 3.0, 0.0)

@@ -8,22 +8,18 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.studies.learning.visibility import (
-    SEES,
-    SeesMotion,
-    VisibleMotion,
-    area,
-    embedding_areas,
-)
+from edge_server.experiments.studies.learning.visibility import SEES, SeesMotion, VisibleMotion, area, embedding_areas
 from edge_server.experiments.studies.learning.workshop import workshop
 from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.state import State
 
 SIDES = {
-    "south": {"cam04", "cam05", "cam12", "cam13", "cam17"}, "east": {"cam02", "cam04", "cam09"},
-    "north": {"cam01", "cam09", "cam10", "cam18"}, "west": {"cam03", "cam05", "cam10"},
-}  # fmt: skip
+    "south": {"cam04", "cam05", "cam12", "cam13", "cam17"},
+    "east": {"cam02", "cam04", "cam09"},
+    "north": {"cam01", "cam09", "cam10", "cam18"},
+    "west": {"cam03", "cam05", "cam10"},
+}
 
 
 def test_the_area_is_the_share_of_pairs_in_the_right_order():

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.experiments.training.detector.average_precision import (
-    average_precision,
-    box_iou,
-    detections,
-    measure,
-)
+from edge_server.experiments.training.detector.average_precision import average_precision, box_iou, detections, measure
 from edge_server.experiments.training.detector.dataset import LabeledImages
 from edge_server.experiments.training.detector.scenes import KINDS
 
@@ -29,9 +24,7 @@ def true(*rows):
 
 def test_overlap():
     shifted = [5.0, 0.0, 15.0, 10.0]
-    assert box_iou(true(A, B), true(A, shifted, FAR)) == pytest.approx(
-        [[1, 1 / 3, 0], [0, 0, 0]] * np.ones((2, 3))
-    )
+    assert box_iou(true(A, B), true(A, shifted, FAR)) == pytest.approx([[1, 1 / 3, 0], [0, 0, 0]] * np.ones((2, 3)))
     assert np.isfinite(box_iou(np.zeros((1, 4)), np.zeros((1, 4)))).all(), "boxes without area"
 
 

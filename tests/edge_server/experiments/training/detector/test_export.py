@@ -59,9 +59,7 @@ def test_masks_go_through_the_file_into_what_a_deployment_runs(tmp_path):
         centre = torch.tensor([best.box[0] + best.box[2], best.box[1] + best.box[3]]) / 2
         cell = (table[0, :4].T - torch.cat([centre, size])).abs().sum(1).argmin()
         logits = torch.einsum("m,mhw->hw", table[0, 5:, cell], maps[0])
-        true = (
-            torch.nn.functional.interpolate(logits[None, None], (64, 64), mode="bilinear")[0, 0].numpy() > 0
-        )
+        true = torch.nn.functional.interpolate(logits[None, None], (64, 64), mode="bilinear")[0, 0].numpy() > 0
         assert (best.mask() == true).mean() > least
 
 
@@ -98,7 +96,5 @@ def test_the_learnt_projection_gives_unit_variance_without_mean(exported):
 
 def test_fewer_numbers_are_the_first_of_more(exported):
     _, fp32, _ = exported
-    few, many = (
-        make_embedder(EmbeddingConfig(str(fp32), d, provider="cpu")).embed(list(IMAGES[:3])) for d in (4, 12)
-    )
+    few, many = (make_embedder(EmbeddingConfig(str(fp32), d, provider="cpu")).embed(list(IMAGES[:3])) for d in (4, 12))
     assert many[:, :4] == pytest.approx(few, abs=1e-4)

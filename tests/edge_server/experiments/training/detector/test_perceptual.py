@@ -10,14 +10,7 @@ from edge_server.cli import main as edge_server
 from edge_server.experiments.training.detector import renderings, scenes
 from edge_server.experiments.training.detector.dataset import INSTANTS, scenes_of
 from edge_server.experiments.training.detector.distortions import DISTORTIONS, distorted
-from edge_server.experiments.training.detector.perceptual import (
-    TRIES,
-    Compared,
-    correlation,
-    fit,
-    left_out,
-    pairs_of,
-)
+from edge_server.experiments.training.detector.perceptual import TRIES, Compared, correlation, fit, left_out, pairs_of
 from tests.conftest import data_dir
 
 RNG = np.random.default_rng(6)

@@ -13,14 +13,7 @@ from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from camera_node.synthetic.textures import Plain
 from edge_server.experiments.training.detector.dataset import LabeledImages, render
-from edge_server.experiments.training.detector.scenes import (
-    KINDS,
-    Shot,
-    boxes_of,
-    kind_of,
-    own_rig,
-    variation,
-)
+from edge_server.experiments.training.detector.scenes import KINDS, Shot, boxes_of, kind_of, own_rig, variation
 from freshfield.geometry import Pinhole, look_at
 
 BALL, DRUM = KINDS.index("ball"), KINDS.index("drum")

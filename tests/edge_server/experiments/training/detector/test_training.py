@@ -10,22 +10,10 @@ import torch
 
 from edge_server.experiments.training.detector.average_precision import box_iou
 from edge_server.experiments.training.detector.dataset import LabeledImages
-from edge_server.experiments.training.detector.loss import (
-    assign,
-    assign_batch,
-    detection_loss,
-    mask_loss,
-    overlaps,
-)
+from edge_server.experiments.training.detector.loss import assign, assign_batch, detection_loss, mask_loss, overlaps
 from edge_server.experiments.training.detector.network import Detector
 from edge_server.experiments.training.detector.scenes import KINDS, boxes_of
-from edge_server.experiments.training.detector.training import (
-    BATCH,
-    CheckpointError,
-    Settings,
-    augmented,
-    train,
-)
+from edge_server.experiments.training.detector.training import BATCH, CheckpointError, Settings, augmented, train
 
 SIDE = 64
 SETTINGS = Settings(seed=1, side=SIDE, worlds=1, epochs=3, threads=1)
@@ -177,10 +165,7 @@ def test_the_mask_loss_is_that_of_the_pixels_in_and_near_the_box():
     masks = torch.zeros(2, SIDE, SIDE)
     masks[0, 16:48, 16:48] = 1.0
     nothing = torch.zeros(0, dtype=torch.long)
-    assigned = [
-        (torch.tensor([3]), torch.tensor([0]), torch.tensor([0.8])),
-        (nothing, nothing, torch.zeros(0)),
-    ]
+    assigned = [(torch.tensor([3]), torch.tensor([0]), torch.tensor([0.8])), (nothing, nothing, torch.zeros(0))]
     weights = torch.zeros(2, 5, 1)
     weights[0, 3] = 1.0
     right = torch.full((2, 1, 32, 32), -9.0)

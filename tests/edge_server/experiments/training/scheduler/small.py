@@ -19,12 +19,17 @@ RAW: dict[str, Any] = {
     "seed": 3,
     "cameras": {"count": 5, "held_out": ["cam00"]},
     "source": {
-        "kind": "world", "scene": "room", "width": 24, "height": 24, "fps": 15, "speed_m_per_s": 2.0,
+        "kind": "world",
+        "scene": "room",
+        "width": 24,
+        "height": 24,
+        "fps": 15,
+        "speed_m_per_s": 2.0,
         "params": {"supersample": 1},
     },
     "channel": {"preset": "ch5"},
     "edge": {"field": "splat", "field_options": FIELD, "lpips": "none"},
-}  # fmt: skip
+}
 
 
 def scenario(channel: dict[str, Any] | None = None, **other: Any) -> Scenario:
@@ -35,9 +40,14 @@ def scenario(channel: dict[str, Any] | None = None, **other: Any) -> Scenario:
 def setting(channel: dict[str, Any] | None = None, **more: Any) -> Setting:
     """One held-out camera, updates from nothing and one motion, unless ``more`` says otherwise."""
     values: dict[str, Any] = {
-        "steps": 4, "decisions": 2, "lead_ms": 800.0, "span_ms": 600.0, "warm_steps": 6, "scratch": True,
+        "steps": 4,
+        "decisions": 2,
+        "lead_ms": 800.0,
+        "span_ms": 600.0,
+        "warm_steps": 6,
+        "scratch": True,
         "motions": False,
-    }  # fmt: skip
+    }
     return Setting(scenario(channel), **{**values, **more})
 
 

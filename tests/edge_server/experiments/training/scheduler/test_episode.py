@@ -84,8 +84,10 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     expected = live.publications[0]
     assert set(expected.selected) == set(choice.cameras)
     assert (found.psnr_db, found.psnr_moving_db, found.ssim) == (
-        expected.psnr_db, expected.psnr_moving_db, expected.ssim
-    )  # fmt: skip
+        expected.psnr_db,
+        expected.psnr_moving_db,
+        expected.ssim,
+    )
     assert found.aaoi_ms == expected.aaoi_ms and found.views == len(expected.selected)
     assert moment.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
 
@@ -94,8 +96,9 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
 def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
     factory = EpisodeFactory(setting(scratch=scratch), NOTHING)
     episode = factory.episode(2)
-    asked = [(k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments)
-             for n in (1, 2, 4)]  # fmt: skip
+    asked = [
+        (k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments) for n in (1, 2, 4)
+    ]
     forwards = [episode.evaluate(*a) for a in asked]
     fresh = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
     backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
@@ -139,9 +142,7 @@ def test_a_state_has_ages_and_poses_of_who_reported(factory):
 def test_actions_of_a_learner_mean_what_the_live_policies_do(factory):
     moment = factory.episode(4).moments[0]
     spec = Spec("threshold", omegas_ms=(40.0, 90.0))
-    assert choice_of_action(spec, 1, moment) == choose(
-        named("threshold:90")(np.random.default_rng(0)), moment
-    )
+    assert choice_of_action(spec, 1, moment) == choose(named("threshold:90")(np.random.default_rng(0)), moment)
     wait = choice_of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, moment)
     assert wait.at_ns >= moment.now_ns + 50 * 10**6
     picked = choice_of_action(Spec("select"), np.array([True, False, True, False]), moment)

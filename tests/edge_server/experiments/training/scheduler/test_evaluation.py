@@ -29,8 +29,9 @@ def evaluation_of(rng: np.random.Generator, matters: float, twice: bool = True) 
         for k, omega in enumerate(OMEGAS):
             into[f"threshold:{omega}"] = {
                 (seed, n): outcome(20.0 + rng.normal() + matters * (best[seed, n] == k))
-                for seed in range(20) for n in range(4)
-            }  # fmt: skip
+                for seed in range(20)
+                for n in range(4)
+            }
         into["random"] = {(s, n): outcome(20.0 + rng.normal()) for s in range(20) for n in range(4)}
     return found
 
@@ -81,8 +82,11 @@ def test_a_decision_that_nobody_has_a_value_for_is_left_out_for_all():
             of[name][3, 1] = outcome(None)
             of[name].update({(4, n): outcome(None) for n in range(4)})
     assert found.seeds("random") == (20, 19)
-    values = [outcome.psnr_db for of in (found.outcomes, found.repeated) for outcome in
-              (of["random"][3, n] for n in (0, 2, 3))]  # fmt: skip
+    values = [
+        outcome.psnr_db
+        for of in (found.outcomes, found.repeated)
+        for outcome in (of["random"][3, n] for n in (0, 2, 3))
+    ]
     mine = found.rewards("random")
     assert mine[3] == pytest.approx(np.mean(values)) and mine[4] is None and mine[5] == whole[5]
     assert found.rewards(HINDSIGHT)[3] is not None and found.best_values("threshold")["gain"].count == 19

@@ -116,9 +116,7 @@ def test_a_silent_camera_never_reports_and_is_another_setting():
 
 def test_what_an_evaluation_costs_is_all_that_it_takes_and_not_its_fit_alone(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(
-        "edge_server.experiments.training.scheduler.episode.time.process_time", lambda: clock[0]
-    )
+    monkeypatch.setattr("edge_server.experiments.training.scheduler.episode.time.process_time", lambda: clock[0])
     episode = EpisodeFactory(setting(scratch=False), NOTHING).episode(5)
     clock[0] += 1000.0  # between two evaluations: somebody else's
     field, truth = episode._factory.field(5), episode._truth

@@ -17,20 +17,9 @@ from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.training.scheduler import command, policy_comparison
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
-from edge_server.experiments.training.scheduler.deployed import (
-    Decided,
-    Hindsight,
-    _run,
-    judge,
-    sibling_advantages,
-)
+from edge_server.experiments.training.scheduler.deployed import Decided, Hindsight, _run, judge, sibling_advantages
 from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory, Outcome
-from edge_server.experiments.training.scheduler.evaluation import (
-    HINDSIGHT,
-    baseline_policies,
-    evaluate_policies,
-    rows,
-)
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, baseline_policies, evaluate_policies, rows
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import Setting, reward_of, seeds
@@ -56,8 +45,9 @@ from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW,
 from tests.edge_server.scheduler.learned.problems import collect
 
 REWARD = make_reward("set", distance=0.0)
-CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
-                checkpoint_every=1)  # fmt: skip
+CONFIG = TrainingConfig(
+    Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2, checkpoint_every=1
+)
 
 
 def weights(learner: Learner) -> dict[str, np.ndarray]:
@@ -102,8 +92,10 @@ def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path, pool: Wo
     with WorkerPool(NOTHING, jobs=2) as two:
         both = train(setting(), CONFIG, two, tmp_path / "two", quiet)
     assert same(alone, both) and not same(alone, Learner(CONFIG.spec, CONFIG.seed))
-    timeless = [[{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
-                for name in ("one", "two")]  # fmt: skip
+    timeless = [
+        [{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
+        for name in ("one", "two")
+    ]
     assert timeless[0] == timeless[1]
     other = train(setting(), dataclasses.replace(CONFIG, seed=1), pool, tmp_path / "other", quiet)
     assert not same(alone, other)
@@ -199,8 +191,10 @@ def test_an_evaluation_is_reported_as_table_and_text(evaluation, tmp_path: Path)
 
 
 def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
-    config = [{"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
-            for k in range(5)]  # fmt: skip
+    config = [
+        {"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
+        for k in range(5)
+    ]
     draw_curve(tmp_path / "curve.png", config, {"random": 0.1})
     assert (tmp_path / "curve.png").stat().st_size > 5_000
 
@@ -285,9 +279,7 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
         monkeypatch.setattr(module, "LEAD_MS", 1200.0)
     costs = {"ms_per_step": 2.0, "ms_per_view": 1.0}
     edge = {**RAW["edge"], "steps": 3, "compute": costs, "updates": "arrivals", "update_ms": 20}
-    asked = (
-        "--kind threshold --hold 200 --omegas 50,200 --episodes 2 --batch 1 --decisions 3 --size 0 --test 1"
-    )
+    asked = "--kind threshold --hold 200 --omegas 50,200 --episodes 2 --batch 1 --decisions 3 --size 0 --test 1"
     words, out = command_line(tmp_path, asked, {**RAW, "channel": {"preset": "swing"}, "edge": edge})
     assert main(words) == 0
     assert "rewarded from cam03; judged from cam00" in capsys.readouterr().out
@@ -342,9 +334,7 @@ def test_a_running_deployment_decides_as_often_as_an_update_lasts_and_takes_in_w
     small = setting(compute=costs, lead_ms=400.0, span_ms=1200.0)
     edge = {**small.scenario.edge, "updates": "arrivals", "update_ms": 50.0, "steps": 2, "grace_ms": 0.0}
     small = dataclasses.replace(small, scenario=dataclasses.replace(small.scenario, edge=edge))
-    deployment, _ = _run(
-        EpisodeFactory(small, NOTHING), 5, make_policy("all", None, np.random.default_rng(0))
-    )
+    deployment, _ = _run(EpisodeFactory(small, NOTHING), 5, make_policy("all", None, np.random.default_rng(0)))
     decided_ms = [p.published_ns / 1e6 - p.update_ms for p in deployment.publications]
     assert len(decided_ms) > 10 and np.median(np.diff(decided_ms)) == pytest.approx(50.0)
     assert deployment.settings.most_new == 96
@@ -417,9 +407,7 @@ def test_a_policy_may_show_nothing_in_the_span(tmp_path: Path):
             return [shown for _ in seeds]
 
     actor = Learner(CONFIG.spec, 0).actor
-    found = policy_comparison.score_policies(
-        setting(), Judge(), range(2), actor, "", tmp_path / "known", said.append
-    )  # type: ignore[arg-type]
+    found = policy_comparison.score_policies(setting(), Judge(), range(2), actor, "", tmp_path / "known", said.append)  # type: ignore[arg-type]
     assert said[0] == "all: - dB shown with seed 3"
     assert found["policies"]["learnt"]["psnr_db_over_all"] == [None] * 3
 
@@ -440,10 +428,7 @@ def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("reward", "missing"),
-    [
-        (make_reward("set"), "lpips.*--distance none"),
-        (make_reward("set", distance_is="perceptual"), "edge.metrics"),
-    ],
+    [(make_reward("set"), "lpips.*--distance none"), (make_reward("set", distance_is="perceptual"), "edge.metrics")],
 )
 def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path, pool):
     config = dataclasses.replace(CONFIG, reward=reward)

@@ -21,9 +21,17 @@ from tests.edge_server.fields.scenes import ring
 CELLS = 8  # a task's worth of cells, so that its samples are all there afterwards
 VIEWS = ring(5, size=24)
 SETTINGS = NgpSettings(
-    levels=4, log2_table=10, finest_resolution=32, hidden=16, rays=64, batch_samples=2048, samples=48,
-    cells=16, samples_start=48, threads=1,
-)  # fmt: skip
+    levels=4,
+    log2_table=10,
+    finest_resolution=32,
+    hidden=16,
+    rays=64,
+    batch_samples=2048,
+    samples=48,
+    cells=16,
+    samples_start=48,
+    threads=1,
+)
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +70,7 @@ def test_views_of_a_cell_are_those_whose_picture_it_is_in(field: NgpField, contr
     mask = np.random.default_rng(1).random((2, 24, 24)) < 0.4
     first = np.array([-1, 0, -1, 24 * 24, -1], np.int64)
     seen, marked = np.full(cells**3, 9, np.uint16), np.full(cells**3, 9, np.uint16)
-    CallerPool().run(
-        count_views, cells, contracted, near, views, first, mask.astype(np.uint8).ravel(), seen, marked
-    )
+    CallerPool().run(count_views, cells, contracted, near, views, first, mask.astype(np.uint8).ravel(), seen, marked)
     expected, flagged, clear = np.zeros(cells**3, int), np.zeros(cells**3, int), np.ones(cells**3, bool)
     for v, view in enumerate(VIEWS):
         pose = view.camera_to_world
@@ -96,9 +102,22 @@ def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phas
     before = rng.random(CELLS**3).astype(np.float32) * 3.0
     density, acts, x = before.copy(), field._scratch.acts, np.full_like(field._batch.x, np.nan)
     CallerPool().run(
-        sample_density, np.uint64(11), phase, phases, np.float32(fade), field._grid, SETTINGS.levels,
-        field._net, CELLS, contracted, seen, few, density, acts, x,
-    )  # fmt: skip
+        sample_density,
+        np.uint64(11),
+        phase,
+        phases,
+        np.float32(fade),
+        field._grid,
+        SETTINGS.levels,
+        field._net,
+        CELLS,
+        contracted,
+        seen,
+        few,
+        density,
+        acts,
+        x,
+    )
     here = np.arange(phase, CELLS**3, phases)
     np.testing.assert_array_equal(np.delete(density, here), np.delete(before, here))
     np.testing.assert_array_equal(density[here[seen[here] < few]], 0.0)
@@ -121,9 +140,22 @@ def test_a_density_that_is_not_finite_is_looked_at_again(field: NgpField) -> Non
     poisoned = field._net._replace(params=np.full_like(field._net.params, np.nan))
     density = np.zeros(CELLS**3, np.float32)
     CallerPool().run(
-        sample_density, np.uint64(1), 0, 1, np.float32(0.5), field._grid, SETTINGS.levels, poisoned, CELLS,
-        False, np.ones(CELLS**3, np.uint16), 1, density, field._scratch.acts, field._batch.x.copy(),
-    )  # fmt: skip
+        sample_density,
+        np.uint64(1),
+        0,
+        1,
+        np.float32(0.5),
+        field._grid,
+        SETTINGS.levels,
+        poisoned,
+        CELLS,
+        False,
+        np.ones(CELLS**3, np.uint16),
+        1,
+        density,
+        field._scratch.acts,
+        field._batch.x.copy(),
+    )
     assert np.isfinite(density).all() and density.min() > 1.0
 
 

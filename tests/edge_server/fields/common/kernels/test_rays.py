@@ -57,9 +57,18 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     none = torch.zeros(0)
     box = SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0, 0.1)
     model = TorchSnapshot(
-        settings, box, TorchGrid([], [], [], none), 0, [], none,
-        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step), (), 0,
-    )  # fmt: skip
+        settings,
+        box,
+        TorchGrid([], [], [], none),
+        0,
+        [],
+        none,
+        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS),
+        none,
+        float(space.step),
+        (),
+        0,
+    )
     rng = np.random.default_rng(6)
     for _ in range(20):
         o = rng.normal(size=3) * 1.5

@@ -23,9 +23,17 @@ from edge_server.fields.ngp.torch_model import encode, mlp, ray_losses, shade, t
 from tests.edge_server.fields.scenes import ring
 
 SETTINGS = NgpSettings(
-    levels=4, log2_table=10, finest_resolution=32, hidden=16, rays=64, batch_samples=2048, samples=48,
-    cells=16, samples_start=48, threads=1,
-)  # fmt: skip
+    levels=4,
+    log2_table=10,
+    finest_resolution=32,
+    hidden=16,
+    rays=64,
+    batch_samples=2048,
+    samples=48,
+    cells=16,
+    samples_start=48,
+    threads=1,
+)
 VIEWS = ring(5, size=24)
 DISTORTION = 0.2
 
@@ -53,9 +61,14 @@ def _train(
     """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
     takes everything to be ``over`` times as dense as it knows."""
     recipe = RaySampling(
-        key=np.uint64(7), chunk_rays=rays, levels=SETTINGS.levels, harmonics=1,
-        changed_share=np.float32(0.5), background=np.full(3, 0.5, np.float32), random_background=False,
-    )  # fmt: skip
+        key=np.uint64(7),
+        chunk_rays=rays,
+        levels=SETTINGS.levels,
+        harmonics=1,
+        changed_share=np.float32(0.5),
+        background=np.full(3, 0.5, np.float32),
+        random_background=False,
+    )
     space = field._occupancy.space(step_length(SETTINGS, field.step))
     space = space._replace(density=space.density * np.float32(over))
     weights = Weights(np.float32(DISTORTION))

@@ -53,8 +53,7 @@ def _kernel(raw, line, ray, weights, harmonics, guide=0.0):
     out, d_out = raw.copy(), np.zeros_like(raw)
     add_harmonics(out, harmonics, 0, SAMPLES, *ray[:3])
     activate(out, 0, SAMPLES)
-    error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], np.float32(guide),
-                     weights)  # fmt: skip
+    error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], np.float32(guide), weights)
     add_harmonics_backward(d_out, harmonics, 0, SAMPLES, *ray[:3])
     return error, d_out
 

@@ -67,11 +67,7 @@ for k in (double, total, only_after):
 def _who(cache: Path, *executable: str, threads: int = 2) -> list[str]:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), THREADS_VARIABLE: str(threads)}
     done = subprocess.run(
-        [sys.executable, "-c", TOLD, *executable],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [sys.executable, "-c", TOLD, *executable], env=environment, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0 and not done.stderr, done.stderr
     return done.stdout.split("\n")[:-1]

@@ -16,13 +16,7 @@ from numba import njit
 from edge_server.fields.common.kernels.jit import FAST, SOURCES
 from edge_server.fields.common.kernels.mlp import forward
 from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, fetch_add, log32, uniform
-from edge_server.fields.common.threads.thread_pool import (
-    MOST_USEFUL,
-    THREADS_VARIABLE,
-    CallerPool,
-    Pool,
-    shared_pool,
-)
+from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE, CallerPool, Pool, shared_pool
 from edge_server.fields.common.threads.work_queue import WAKE_CALLER, poll_for_job
 
 
@@ -305,9 +299,7 @@ def test_who_is_interrupted_twice_leaves_it_to_the_next_job(cores, monkeypatch) 
     pool.close()
 
 
-def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finished_too(
-    many_cores, monkeypatch
-) -> None:
+def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finished_too(many_cores, monkeypatch) -> None:
     pool, seen = Pool(3, nice=0), []
     work = pool._work
 

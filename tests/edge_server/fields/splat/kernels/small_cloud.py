@@ -30,9 +30,12 @@ def static(params: np.ndarray) -> Gaussians:
 
 
 def binned(
-    cams: np.ndarray, params: np.ndarray, wanted: list[np.ndarray | None] | None = None,
-    differentiate: bool = True, pool: Pool | None = None,
-) -> RasterBuffers:  # fmt: skip
+    cams: np.ndarray,
+    params: np.ndarray,
+    wanted: list[np.ndarray | None] | None = None,
+    differentiate: bool = True,
+    pool: Pool | None = None,
+) -> RasterBuffers:
     """Buffers after ``project_and_bin``; wanted: None for all tiles of all cameras."""
     raster = RasterBuffers(pool or CallerPool())
     raster.project_and_bin(cams, static(params), wanted or [None] * len(cams), differentiate)

@@ -48,16 +48,12 @@ def _sorted(lists, t, projected, y0, strip_pairs, count):
 
 @njit
 def _composite(strip_pairs, count, owner, projected, tile, saved):
-    return composite(
-        strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), tile, 0, saved, SAVED
-    )
+    return composite(strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), tile, 0, saved, SAVED)
 
 
 @njit
 def _composite_backward(strip_pairs, count, owner, projected, slopes, saved, sums):
-    composite_backward(
-        strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), slopes, 0, saved, sums
-    )
+    composite_backward(strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), slopes, 0, saved, sums)
 
 
 def _row(alpha: float, conic: tuple[float, float, float] = (0.05, 0.01, 0.04)) -> NDArray[np.float32]:
@@ -93,9 +89,7 @@ def test_every_strip_that_has_a_pixel_of_a_gaussian_lists_it_once_and_in_order()
         rows = raster.projected[0, lists.owner[0, pairs]].astype(np.float64)
         dx = x0 + np.arange(PIXELS) % TILE + 0.5 - rows[:, [MEAN_X]]
         dy = y0 + np.arange(PIXELS) // TILE + 0.5 - rows[:, [MEAN_Y]]
-        form = (
-            rows[:, [CONIC_A]] * dx * dx + 2.0 * rows[:, [CONIC_B]] * dx * dy + rows[:, [CONIC_C]] * dy * dy
-        )
+        form = rows[:, [CONIC_A]] * dx * dx + 2.0 * rows[:, [CONIC_B]] * dx * dy + rows[:, [CONIC_C]] * dy * dy
         reached = rows[:, [ALPHA]] * np.exp(-0.5 * form) >= ALPHA_MIN * 1.0001
         for n in range(STRIPS):
             mine = strip_pairs[n, : count[n]].tolist()

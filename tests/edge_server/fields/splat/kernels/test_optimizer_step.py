@@ -38,36 +38,46 @@ def _moments(width: int, filled: bool) -> OptimizerState:
     age = rng.integers(0, 6, COUNT) if filled else np.zeros(COUNT)
     flat = [np.zeros(COUNT, np.float32) for _ in range(3)]
     share = 1.0 if filled else 0.0
-    return OptimizerState(
-        (share * m).astype(np.float32), (share * v).astype(np.float32), age.astype(np.int32), *flat
-    )
+    return OptimizerState((share * m).astype(np.float32), (share * v).astype(np.float32), age.astype(np.int32), *flat)
 
 
 def _adam_parameters(width: int, beta1: float, rate: float, fade: float = 0.0) -> AdamParameters:
     rates = rate * (1.0 + np.arange(width)) / width
     corrections = np.array([[9.0, 9.0, 9.0], [3.0, 2.5, 1.0], [2.0, 1.8, 0.9], [1.5, 1.2, 0.8]])
     return AdamParameters(
-        rates.astype(np.float32), corrections.astype(np.float32),
+        rates.astype(np.float32),
+        corrections.astype(np.float32),
         *(np.float32(x) for x in (beta1, BETA2, EPSILON, fade, 4.0, 5.0)),
-    )  # fmt: skip
+    )
 
 
 def _update(
-    params: NDArray[np.float32], moments: OptimizerState, rule: AdamParameters, raster: RasterBuffers,
-    cams: NDArray[np.float32], pool: Pool | None = None,
-) -> int:  # fmt: skip
+    params: NDArray[np.float32],
+    moments: OptimizerState,
+    rule: AdamParameters,
+    raster: RasterBuffers,
+    cams: NDArray[np.float32],
+    pool: Pool | None = None,
+) -> int:
     """How many gradients were dropped; params and moments are changed."""
     dropped = np.zeros(-(-COUNT // BLOCK), np.int64)
     (pool or CallerPool()).run(
-        adam_step, cams, static(params), COUNT, raster.projected, raster.lists.own_first,
-        raster.lists.own_count, raster.sums, moments, rule, dropped,
-    )  # fmt: skip
+        adam_step,
+        cams,
+        static(params),
+        COUNT,
+        raster.projected,
+        raster.lists.own_first,
+        raster.lists.own_count,
+        raster.sums,
+        moments,
+        rule,
+        dropped,
+    )
     return int(dropped.sum())
 
 
-def _gradient(
-    params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _gradient(params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]) -> NDArray[np.float32]:
     """Adam's first moment after a step with beta1 = 0."""
     width = params.shape[1]
     moments = _moments(width, filled=False)
@@ -100,12 +110,7 @@ def test_a_step_is_adams(harmonics: int) -> None:
     np.testing.assert_allclose(moments.v[seen], v[seen], rtol=2e-5, atol=1e-9)
     np.testing.assert_allclose((params - after)[seen], moved[seen], rtol=1e-3, atol=2e-6)
     np.testing.assert_array_equal(moments.age[seen], before.age[seen] + 1)
-    for array, was in (
-        (after, params),
-        (moments.m, before.m),
-        (moments.v, before.v),
-        (moments.age, before.age),
-    ):
+    for array, was in ((after, params), (moments.m, before.m), (moments.v, before.v), (moments.age, before.age)):
         np.testing.assert_array_equal(array[~seen], was[~seen].astype(array.dtype))
 
 

@@ -20,13 +20,7 @@ from edge_server.fields.splat.kernels.optimizer_step import (
     position_gradients,
 )
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
-from edge_server.fields.splat.kernels.rasterize import (
-    Loss,
-    add_dssim,
-    compare_tiles,
-    render_tiles,
-    train_tiles,
-)
+from edge_server.fields.splat.kernels.rasterize import Loss, add_dssim, compare_tiles, render_tiles, train_tiles
 from edge_server.fields.splat.kernels.view_evidence import Evidence, collect_evidence
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
@@ -47,9 +41,18 @@ def _render(params: np.ndarray, cam: np.ndarray, threads: int = 1) -> list[np.nd
     w, h = LENS.width, LENS.height
     out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
     raster.pool.run(
-        render_tiles, int(raster.columns[0]), int(raster.rows[0]), w, h, raster.projected, raster.lists, BACK,
-        raster.memory, raster.saved, *out,
-    )  # fmt: skip
+        render_tiles,
+        int(raster.columns[0]),
+        int(raster.rows[0]),
+        w,
+        h,
+        raster.projected,
+        raster.lists,
+        BACK,
+        raster.memory,
+        raster.saved,
+        *out,
+    )
     return out
 
 
@@ -85,47 +88,79 @@ def test_a_ball_appears_where_the_lens_puts_it() -> None:
 def _views(target: np.ndarray, weight: np.ndarray | None = None) -> Views:
     h, w = target.shape[:2]
     return Views(
-        first=np.array([0, h * w]), size=np.array([[w, h]]), lens=np.zeros((1, 8)),
-        rotation=np.zeros((1, 3, 3)), origin=np.zeros((1, 3)), pixels=target.reshape(h * w, -1),
+        first=np.array([0, h * w]),
+        size=np.array([[w, h]]),
+        lens=np.zeros((1, 8)),
+        rotation=np.zeros((1, 3, 3)),
+        origin=np.zeros((1, 3)),
+        pixels=target.reshape(h * w, -1),
         changed=np.zeros(0, np.int64),
         weight=np.zeros(0, np.float32) if weight is None else weight.reshape(-1),
-    )  # fmt: skip
+    )
 
 
 def _train(
-    params: np.ndarray, cam: np.ndarray, target: np.ndarray, absolute: bool = False, dssim: float = 0.0,
+    params: np.ndarray,
+    cam: np.ndarray,
+    target: np.ndarray,
+    absolute: bool = False,
+    dssim: float = 0.0,
     weight: np.ndarray | None = None,
-) -> tuple[RasterBuffers, float]:  # fmt: skip
+) -> tuple[RasterBuffers, float]:
     """Buffers with the pairs' sums, and the loss."""
     raster = binned(cam, params)
     tasks, loss = raster.tasks(), Loss(absolute, np.float32(dssim), BACK, False, np.uint64(1))
     losses = np.zeros((len(tasks), 3))
     raster.pool.run(
-        train_tiles, _views(target, weight), np.zeros(1, np.int64), tasks, raster.columns, raster.projected,
-        raster.lists, loss, raster.memory, raster.saved, raster.sums, losses,
-    )  # fmt: skip
+        train_tiles,
+        _views(target, weight),
+        np.zeros(1, np.int64),
+        tasks,
+        raster.columns,
+        raster.projected,
+        raster.lists,
+        loss,
+        raster.memory,
+        raster.saved,
+        raster.sums,
+        losses,
+    )
     assert losses[:, 2].sum() == 0
     return raster, float(losses[:, 0].sum())
 
 
 def _gradient(
-    params: np.ndarray, cam: np.ndarray, target: np.ndarray, absolute: bool = False, dssim: float = 0.0,
+    params: np.ndarray,
+    cam: np.ndarray,
+    target: np.ndarray,
+    absolute: bool = False,
+    dssim: float = 0.0,
     weight: np.ndarray | None = None,
-) -> tuple[float, np.ndarray]:  # fmt: skip
+) -> tuple[float, np.ndarray]:
     """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
     raster, loss = _train(params, cam, target, absolute, dssim, weight)
     n = len(params)
     flat = [np.zeros(n, np.float32) for _ in range(3)]
     moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
     rule = AdamParameters(
-        np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32),
+        np.zeros(params.shape[1], np.float32),
+        np.ones((4, 3), np.float32),
         *(np.float32(v) for v in (0.0, 0.9, 1e-8, 0.0, 4.0, 5.0)),
-    )  # fmt: skip
+    )
     dropped = np.zeros(n, np.int64)
     raster.pool.run(
-        adam_step, cam, static(params.copy()), n, raster.projected, raster.lists.own_first,
-        raster.lists.own_count, raster.sums, moments, rule, dropped,
-    )  # fmt: skip
+        adam_step,
+        cam,
+        static(params.copy()),
+        n,
+        raster.projected,
+        raster.lists.own_first,
+        raster.lists.own_count,
+        raster.sums,
+        moments,
+        rule,
+        dropped,
+    )
     assert dropped.sum() == 0
     return loss, moments.m
 
@@ -449,9 +484,16 @@ def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
     (raster, _), some = _train(params, cam, target), np.array([7, 1, 4], np.int64)
     slope = np.full((3, 3), 7, np.float32)
     raster.pool.run(
-        position_gradients, cam, static(params), some, raster.projected, raster.lists.own_first,
-        raster.lists.own_count, raster.sums, slope,
-    )  # fmt: skip
+        position_gradients,
+        cam,
+        static(params),
+        some,
+        raster.projected,
+        raster.lists.own_first,
+        raster.lists.own_count,
+        raster.sums,
+        slope,
+    )
     np.testing.assert_allclose(slope, gradient[some, :3], rtol=1e-5, atol=1e-6)
 
 
@@ -462,15 +504,22 @@ def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
     tasks = np.array([(0, 0), (0, columns + 1)], np.int32)
     error = np.full(LENS.width * LENS.height, -1, np.float32)
     raster.pool.run(
-        compare_tiles, _views(target), np.zeros(1, np.int64), tasks, raster.columns, raster.projected,
-        raster.lists, BACK, raster.memory, raster.saved, error,
-    )  # fmt: skip
+        compare_tiles,
+        _views(target),
+        np.zeros(1, np.int64),
+        tasks,
+        raster.columns,
+        raster.projected,
+        raster.lists,
+        BACK,
+        raster.memory,
+        raster.saved,
+        error,
+    )
     error = error.reshape(LENS.height, LENS.width)
     wanted = np.abs(color - target / 255.0).max(axis=2)
     for y, x in ((0, 0), (TILE, TILE)):
-        np.testing.assert_allclose(
-            error[y : y + TILE, x : x + TILE], wanted[y : y + TILE, x : x + TILE], atol=1e-5
-        )
+        np.testing.assert_allclose(error[y : y + TILE, x : x + TILE], wanted[y : y + TILE, x : x + TILE], atol=1e-5)
     assert (error[:TILE, TILE:] == -1).all()
 
 

@@ -68,10 +68,7 @@ def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
 
 def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
     out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(
-        render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory,
-        raster.saved, out,
-    )  # fmt: skip
+    POOL.run(render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory, raster.saved, out)
     return out
 
 
@@ -121,17 +118,24 @@ def test_what_pixels_tell_adds_up_to_what_they_show():
     normals[..., 3] = 1.0
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     POOL.run(
-        accumulate_normals, 0, 3, 3, 24, 24, raster.projected, raster.lists, normals, raster.memory,
-        raster.saved, normal_sums,
-    )  # fmt: skip
+        accumulate_normals,
+        0,
+        3,
+        3,
+        24,
+        24,
+        raster.projected,
+        raster.lists,
+        normals,
+        raster.memory,
+        raster.saved,
+        normal_sums,
+    )
     out = blended(raster, gaussian_planes(gaussians, camera))
     pairs = int(raster.lists.needed[0])
     np.testing.assert_allclose(normal_sums[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)
     np.testing.assert_allclose(
-        normal_sums[:pairs, :3].sum(axis=0),
-        (out[..., 4:] * normals[..., :3]).sum(axis=(0, 1)),
-        rtol=2e-3,
-        atol=1e-2,
+        normal_sums[:pairs, :3].sum(axis=0), (out[..., 4:] * normals[..., :3]).sum(axis=(0, 1)), rtol=2e-3, atol=1e-2
     )
 
 
@@ -171,9 +175,7 @@ def test_normals_of_depth_are_those_of_the_plane():
     turn = camera_rows([POSE], [LENS], BOX)[0, :ORIGIN].reshape(3, 3)
     inner = found[1:-1, 1:-1]
     assert inner[..., 3].all() and not found[0, :, 3].any()
-    np.testing.assert_allclose(
-        inner[..., :3], np.broadcast_to(turn @ tilt[:, 2], inner[..., :3].shape), atol=1e-3
-    )
+    np.testing.assert_allclose(inner[..., :3], np.broadcast_to(turn @ tilt[:, 2], inner[..., :3].shape), atol=1e-3)
 
 
 def test_hard_cases_stay_finite():
@@ -195,15 +197,15 @@ def test_hard_cases_stay_finite():
 
 def test_a_field_that_is_asked_for_surfaces_shows_their_planes():
     views = ring(5, size=32)
-    fields = [SplatField(SplatSettings(gaussians=512, start=256, **more)) for more in
-              ({}, {"flatten": 0.02, "align": 0.3}, {"flatten": 0.02, "align": 0.3})]  # fmt: skip
+    fields = [
+        SplatField(SplatSettings(gaussians=512, start=256, **more))
+        for more in ({}, {"flatten": 0.02, "align": 0.3}, {"flatten": 0.02, "align": 0.3})
+    ]
     for field in fields:
         field.fit(views, Budget(steps=40))
     plain, planar, again = (field.cloud.params for field in fields)
     np.testing.assert_array_equal(planar, again)
-    thin = [
-        p[:, SCALE : SCALE + 3].max(axis=1) - p[:, SCALE : SCALE + 3].min(axis=1) for p in (plain, planar)
-    ]
+    thin = [p[:, SCALE : SCALE + 3].max(axis=1) - p[:, SCALE : SCALE + 3].min(axis=1) for p in (plain, planar)]
     assert np.median(thin[1]) > np.median(thin[0]) + 0.3
     camera = (views[0].camera_to_world, views[0].intrinsics)
     snapshot = fields[1].snapshot()

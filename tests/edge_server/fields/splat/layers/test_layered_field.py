@@ -93,9 +93,7 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
 
     differing = begun(level * gains)
     found = np.array([camera.plate.gain.mean() for camera in differing.cameras.values()])
-    white = np.array(
-        [(np.asarray(c.view.image).max(axis=2) > 235).mean() > 0.75 for c in differing.cameras.values()]
-    )
+    white = np.array([(np.asarray(c.view.image).max(axis=2) > 235).mean() > 0.75 for c in differing.cameras.values()])
     assert (found[white] == 1.0).all() and white.any() == (level == 1.0)
     if level < 1.0:
         assert np.log(found / gains).std() < 0.3 * np.log(gains).std()
@@ -224,9 +222,11 @@ def test_a_refused_state_changes_nothing() -> None:
         SplatField(SMALL).state(),
         {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
         {k: v * np.nan if k == "moving.share" else v for k, v in _moving().state().items()},
-        {k: np.array(str(v).replace('"version": 3', '"version": 1')) if k == "meta" else v
-         for k, v in _moving().state().items()},
-    ):  # fmt: skip
+        {
+            k: np.array(str(v).replace('"version": 3', '"version": 1')) if k == "meta" else v
+            for k, v in _moving().state().items()
+        },
+    ):
         with pytest.raises(ValueError):
             field.load_state(wrong)
     after = field.state()
@@ -335,9 +335,7 @@ def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves(
     assert field.frame_s is not None
 
 
-def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     field = LayeredField(SMALL)
     _run(field, range(17))
     field.fit([_frame(k, 17, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
@@ -378,8 +376,11 @@ def test_each_turn_of_the_layers_is_one_line_of_the_log(caplog: pytest.LogCaptur
     field.fit([replace(_frame(1, 21, False), intrinsics=lens)], Budget(steps=1))
     _run(field, range(22, 24), moves=False, steps=1)
     assert [record.message.split(":")[0] for record in caplog.records] == [
-        "layers begin", "layers begin again", "layers begin", "layers are given up until a reset",
-    ]  # fmt: skip
+        "layers begin",
+        "layers begin again",
+        "layers begin",
+        "layers are given up until a reset",
+    ]
     assert f"lens or the image size of {CAMERAS[1].camera}" in caplog.records[-1].message
 
 

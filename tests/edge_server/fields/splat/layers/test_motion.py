@@ -5,15 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.fields.splat.layers.motion import (
-    DIFFERENCES,
-    FIXED,
-    FREE,
-    KNOTS_PER_S,
-    WINDOW,
-    Motion,
-    ViewRow,
-)
+from edge_server.fields.splat.layers.motion import DIFFERENCES, FIXED, FREE, KNOTS_PER_S, WINDOW, Motion, ViewRow
 
 RADIUS_M = 3.0
 
@@ -25,9 +17,7 @@ def moving(count: int = 6, start_s: float = 10.0, seed: int = 0) -> Motion:
     return motion
 
 
-def row(
-    motion: Motion, instant_s: float, truth: np.ndarray, rng, rank: int = 2, strength: float = 1e4
-) -> ViewRow:
+def row(motion: Motion, instant_s: float, truth: np.ndarray, rng, rank: int = 2, strength: float = 1e4) -> ViewRow:
     """A camera that sees ``rank`` directions of every anchor, linearized at the motion's own displacement."""
     n = truth.size
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0][:rank]
@@ -84,9 +74,7 @@ def test_the_solution_is_that_of_a_dense_factor(count, views):
     assert (np.abs(motion._knots[FIXED:] - wanted) / deviation).max() < 0.02
     last = np.zeros((1, 3), np.int64), np.array([[1, 0, 0]], np.float32)
     at = (motion._first + WINDOW - 1) / KNOTS_PER_S
-    np.testing.assert_allclose(
-        motion.deviation(*last, at), np.sqrt((deviation[-1, 0] ** 2).mean()), rtol=0.02
-    )
+    np.testing.assert_allclose(motion.deviation(*last, at), np.sqrt((deviation[-1, 0] ** 2).mean()), rtol=0.02)
     assert motion.deviation(*last, at + 0.1) > motion.deviation(*last, at)
 
 

@@ -98,9 +98,7 @@ def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
     keep = stats[:, 4] >= SPECK
     keep[0] = False
     part = cv2.copyMakeBorder(keep[label].astype(np.uint8), *[CLOSE] * 4, cv2.BORDER_CONSTANT, value=0)
-    part = cv2.morphologyEx(
-        part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE))
-    )
+    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE)))
     part = np.ascontiguousarray(part[CLOSE:-CLOSE, CLOSE:-CLOSE])
     _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
     fill = stats[:, 4] <= HOLE * mask.size

@@ -9,16 +9,7 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.composite import ALPHA_MAX, STOP
-from edge_server.fields.splat.kernels.project import (
-    ALPHA,
-    ALPHA_MIN,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-)
+from edge_server.fields.splat.kernels.project import ALPHA, ALPHA_MIN, CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, RED
 from edge_server.fields.splat.layers.kernels.align import NOISE, ROBUST, align_view
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params, static
@@ -54,8 +45,9 @@ def by_pixels(params, anchor, share, image, plate, weight, anchors=ANCHORS):
     turn = CAMS[0, :9].reshape(3, 3).astype(float)
     x, y, z = turn @ (params[:, :3] - CAMS[0, 9:12]).T.astype(float)
     rows = raster.projected[0].astype(float)
-    slope = np.stack([LENS.fx / z * (turn[0] - np.outer(x / z, turn[2])).T,
-                      LENS.fy / z * (turn[1] - np.outer(y / z, turn[2])).T])  # fmt: skip
+    slope = np.stack(
+        [LENS.fx / z * (turn[0] - np.outer(x / z, turn[2])).T, LENS.fy / z * (turn[1] - np.outer(y / z, turn[2])).T]
+    )
     matrix, vector = np.zeros((3 * anchors, 3 * anchors)), np.zeros(3 * anchors)
     shown = plate / 255.0
     lists = raster.lists
@@ -70,9 +62,7 @@ def by_pixels(params, anchor, share, image, plate, weight, anchors=ANCHORS):
                 form = row[CONIC_A] * dx * dx + 2 * row[CONIC_B] * dx * dy + row[CONIC_C] * dy * dy
                 a = min(row[ALPHA] * np.exp(-0.5 * form), ALPHA_MAX)
                 if a >= ALPHA_MIN and light >= STOP:
-                    h = a * np.array(
-                        [row[CONIC_A] * dx + row[CONIC_B] * dy, row[CONIC_B] * dx + row[CONIC_C] * dy]
-                    )
+                    h = a * np.array([row[CONIC_A] * dx + row[CONIC_B] * dy, row[CONIC_B] * dx + row[CONIC_C] * dy])
                     used.append((i, a, light, h if a < ALPHA_MAX else 0 * h))
                     light *= 1 - a
             behind, jacobian = plate[v, u] / 255.0, np.zeros((3, anchors, 3))
@@ -140,8 +130,7 @@ def test_the_gradient_is_that_of_the_rendered_image(axis):
     _, vector, shown, _ = at(0.0, image)
     robust = 1 / (1 + ((image / 255.0 - shown) ** 2).sum(axis=-1) / ROBUST**2)
     ahead, back = (
-        0.5 * (robust[..., None] * (image / 255.0 - at(step)[2]) ** 2).sum() / NOISE**2
-        for step in (2e-3, -2e-3)
+        0.5 * (robust[..., None] * (image / 255.0 - at(step)[2]) ** 2).sum() / NOISE**2 for step in (2e-3, -2e-3)
     )
     slope = (ahead - back) / 4e-3
     assert abs(slope) > 10.0

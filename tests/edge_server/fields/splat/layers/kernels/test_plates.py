@@ -60,15 +60,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
         for has_static in (False, True):
             difference, flags = np.empty((H, W), np.float32), np.empty((H, W), np.uint8)
             Pool(2, 0).run(
-                compare_with_plate,
-                blurred,
-                plate,
-                earlier,
-                count,
-                static[None],
-                has_static,
-                difference,
-                flags,
+                compare_with_plate, blurred, plate, earlier, count, static[None], has_static, difference, flags
             )
             changing = np.zeros((H, W), bool)
             for k in range(count):
@@ -77,9 +69,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
             unknown = beyond > THRESHOLD_UNKNOWN if has_static else changing
             expected = _off(blurred, plate.blurred[0])
             np.testing.assert_allclose(difference, expected, rtol=1e-6)
-            np.testing.assert_array_equal(
-                flags & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown)
-            )
+            np.testing.assert_array_equal(flags & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown))
             np.testing.assert_array_equal(flags & CHANGING > 0, changing)
             np.testing.assert_array_equal(flags & LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
 
@@ -87,12 +77,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
 def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np.ndarray) -> None:
     """One pixel that votes, by the rules of the module."""
     modes = [
-        {
-            "w": p.weight[k, y, x],
-            "m": p.means[k, y, x].copy(),
-            "b": p.blurred[k, y, x].copy(),
-            "first": k == 0,
-        }
+        {"w": p.weight[k, y, x], "m": p.means[k, y, x].copy(), "b": p.blurred[k, y, x].copy(), "first": k == 0}
         for k in range(MODES)
     ]
     alive = [m for m in modes if m["w"] > kernels.LEAST_WEIGHT]
@@ -122,9 +107,7 @@ def test_votes() -> None:
     difference = _off(blurred, plain.blurred[0]).astype(np.float32)
     foreground, votes, held = ((rng.random((H, W)) < share).astype(np.uint8) for share in (0.3, 0.8, 0.2))
     picture = np.empty((H, W, 3), np.float32)
-    Pool(2, 0).run(
-        vote, image, blurred, difference, foreground, votes, held, found, static, True, picture
-    )  # fmt: skip
+    Pool(2, 0).run(vote, image, blurred, difference, foreground, votes, held, found, static, True, picture)
     for y in range(H):
         for x in range(W):
             if held[y, x]:

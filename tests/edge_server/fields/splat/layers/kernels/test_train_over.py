@@ -27,28 +27,49 @@ def _trained(raster: RasterBuffers, plate: np.ndarray, weight: np.ndarray) -> tu
     tasks = raster.tasks()
     losses = np.full(len(tasks), np.nan)
     raster.pool.run(
-        train_over, IMAGE, plate, weight, tasks, raster.columns, raster.projected, raster.lists,
-        raster.memory, raster.saved, raster.sums, losses,
-    )  # fmt: skip
+        train_over,
+        IMAGE,
+        plate,
+        weight,
+        tasks,
+        raster.columns,
+        raster.projected,
+        raster.lists,
+        raster.memory,
+        raster.saved,
+        raster.sums,
+        losses,
+    )
     return losses, raster.sums[0, : int(raster.lists.needed[0])].copy()
 
 
 def test_a_plate_of_one_color_is_a_background() -> None:
     raster, color = binned(CAMS, random_params(30)), np.array([0.2, 0.6, 0.4], np.float32)
-    losses, sums = _trained(
-        raster, np.broadcast_to(color * 255, IMAGE.shape).astype(np.float32), np.ones_like(WEIGHT)
-    )
+    losses, sums = _trained(raster, np.broadcast_to(color * 255, IMAGE.shape).astype(np.float32), np.ones_like(WEIGHT))
     tasks, expected = raster.tasks(), np.zeros((len(raster.tasks()), 3))
     views = Views(
-        first=np.array([0, 21 * 29]), size=np.array([[29, 21]]), lens=np.zeros((1, 8)),
-        rotation=np.zeros((1, 3, 3)), origin=np.zeros((1, 3)), pixels=IMAGE.reshape(-1, 3),
+        first=np.array([0, 21 * 29]),
+        size=np.array([[29, 21]]),
+        lens=np.zeros((1, 8)),
+        rotation=np.zeros((1, 3, 3)),
+        origin=np.zeros((1, 3)),
+        pixels=IMAGE.reshape(-1, 3),
         changed=np.zeros(0, np.int64),
-    )  # fmt: skip
+    )
     raster.pool.run(
-        train_tiles, views, np.zeros(1, np.int64), tasks, raster.columns, raster.projected, raster.lists,
-        Loss(False, np.float32(0), color, False, np.uint64(0)), raster.memory, raster.saved, raster.sums,
+        train_tiles,
+        views,
+        np.zeros(1, np.int64),
+        tasks,
+        raster.columns,
+        raster.projected,
+        raster.lists,
+        Loss(False, np.float32(0), color, False, np.uint64(0)),
+        raster.memory,
+        raster.saved,
+        raster.sums,
         expected,
-    )  # fmt: skip
+    )
     filled = np.diff(raster.lists.first[0, : len(tasks) + 1]) > 0
     np.testing.assert_allclose(losses[filled], expected[filled, 0], rtol=1e-5)
     np.testing.assert_allclose(sums, raster.sums[0, : len(sums)], rtol=2e-4, atol=2e-4)
@@ -67,15 +88,12 @@ def test_slopes_over_a_plate_agree_with_differences() -> None:
                 total.append(_trained(raster, PLATE, WEIGHT)[0].sum())
             raster.projected[0, i, RED + c] = old
             expected = (total[0] - total[1]) / (2 * step)
-            np.testing.assert_allclose(
-                sums[first : first + count, 6 + c].sum(), expected, rtol=5e-3, atol=5e-3
-            )
+            np.testing.assert_allclose(sums[first : first + count, 6 + c].sum(), expected, rtol=5e-3, atol=5e-3)
 
 
 def test_the_number_of_threads_changes_nothing() -> None:
     one, two = (
-        _trained(binned(CAMS, random_params(30), pool=pool), PLATE, WEIGHT)
-        for pool in (CallerPool(), Pool(2, 0))
+        _trained(binned(CAMS, random_params(30), pool=pool), PLATE, WEIGHT) for pool in (CallerPool(), Pool(2, 0))
     )
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a, b)
