@@ -1,21 +1,19 @@
 """Frames of a periodic scene, rendered ahead and kept on disk, so that streaming costs only a look-up.
 
-An entry's key hashes everything that determines its bytes: scene, parameters, camera, frame rate, codec,
-quality, rendered effects and the renderer's source. An entry is therefore never stale, only unused. Damaged
-or missing entries are rendered again.
+A folder's key hashes everything that determines its bytes: scene, parameters, camera, frame rate, codec,
+quality, rendered effects and the renderer's source. A frame is therefore never stale, only unused. Damaged or
+missing ones are rendered again. Nothing is kept in memory: ``camera_node.capture.ShotCache`` does that.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 import re
 import shutil
-import tempfile
-import threading
-import zlib
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
@@ -30,18 +28,15 @@ from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield import payload
+from freshfield.files import write_bytes
 
 # A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
 MAX_FRAMES = 3000
 MAX_DISK_BYTES = 2 << 30
-# Bytes that a process writes between two checks of the cache's size, which read the whole folder.
-_PRUNE_EVERY_BYTES = MAX_DISK_BYTES // 16
-MAX_MEMORY_BYTES = 32 << 20
-_MAGIC = b"FFC1"
 _NAME = re.compile("[0-9a-f]{32}")  # name of the folder of one camera's frames
-_written: dict[Path, int] = {}  # root -> bytes that this process wrote since its last check
+_pruned: set[Path] = set()  # roots that this process has pruned
 # Files of this package that do not influence what a frame looks like.
-_NOT_RENDERING = ("frame_cache.py", "effect_costs.py", "preview.py", "source.py")
+_NOT_RENDERING = ("frame_cache.py", "source.py")
 
 
 def default_folder() -> Path:
@@ -51,14 +46,14 @@ def default_folder() -> Path:
 
 
 class FrameCache:
-    """The frames of one camera at one rate. Frame k shows the scene at k / fps + phase_ns. Thread-safe.
+    """The frames of one camera at one rate. Frame k shows the scene at k / fps + phase_ns.
 
     camera_id: camera of the scene.
     fps: frames a second, kept as a fraction (29.97 is 2997/100).
     effects: of this camera, from ``load_effects``.
     codec, quality: of the encoded frames.
     folder: root of the cache; None: ``default_folder()``.
-    on_disk: False keeps frames in memory only.
+    on_disk: False renders every frame anew.
     Raises ValueError for a rate that is not positive, EffectError for effects that do not fit the scene.
 
     Attributes:
@@ -91,14 +86,12 @@ class FrameCache:
         self._effects = effects
         # Frames to which image effects are applied later are stored losslessly.
         self._stored_codec = "zstd" if effects.image else codec
-        self._memory: dict[int, bytes] = {}
-        self._memory_bytes = 0
-        self._lock = threading.Lock()
-        self._touched = False
         self._folder: Path | None = None
         if on_disk and self.repeats_after is not None:
             self._root = folder or default_folder()
             self._folder = self._root / self.key()[:32]
+            with contextlib.suppress(OSError):
+                os.utime(self._folder)  # used now: the last to be deleted
 
     @property
     def on_disk(self) -> bool:
@@ -130,13 +123,15 @@ class FrameCache:
         return self._stored(index)
 
     def fill(self, stop: Callable[[], bool] = lambda: False) -> int:
-        """Render all missing frames, until ``stop`` returns True. Returns how many were rendered. Frames can
-        be read meanwhile: a missing one is rendered at once."""
+        """Render all frames that are not on disk, until ``stop`` returns True. Returns how many were rendered.
+        Frames can be read meanwhile: a missing one is rendered at once."""
         rendered = 0
         for index in range(self.repeats_after or 0):
-            if stop():
+            if stop() or self._folder is None:
                 break
-            rendered += self._get_or_render(index)[1]
+            if self._load(index) is None:
+                self._render_and_save(index)
+                rendered += 1
         return rendered
 
     def key(self) -> str:
@@ -171,66 +166,38 @@ class FrameCache:
 
     def _stored(self, index: int) -> bytes:
         frame = self._wrapped(index)
-        return self._memory.get(frame) or self._get_or_render(frame)[0]
+        return self._load(frame) or self._render_and_save(frame)
 
-    def _get_or_render(self, frame: int) -> tuple[bytes, bool]:
-        """A frame's bytes, now in memory, and whether it was rendered."""
-        with self._lock:
-            if frame in self._memory:
-                return self._memory[frame], False
-            data = self._load(frame)
-            fresh = data is None
-            if data is None:
-                data = payload.encode(self._render(frame), self._stored_codec, self.quality)
-                self._save(frame, data)
-            self._keep_in_memory(frame, data)
-            return data, fresh
-
-    def _keep_in_memory(self, frame: int, data: bytes) -> None:
-        while self._memory and self._memory_bytes + len(data) > MAX_MEMORY_BYTES:
-            oldest = next(iter(self._memory))
-            self._memory_bytes -= len(self._memory.pop(oldest))
-        self._memory[frame] = data
-        self._memory_bytes += len(data)
-
-    def _path(self, frame: int) -> Path:
-        assert self._folder is not None
-        return self._folder / f"{frame:06d}.{self._stored_codec}"
-
-    def _load(self, frame: int) -> bytes | None:
-        if self._folder is None:
-            return None
-        try:
-            raw = self._path(frame).read_bytes()
-        except OSError:
-            return None
-        head, data = raw[:8], raw[8:]
-        if head[:4] != _MAGIC or head[4:] != zlib.crc32(data).to_bytes(4, "little"):
-            return None
+    def _render_and_save(self, frame: int) -> bytes:
+        data = payload.encode(self._render(frame), self._stored_codec, self.quality)
+        if self._folder is not None:
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                if self._root not in _pruned:  # looking through all folders takes as long as a few frames
+                    _pruned.add(self._root)
+                    prune(self._root, self._folder, MAX_DISK_BYTES)
+                # Other processes may write the same frame: it is replaced as a whole, by equal bytes.
+                write_bytes(self._path(self._folder, frame), data)
+            except OSError as error:
+                # A full or read-only disk costs time, not frames.
+                self.disk_error = f"{self._folder}: {error.strerror}"
+                self._folder = None
         return data
 
-    def _save(self, frame: int, data: bytes) -> None:
+    def _path(self, folder: Path, frame: int) -> Path:
+        return folder / f"{frame:06d}.{self._stored_codec}"
+
+    def _load(self, frame: int) -> bytes | None:
+        """The frame's bytes; None if they are missing or damaged."""
         if self._folder is None:
-            return
+            return None
+        camera, _ = self.scene.cameras[self.camera_id]
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            if not self._touched:
-                self._touched = True
-                os.utime(self._folder)
-            _prune_now_and_then(self._root, self._folder, len(data))
-            # Another process may write the same entry: each writes its own file and renames it.
-            handle, name = tempfile.mkstemp(dir=self._folder, prefix=".new-")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    file.write(_MAGIC + zlib.crc32(data).to_bytes(4, "little") + data)
-                os.replace(name, self._path(frame))
-            except OSError:
-                Path(name).unlink(missing_ok=True)
-                raise
-        except OSError as error:
-            # A full or read-only disk costs time, not frames.
-            self.disk_error = f"{self._folder}: {error.strerror}"
-            self._folder = None
+            data = self._path(self._folder, frame).read_bytes()
+            payload.check(data, self._stored_codec, camera.width, camera.height)
+        except (OSError, payload.PayloadError):
+            return None
+        return data
 
 
 def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
@@ -254,17 +221,7 @@ def renderer_version() -> str:
     return digest.hexdigest()
 
 
-def _prune_now_and_then(root: Path, keep: Path, new_bytes: int) -> None:
-    """Call ``prune`` at the process's first frame for ``root``, and whenever _PRUNE_EVERY_BYTES more were
-    written."""
-    written = _written.get(root, _PRUNE_EVERY_BYTES) + new_bytes
-    if written >= _PRUNE_EVERY_BYTES:
-        prune(root, keep)
-        written = 0
-    _written[root] = written
-
-
-def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTES) -> int:
+def prune(root: Path, keep: Path, limit_bytes: int) -> int:
     """Delete the least recently used folders of ``root``, except ``keep``, until it holds at most
     ``limit_bytes``. Returns the bytes freed. Other processes may do the same at the same time."""
     folders: list[tuple[float, int, Path]] = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import time
 from fractions import Fraction
 from pathlib import Path
 
@@ -80,19 +79,13 @@ def test_frames_can_be_read_before_and_while_it_fills(tmp_path):
     assert c.encoded(5) == seen
 
 
-def flipped(raw: bytes) -> bytes:
-    """One bit in the middle."""
-    half = len(raw) // 2
-    return raw[:half] + bytes([raw[half] ^ 1]) + raw[half + 1 :]
-
-
-@pytest.mark.parametrize("damage", [b"", b"FFC1", b"FFC1\0\0\0\0rubbish", os.urandom(900), flipped])
+@pytest.mark.parametrize("damage", [b"", b"rubbish", b"\xff\xd8\xff\xe0" * 200])
 def test_a_damaged_entry_is_rendered_again(tmp_path, damage):
     good = FrameCache(room(), "cam01", 15, folder=tmp_path)
     good.fill()
     victim = files(tmp_path)[3]
     whole = victim.read_bytes()
-    victim.write_bytes(damage(whole) if callable(damage) else damage)
+    victim.write_bytes(damage)
     c = FrameCache(room(), "cam01", 15, folder=tmp_path)
     assert c.fill() == 1
     assert c.encoded(3) == good.encoded(3)
@@ -146,18 +139,10 @@ def test_a_folder_that_cannot_be_written_costs_time_not_frames(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     c = FrameCache(room(), "cam01", 15, folder=blocked)
-    assert c.fill() == 9
+    expected = payload.encode(room().render("cam01", 3 / 15), "jpeg", 92)
+    assert c.encoded(3) == expected
     assert "file" in (c.disk_error or "")
-    assert c.fill() == 0
-    assert c.encoded(3) == FrameCache(room(), "cam01", 15, on_disk=False).encoded(3)
-
-
-def test_memory_is_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache_module, "MAX_MEMORY_BYTES", 4000)
-    c = FrameCache(room(), "cam01", 15, folder=tmp_path)
-    c.fill()
-    assert sum(map(len, c._memory.values())) == c._memory_bytes <= 4000
-    assert c.encoded(0) == FrameCache(room(), "cam01", 15, on_disk=False).encoded(0)
+    assert c.fill() == 0 and c.encoded(3) == expected
 
 
 def test_default_folder_follows_xdg(monkeypatch, tmp_path):
@@ -166,6 +151,17 @@ def test_default_folder_follows_xdg(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert default_folder() == tmp_path / "home" / ".cache" / "freshfield" / "frames"
+
+
+def test_the_first_frame_a_process_writes_makes_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache_module, "_pruned", set())
+    monkeypatch.setattr(cache_module, "MAX_DISK_BYTES", 1000)
+    old = tmp_path / f"{0:032x}"
+    old.mkdir()
+    (old / "000000.jpeg").write_bytes(bytes(2000))
+    c = FrameCache(room(), "cam01", 15, folder=tmp_path)
+    c.fill()
+    assert not old.exists() and len(files(tmp_path)) == 9
 
 
 def test_prune_deletes_the_longest_unused_first_and_nothing_else(tmp_path):
@@ -178,18 +174,6 @@ def test_prune_deletes_the_longest_unused_first_and_nothing_else(tmp_path):
     (tmp_path / "models" / "weights").write_bytes(bytes(10**5))
     assert prune(tmp_path, keep=tmp_path / f"{0:032x}", limit_bytes=2500) == 2000
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{0:032x}", f"{3:032x}", "models"]
-
-
-def test_the_folder_is_looked_through_once_and_not_for_each_camera(tmp_path, monkeypatch):
-    looked: list[Path] = []
-    monkeypatch.setattr(cache_module, "prune", lambda root, keep: looked.append(root))
-    monkeypatch.setattr(cache_module, "_PRUNE_EVERY_BYTES", 10**6)
-    for camera in ("cam01", "cam02", "cam03"):
-        FrameCache(room(), camera, 15, folder=tmp_path).fill()
-    assert looked == [tmp_path]
-    monkeypatch.setattr(cache_module, "_PRUNE_EVERY_BYTES", 1)
-    FrameCache(room(), "cam04", 15, folder=tmp_path).fill()
-    assert len(looked) == 10, "after each of nine frames"
 
 
 def _fill(folder: str, out: multiprocessing.Queue[object]) -> None:
@@ -210,18 +194,3 @@ def test_several_processes_may_fill_at_once(tmp_path):
     assert results[0] == results[1] == results[2]
     names = [p.name for p in files(tmp_path)]
     assert names == [f"{k:06d}.jpeg" for k in range(9)]
-
-
-@pytest.mark.alone
-def test_streaming_from_the_cache_costs_next_to_nothing(tmp_path):
-    """Nine cameras of 128 x 128 at 15 frames a second: the source's part of their 15 % of a core."""
-    scene = make_scene("room", {"width": 128, "height": 128, "supersample": 1, "speed_m_per_s": 8.0})
-    caches = [FrameCache(scene, f"cam{k:02d}", 15, folder=tmp_path) for k in range(9)]
-    for c in caches:
-        c.fill()
-    start = time.process_time()
-    for tick in range(150):
-        for c in caches:
-            c.read(c.content(tick))
-    share = (time.process_time() - start) / 10.0
-    assert share < 0.01
