@@ -20,7 +20,6 @@ DOCS = Path(__file__).parent
 VERDICT_WORDS = ("holds", "does not hold", "undecided")
 FIELDS = {
     "splat": "3D Gaussians",
-    "voxel": "voxel grid, no network",
     "ngp": "hash grid, small network (default)",
     "nerfacto": "hash grid, proposal sampling",
     "tensorf": "vector-matrix factors",
@@ -54,8 +53,6 @@ OPTIONS: tuple[tuple[str, tuple[tuple[str, str], ...], tuple[tuple[str, str], ..
         (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room")),
     ),
     ("random background", (("ngp", "lego"), ("splat", "lego")), (("ngp", "tile"), ("splat", "tile"))),
-    ("outlines", (("voxel", "tile"),), (("voxel", "room"),)),
-    ("diffusion", (("voxel", "room"), ("voxel", "kitchen"), ("voxel", "tile")), (("voxel", "lego"),)),
     ("no density seen by few", (), (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room"))),
     ("smoothness", (), (("ngp", "tile"), ("ngp", "room"))),
 )
@@ -301,7 +298,7 @@ def limits() -> str:
 
 def following(part: str) -> str:
     """Tables of track and drift: how far updates stay behind a fresh fit."""
-    found = _rows(part, "(room|kitchen) ")
+    found = [row for row in _rows(part, "(room|kitchen) ") if row[1] in FIELDS]
     found.sort(key=lambda row: (("room", "kitchen").index(row[0]), list(FIELDS).index(row[1])))
     last = 10 if part == "drift" else 9
     rows = [[r[0], f"`{r[1]}`", r[2], *map(_one_decimal, r[4:last])] for r in found]

@@ -30,7 +30,7 @@ FORBIDDEN = {
         "edge_server.surface",
     ),
     "edge_server.fields.common": tuple(
-        f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf", "voxel")
+        f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf")
     ),
     "edge_server.embed": ("edge_server.live", "edge_server.fields", "edge_server.page", "edge_server.report"),
     "edge_server.scheduler": ("edge_server.live", "edge_server.page", "edge_server.report"),

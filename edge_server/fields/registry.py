@@ -19,7 +19,6 @@ _PACKAGES: dict[str, str] = {
     "nerfacto": "edge_server.fields.nerfacto",
     "tensorf": "edge_server.fields.tensorf",
     "splat": "edge_server.fields.splat",
-    "voxel": "edge_server.fields.voxel",
 }
 
 

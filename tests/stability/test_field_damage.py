@@ -15,8 +15,6 @@ from edge_server.fields import Budget
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.common.trained_field import TrainedField
 from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.voxel.field import VoxelField
-from edge_server.fields.voxel.kernels.update import MAX_DENSITY
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import mean_psnr, ring
 from tests.edge_server.fields.small import healthy, tiny
@@ -49,7 +47,6 @@ THROUGH_ALL: dict[str, tuple[int, tuple[dict[str, Any], ...]]] = {
             {**_FEW, "contracted": True, "radius_m": 0.5},
         ),
     ),
-    "voxel": (20, ({}, {"contracted": True, "radius_m": 0.5}, {"parts": 7, "rays": 9, "background": "random"})),
 }
 
 
@@ -110,36 +107,9 @@ def _saturate(field: TrainedField) -> None:
     field._net.params[:] = PARAMETER_LIMIT
 
 
-def _poison_voxels(field: VoxelField) -> None:
-    field._voxels.table[::7] = np.nan
-
-
-def _poison_voxel_moments(field: VoxelField) -> None:
-    field._second_moment[::3] = np.nan
-
-
-def _poison_voxel_gradient(field: VoxelField) -> None:
-    field._gradient[0, ::3] = np.nan
-    field._dirty[0] = 1
-
-
-def _overflow_voxels(field: VoxelField) -> None:
-    field._voxels.table[:] = 1e30
-
-
-def _saturate_voxels(field: VoxelField) -> None:
-    field._voxels.table[:] = MAX_DENSITY
-
-
 @pytest.mark.parametrize(
     ("kind", "damage"),
-    [
-        *product(KINDS, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
-        ("nerfacto", _poison_proposal),
-        ("voxel", _poison_voxels),
-        ("voxel", _poison_voxel_moments),
-        ("voxel", _poison_voxel_gradient),
-    ],
+    [*product(KINDS, (_poison_table, _poison_net, _poison_moments, _poison_gradient)), ("nerfacto", _poison_proposal)],
 )
 def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) -> None:
     """What is not finite is left out, counted if it is a gradient, and gone 40 steps later."""
@@ -150,17 +120,14 @@ def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) 
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
     assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
     report = field.fit(VIEWS, Budget(steps=40))
-    counted = damage not in (_poison_moments, _poison_voxel_moments)
+    counted = damage is not _poison_moments
     assert field.dropped == report.dropped and (report.dropped > 0) == counted
     assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
     healthy(field, VIEWS)
     assert mean_psnr(field, VIEWS) > 15.0
 
 
-@pytest.mark.parametrize(
-    ("kind", "damage"),
-    [*product(KINDS, (_overflow, _saturate)), ("voxel", _overflow_voxels), ("voxel", _saturate_voxels)],
-)
+@pytest.mark.parametrize(("kind", "damage"), product(KINDS, (_overflow, _saturate)))
 def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[Any], None]) -> None:
     """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
     field = tiny(kind)

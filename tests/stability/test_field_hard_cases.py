@@ -151,7 +151,7 @@ def test_views_that_contradict_each_other(name: str) -> None:
 
 @pytest.mark.slow
 # The networks share their optimiser and their warm starts.
-@pytest.mark.parametrize("name", ["ngp", "splat", "voxel"])
+@pytest.mark.parametrize("name", ["ngp", "splat"])
 def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)

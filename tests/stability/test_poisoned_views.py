@@ -86,12 +86,12 @@ POSES: list[Poison] = [_a_meter_off, _turned, _in_millimeters]
 def each_with(
     poisons: list[Poison], soon: list[Poison], in_slow_tests: tuple[Poison, ...] = (_noise, _in_millimeters)
 ) -> pytest.MarkDecorator:
-    """Every poison with splat and voxel. Networks take ten times as long, and share with voxel what refuses
-    views: they meet ``in_slow_tests`` there, for one update, and ngp meets ``soon`` besides."""
+    """Every poison with splat. Networks take ten times as long, and share what refuses views: they meet
+    ``in_slow_tests`` there, for one update, and ngp meets ``soon`` besides."""
     cases = []
     for name in NAMES:
         for poison in poisons:
-            at_once = name in ("splat", "voxel") or (name == "ngp" and poison in soon)
+            at_once = name == "splat" or (name == "ngp" and poison in soon)
             if at_once or poison in in_slow_tests:
                 marks = [] if at_once else [pytest.mark.slow]
                 cases.append(pytest.param(name, poison, id=f"{name}-{poison.__name__}", marks=marks))
@@ -157,7 +157,7 @@ def test_a_poisoned_view_is_survived(name: str, poison: Poison) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("poison", PICTURES + POSES)
-@pytest.mark.parametrize("name", ["splat", "voxel"])
+@pytest.mark.parametrize("name", ["splat"])
 def test_a_view_that_stays_poisoned_is_survived(name: str, poison: Poison) -> None:
     _survives(name, poison, 10)
 

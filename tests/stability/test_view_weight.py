@@ -91,6 +91,6 @@ def test_of_two_that_disagree_the_heavier_one_is_believed(name: str) -> None:
     ids=["shape", "float64", "nan", "above", "below"],
 )
 def test_a_weight_that_is_none_is_refused_by_camera(weight) -> None:
-    field = tiny("voxel")
+    field = tiny("ngp")
     with pytest.raises(ValueError, match=r"cam02: weight must be float32 of shape .24, 24. within 0..1"):
         field.fit([*VIEWS[:2], replace(VIEWS[2], weight=weight)], Budget(steps=1))

@@ -48,7 +48,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "splat": ("splat", {}),
     "splat, planar": ("splat", {"flatten": 0.02, "align": 0.3}),
     "ngp": ("ngp", {}),
-    "voxel": ("voxel", {}),
 }
 # Kinds of depth for meshes, and their settings.
 DEPTHS = {"of the field": MeshSettings(sharpen=False), "sharpened": MeshSettings()}

@@ -20,7 +20,6 @@ SECONDS = 4.5
 _FAULTS_BEGIN_S = (0.3, 2.0)
 FAULTS_OVER_S = 2.5
 _SMALL: dict[str, dict[str, Any]] = {
-    "voxel": {"sizes": [16, 24], "refine_at": [10], "rays": 512, "cells": 16},
     "ngp": {
         "device": "cpu",
         "levels": 4,

@@ -19,10 +19,7 @@ from edge_server.fields.registry import field_names, make_field
 from freshfield.geometry import Pose, look_at
 from tests.work import MOST_MS, work_ms
 
-OPTIONS = {
-    "splat": {"gaussians": 512, "start": 256, "seed_cells": 16},
-    "voxel": {"sizes": [16, 32], "refine_at": [10], "rays": 1024, "cells": 16},
-}
+OPTIONS = {"splat": {"gaussians": 512, "start": 256, "seed_cells": 16}}
 SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48, "cells": 16}
 
 
@@ -199,9 +196,9 @@ def test_no_checkpoint_and_the_wrong_field(tmp_path, capsys):
     (tmp_path / "field.npz").write_bytes(b"half of it")
     assert export(tmp_path, "--points", tmp_path / "p.ply") == 2
     assert "damaged or not a checkpoint" in capsys.readouterr().err
-    saved(tmp_path, "voxel", steps=2)
+    saved(tmp_path, "ngp", steps=2)
     assert export(tmp_path, "--splats", tmp_path / "s.ply") == 2
-    assert "voxel has no Gaussians" in capsys.readouterr().err
+    assert "ngp has no Gaussians" in capsys.readouterr().err
 
 
 def test_nothing_asked_for_is_an_error(run, capsys):

@@ -122,7 +122,7 @@ def test_updates_of_a_moving_scene_keep_their_budget(name: str, each_s: float) -
     work = Work()
     field = CLASSES[name](SMALL[name], work)
     field.now = lambda: work.seconds
-    field.fit(_moving(0), Budget(steps=130))  # voxel's grid has its last size by then
+    field.fit(_moving(0), Budget(steps=130))
     field.fit(_moving(1), Budget(seconds=1.0))
     work.each_s = each_s
     for frame in (2, 3):  # by then it is known what each part of an update takes

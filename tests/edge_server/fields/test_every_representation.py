@@ -91,8 +91,6 @@ def test_a_budget_in_seconds_is_kept(name: str) -> None:
         ("tensorf", {}),
         ("tensorf", {"harmonics": 4}),
         ("splat", {}),
-        ("voxel", {}),
-        ("voxel", {"background": "random", "contracted": True}),
     ],
 )
 def test_results_are_equal_bit_for_bit_whatever_the_thread_count(name: str, extra: dict[str, Any]) -> None:
@@ -114,7 +112,7 @@ def test_results_are_equal_bit_for_bit_whatever_the_thread_count(name: str, extr
 def test_another_seed_is_another_field(name: str) -> None:
     a, b = small(name), small(name, seed=1)
     learned = "params" if name == "splat" else "table"
-    if name not in ("splat", "voxel"):  # whose first values come from the pictures, or are all the same
+    if name != "splat":  # whose first values come from the pictures
         assert not np.array_equal(a.state()[learned], b.state()[learned])
     for field in (a, b):
         field.fit(SEEN[:3], Budget(steps=1))
@@ -130,7 +128,6 @@ def test_another_seed_is_another_field(name: str) -> None:
         ("tensorf", {}, 20),  # where planes get finer,
         ("tensorf", {}, 30),  # and elsewhere
         ("splat", {}, 20),
-        ("voxel", {}, 30),
     ],
 )
 def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps: int) -> None:
@@ -141,7 +138,7 @@ def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps:
     b.load_state(before)
     for field in (a, b):
         field.fit([moved(v) for v in SEEN], Budget(steps=40))
-    if name in ("tensorf", "voxel"):
+    if name == "tensorf":
         assert a.state()["table"].size > before["table"].size
     same_state(a, b)
     if name == "nerfacto":
@@ -150,7 +147,7 @@ def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps:
 
 @every_field
 def test_a_state_of_another_kind_is_refused(name: str) -> None:
-    field, other = small(name), "ngp" if name != "ngp" else "voxel"
+    field, other = small(name), "ngp" if name != "ngp" else "tensorf"
     with pytest.raises(ValueError, match=f"a field called {other}, this one is {name}"):
         field.load_state(small(other).state())
     arrays = {name: array for name, array in field.state().items() if name != "meta"}

@@ -125,7 +125,6 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
         ("tensorf", {"density_rank": 16}, "density_rank = 8"),
         ("splat", {"harmonics": 4}, "harmonics = 1"),
         ("splat", {"gaussians": 100, "start": 100}, "holds 100 at most"),
-        ("voxel", {"sizes": (16, 32, 64)}, r"sizes = \[16, 32, 48\]"),
     ],
 )
 def test_a_state_of_another_shape_is_refused(name: str, other: dict[str, Any], text: str) -> None:

@@ -25,7 +25,6 @@ from tests.edge_server.fields.small import CLASSES, every_field
         ("nerfacto", {"bins": 40, "appearance": 4}, {"bins": 40, "appearance": 4}),
         ("tensorf", {"density_rank": 16, "upsample": [10, 20]}, {"density_rank": 16, "upsample": (10, 20)}),
         ("splat", {"gaussians": 99, "start": 9}, {"gaussians": 99, "start": 9}),
-        ("voxel", {"sizes": [16, 24], "refine_at": [10]}, {"sizes": (16, 24), "refine_at": (10,)}),
     ],
 )
 def test_make_field_passes_options_and_seed(name: str, options: dict, expected: dict) -> None:
@@ -64,7 +63,6 @@ REFUSED_ANYWHERE: list[tuple[str, Any, str]] = [
     ("decay", -1.0, "in 0.0..1000.0"),
     ("smooth", -1.0, "in 0.0..1000.0"),
     ("levels_start", 0, "in 1..24"),
-    ("prune_from", -1, "in 0..1073741824"),
     ("batch_samples", 2049, "a multiple of 2048"),
     ("threads", 0, "in 1..1024"),
     ("nice", -1, "in 0..19"),
@@ -89,8 +87,6 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         ("nerfacto", {"density_rank": 8}, r"no option density_rank; it has: effort, .*bins.*nice"),
         ("tensorf", {"levels": 3}, r"no option levels; it has: effort, density_rank, .*nice"),
         ("splat", {"rays": 4096}, r"no option rays; it has: effort, gaussians, .*device"),
-        ("voxel", {"levels": 3}, r"no option levels; it has: effort, sizes, .*nice"),
-        ("voxel", {"hidden": 16}, "no option hidden; it has"),
         ("ngp", {"levels": 99}, r"levels must be in 1..24, not 99"),
         ("nerfacto", {"bins": 4}, "bins must be in 8..1024, not 4"),
         ("nerfacto", {"proposal_cells": 30}, "proposal_cells must be a multiple of 4"),
@@ -110,11 +106,6 @@ def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: A
         ("splat", {"background": "pink"}, "#80c0ff"),
         ("splat", {"radius_m": -1.0}, "positive"),
         ("splat", {"rate_scale": float("nan")}, "rate_scale"),
-        ("voxel", {"sizes": [32, 16]}, "sizes must be rising"),
-        ("voxel", {"sizes": [32, 48], "refine_at": [9, 12]}, "refine_at must be 1 rising"),
-        ("voxel", {"refine_at": [9, 9]}, "refine_at must be rising"),
-        ("voxel", {"parts": 0}, "parts must be in 1..64, not 0"),
-        ("voxel", {"device": "cuda"}, "CPUs only"),
         # Only the kernels do these.
         ("ngp", {"device": "cuda", "exposure": True}, "exposure needs device cpu"),
         ("ngp", {"device": "cuda", "refine_m": 0.03}, "refine_m needs device cpu"),
@@ -138,7 +129,7 @@ def test_efforts_are_ordered_and_can_be_overridden(name: str) -> None:
     assert medium == type(medium)() == settings_of(name)
     for found, preset in zip((low, medium, high), efforts_of(name).values()):
         assert found == replace(medium, **preset)
-    for option in {"ngp": ("samples", "batch_samples"), "splat": ("gaussians",), "voxel": ()}.get(name, ("samples",)):
+    for option in {"ngp": ("samples", "batch_samples"), "splat": ("gaussians",)}.get(name, ("samples",)):
         assert getattr(low, option) < getattr(medium, option) < getattr(high, option)
     assert settings_of(name, {"effort": "high", "threads": 33}) == replace(high, threads=33)
 

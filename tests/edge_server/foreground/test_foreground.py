@@ -92,7 +92,7 @@ def test_the_loop_fits_to_cut_views(tmp_path):
         "cameras": {"count": 3, "held_out": ["cam00"]},
         "source": {"kind": "world", "scene": "tile", "width": 32, "height": 32, "fps": 5},
         "channel": {"preset": "ch5"},
-        "edge": {"field": "voxel", "foreground": {"box": [0.25, 0.25, 0.75, 0.75], "segment": "box"}},
+        "edge": {"field": "splat", "foreground": {"box": [0.25, 0.25, 0.75, 0.75], "segment": "box"}},
     }
     deployment = build_deployment(parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None))
     deployment.run(0.8)

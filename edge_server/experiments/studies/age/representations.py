@@ -9,8 +9,8 @@ from edge_server.experiments.studies.study import METRICS, Point, SceneStudy, St
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
 QUICK_OMEGAS = (30.0, 75.0, 120.0, 240.0)
 # Steps of one update, such that it takes about as long as one of splat on two cores.
-FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "voxel": 60, "tensorf": 150}
-QUICK_FIELDS = {"splat": 150, "ngp": 80, "voxel": 40}
+FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "tensorf": 150}
+QUICK_FIELDS = {"splat": 150, "ngp": 80}
 POLICIES = ("threshold", "wait")
 _METRICS = ("psnr_db", "psnr_moving_db", "lpips", "f_w")
 

@@ -11,7 +11,7 @@ from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 
-FIELD = "voxel"
+FIELD = "ngp"
 # Optimizer steps between renderings.
 STEPS = (15, 25, 60, 150, 250)
 INSTANT_S = 0.4

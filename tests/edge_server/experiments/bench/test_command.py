@@ -161,9 +161,9 @@ def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch, asked)
     """And of another effort; everything else is taken for known."""
     monkeypatch.setattr(bench_field, "table", lambda figures: "")
     monkeypatch.setattr(bench_field, "draw", lambda figures, path: None)
-    words = ("--resume", "--field", "ngp,voxel")
+    words = ("--resume", "--field", "ngp,tensorf")
     bench("field", tmp_path / "bench.json", *words)
-    everything = ["start ngp", "start voxel", "ngp", "voxel", "ngp", "voxel"]
+    everything = ["start ngp", "start tensorf", "ngp", "tensorf", "ngp", "tensorf"]
     assert asked == everything
     asked.clear()
     bench("field", tmp_path / "bench.json", *words)

@@ -184,8 +184,8 @@ def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
         edge_server(["bench", "limits", "--scene", "room"])
     assert "--scene is for field, track, drift, shown; asked for: limits" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        edge_server(["bench", "track", "--field", "voxel,ngp", "--option", "sizes=64"])
-    assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err
+        edge_server(["bench", "track", "--field", "tensorf", "--option", "upsample=64"])
+    assert "tensorf: upsample must be a list" in capsys.readouterr().err
 
 
 def test_an_unknown_scene_is_refused(flat, capsys):

@@ -21,7 +21,7 @@ from edge_server.experiments.frontier.update_time import (
 )
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
-from edge_server.fields.voxel import settings
+from edge_server.fields.tensorf import settings
 from edge_server.live.update_budget import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
@@ -181,7 +181,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
 
 
 def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
-    still, (effort, *_) = (synthetic_still("tile", cameras=3, size=16), effort_sweep.efforts("voxel", {}))
+    still, (effort, *_) = (synthetic_still("tile", cameras=3, size=16), effort_sweep.efforts("tensorf", {}))
     sweep = replace(command.QUICK, planned_s=(0.5,))
     measured = []
 
@@ -192,10 +192,10 @@ def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch
     monkeypatch.setattr(effort_sweep, "fit_from_scratch", fit)
     for _ in range(2):
         file = command.FrontierFile(tmp_path / "frontier.json")
-        command.Frontier(tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0)._from_scratch()
+        command.Frontier(tmp_path, file, sweep, still, "tile", ("tensorf",), [effort], None, "none", 0)._from_scratch()
     assert len(measured) == 1
     monkeypatch.setitem(settings.EFFORTS, effort.name, {"rays": 77})
-    command.Frontier(tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0)._from_scratch()
+    command.Frontier(tmp_path, file, sweep, still, "tile", ("tensorf",), [effort], None, "none", 0)._from_scratch()
     assert len(measured) == 2
 
 

@@ -1,1 +1,0 @@
-"""An explicit voxel grid (as Plenoxels, Fridovich-Keil et al. 2022)."""
