@@ -85,7 +85,7 @@ def test_a_decision_of_nobody_is_an_outcome_without_scores():
     with WorkerPool(NOTHING) as pool:
         silent = setting(NEVER)
         moments = pool.draw(silent, [3])[0]
-        for name in ("all", "threshold:50", "wait:50", "random", "freshen"):
+        for name in ("all", "threshold:50", "wait:50", "random"):
             chosen = choices(named(name), moments)
             found = pool.evaluate(silent, [(m.seed, m.number, c) for m, c in zip(moments, chosen)])
             assert all(o.psnr_db is None and o.views == 0.0 and np.isfinite(o.wait_ms) for o in found)

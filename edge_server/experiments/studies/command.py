@@ -38,11 +38,7 @@ STUDIES = {
         "Representations",
         "figure 6.7: the same trade-off with other representations",
     ),
-    "phase": (
-        "age.trade_map",
-        "Phase",
-        "where the trade-off exists: speed x delay x memory x compute, and gain of mask, freshen",
-    ),
+    "phase": ("age.trade_map", "Phase", "where the trade-off exists: speed x delay x memory x compute"),
     "viewpoints": (
         "viewpoints",
         "Viewpoints",
@@ -76,22 +72,16 @@ STUDIES = {
     "drift": (
         "learning.channel_drift",
         "Drift",
-        "the channel changes during use: fixed, learned and still learning policies",
+        "the channel changes during use: a fixed policy, and ones learned before and after",
     ),
-    "transfer": ("learning.transfer", "Transfer", "policies of one scene and channel, used on another"),
     "semantics": (
         "learning.semantics",
         "Semantics",
         "where image embeddings in the state help, and their cost where they do not",
     ),
-    "reward-cost": (
-        "learning.reward_cost",
-        "RewardCost",
-        "reward against training time, by the effort of a fit and the embedding",
-    ),
 }
 # Studies that consist of cases: --case selects some of them.
-CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "ablation", "reward-cost")
+CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "ablation")
 # Studies that train: they take long and are not part of "all".
 LEARNING = tuple(name for name, (module, *_) in STUDIES.items() if module.startswith("learning."))
 # Studies of captures: they run in this process, and are not part of "all" either.

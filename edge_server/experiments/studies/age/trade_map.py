@@ -14,30 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.statistics import (
-    Interval,
-    all_of,
-    any_of,
-    at_its_best,
-    optimum,
-    paired,
-    share_closed,
-)
-from edge_server.experiments.studies.study import LEAST_DB, Point, Study, StudyRequest, Table, Verdict, number
+from edge_server.experiments.common.statistics import any_of, at_its_best, optimum, paired
+from edge_server.experiments.studies.study import LEAST_DB, Point, Study, StudyRequest, Table, Verdict
 from edge_server.experiments.studies.trial import recording
 from edge_server.report.style import figure
 
 # Cost of a step and of an update of 18 new views: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
 # and 4.0, 66 and 93).
 CHARGED = {"ms_per_step": 3.0, "ms_per_update": 70.0}
-# Time of treating a view of 64 x 64 on the same machine.
-COST_MS = {"mask": 0.5, "freshen": 4.0}
 PERIOD_MS = 30.0
 METRIC = "psnr_moving_db"
 # Thresholds and waits: one period plus these multiples of the mean delay.
 SHARES = {"threshold": (0.5, 1.0, 2.0, 4.0), "wait": (0.5, 1.0, 2.0, 4.0)}
 QUICK_SHARES = {"threshold": (0.75, 1.5, 3.0), "wait": (1.0, 2.5)}
-OWN = ("mask", "freshen")
 
 
 @dataclass(frozen=True)
@@ -73,9 +62,6 @@ class Phase(Study):
                 for policy, value in self._policies(request, cell.delay_ms):
                     labels = {**cell.labels, "policy": policy, "omega_ms": value}
                     trial = dataclasses.replace(base, policy=policy, value=value)
-                    if cell.compute == "charged" and policy in COST_MS:
-                        charge = {**CHARGED, "ms_per_treated_view": COST_MS[policy]}
-                        trial = dataclasses.replace(trial, compute=charge)
                     found.append(Point(labels, trial))
                 ideal = dataclasses.replace(base, channel={"preset": "ideal"})
                 found.append(Point({**cell.labels, "policy": "no delay", "omega_ms": None}, ideal))
@@ -119,7 +105,6 @@ class Phase(Study):
         yield "all", None
         for policy, shares in (QUICK_SHARES if request.quick else SHARES).items():
             yield from ((policy, PERIOD_MS + share * delay_ms) for share in shares)
-        yield from ((name, None) for name in OWN)
 
     def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
         names = [f.name for f in dataclasses.fields(Cell)]
@@ -154,21 +139,6 @@ class Phase(Study):
                 max(gains, key=lambda g: g.mean),
             )
         ]
-        for policy in OWN:
-            treated = table.values(metric, policy=policy, **cell.labels)
-            share = share_closed(treated, use_all, limit) if gap.above(0.0) else None
-            over = [paired(treated, others) for _, others in best.values()]
-            found.append(
-                Verdict(
-                    about,
-                    f"{policy} beats the best threshold and the best wait.",
-                    f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
-                    f"{over[0]} above the best threshold, {over[1]} above the best wait "
-                    f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
-                    all_of(o.above(0.0) for o in over),
-                    min(over, key=lambda o: o.mean),
-                )
-            )
         return found
 
     def _draw(self, request: StudyRequest, table: Table, cells: list[Cell]) -> None:
@@ -190,7 +160,6 @@ class Phase(Study):
             use_all = table.values(METRIC, policy="all", **cell.labels)
             options = {p: _best(table, cell, METRIC, p) for p in SHARES}
             scored = {f"{p} {o:g} ms": paired(v, use_all).mean for p, (o, v) in options.items()}
-            scored |= {p: paired(table.values(METRIC, policy=p, **cell.labels), use_all).mean for p in OWN}
             name = max(scored, key=lambda p: np.nan_to_num(scored[p], nan=-np.inf))
             gains[i, j] = scored[name]
             limit = paired(table.values(METRIC, policy="no delay", **cell.labels), use_all).mean
@@ -211,10 +180,3 @@ def _best(table: Table, cell: Cell, metric: str, policy: str) -> tuple[float, di
     if not curve:
         return float("nan"), {}
     return optimum(curve).x, at_its_best(curve)
-
-
-def _percent(share: Interval | None) -> str:
-    if share is None or not np.isfinite(share.mean):
-        return "and no gap to close is shown"
-    low, high = number(100 * share.low, 0), number(100 * share.high, 0)
-    return f"{100 * share.mean:.0f} % [{low}, {high}] of the gap closed"

@@ -1,4 +1,4 @@
-"""A channel that changes during use: rewards of a fixed policy, a trained one and one that keeps learning."""
+"""A channel that changes during use: rewards of a fixed policy, and of ones trained before and after."""
 
 from __future__ import annotations
 
@@ -28,21 +28,16 @@ from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
-from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward
-from edge_server.scheduler.online.online_policy import OnlinePolicy, OnlineSettings
 
 EPISODES = {True: 40, False: 600}
 # Number of episodes of one run before and after the change.
 BEFORE, AFTER = 10, 60
-# Number of episodes whose rewards arrive together: live, rewards arrive some seconds after the decisions.
-_EPISODES_TOGETHER = 5
 AGE = -0.003
 PRICE = 0.003
 # The camera nearest to the one that rewards.
 DYING = "cam01"
-NOTHING_LOST, NOT_WITHIN = "nothing was lost", "not within the run"
-POLICIES = ("fixed", "learnt", "still learning", "learnt afterwards")
+POLICIES = ("fixed", "learnt", "learnt afterwards")
 
 Rewards = dict[str, list[float]]
 
@@ -90,7 +85,7 @@ def changes() -> dict[str, Change]:
 
 class Drift(TrainingStudy):
     name = "drift"
-    title = "The channel changes during use: fixed, learnt, and still learning"
+    title = "The channel changes during use: fixed, learnt before, learnt afterwards"
 
     def run(self, trainer: StudyTrainer, request: StudyRequest) -> Parts:
         known = changes()
@@ -128,41 +123,26 @@ def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, ru
     policies: dict[str, Policy] = {
         "fixed": fixed(rng),
         "learnt": BanditPolicy(home.actor, "learnt", rng),
-        # The default settings without a warm-up.
-        "still learning": OnlinePolicy(
-            Learner.load(home.folder / "policy.npz"), fixed(rng), "still learning", rng, OnlineSettings(warmup=0)
-        ),
         "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
     }
     rewards: Rewards = {policy: [] for policy in POLICIES}
     number = 0
     for setting, count, first in ((before, BEFORE, 0), (after, AFTER, BEFORE)):
         numbers = seeds(run + 1, "test", count, first)
-        for start in range(0, count, _EPISODES_TOGETHER):
-            part = numbers[start : start + _EPISODES_TOGETHER]
-            moments = [m for episode in trainer.pool.draw(setting, part) for m in episode]
-            for policy in POLICIES:
-                rewards[policy] += _decide(trainer, setting, policies[policy], moments, reward, number)
-            number += len(moments)
+        moments = [m for episode in trainer.pool.draw(setting, numbers) for m in episode]
+        for policy in POLICIES:
+            rewards[policy] += _decide(trainer, setting, policies[policy], moments, reward, number)
+        number += len(moments)
     return rewards
 
 
 def _decide(
     trainer: StudyTrainer, setting: Setting, policy: Policy, moments: list[DecisionPoint], reward: Reward, first: int
 ) -> list[float]:
-    """Rewards of decisions, numbered from ``first`` on, scored by the reporting cameras. An online policy
-    learns from the scores of the rewarding ones."""
+    """Rewards of decisions, numbered from ``first`` on, scored by the reporting cameras."""
     requests = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
-
-    def totals(of: Setting) -> list[float | None]:
-        found = [reward.of(outcome) for outcome in trainer.pool.evaluate(of, requests)]
-        return [r.total if r.complete else None for r in found]
-
-    if isinstance(policy, OnlinePolicy):
-        for k, total in enumerate(totals(setting)):
-            if policy.add_reward(first + k, total):
-                policy.learn()
-    return [np.nan if total is None else total for total in totals(setting.judged)]
+    found = [reward.of(outcome) for outcome in trainer.pool.evaluate(setting.judged, requests)]
+    return [r.total if r.complete and r.total is not None else np.nan for r in found]
 
 
 def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
@@ -177,17 +157,13 @@ def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
             for of in runs
         ]
 
-    recovered = [recovery(run) for of in runs for run in of]
-    text = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
     return [
         better(
             about,
-            "one that goes on learning is better than what was learnt before the change.",
-            late("still learning"),
+            "what was learnt before the change is better than the fixed policy that was best before.",
             late("learnt"),
-            f"half of what the change cost is made up after: {text} (a run each); ",
+            late("fixed"),
         ),
-        better(about, "and better than the fixed policy that was best before.", late("still learning"), late("fixed")),
         better(
             about,
             "what is learnt on the new channel is better than what was learnt on the old.",
@@ -195,20 +171,6 @@ def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
             late("learnt"),
         ),
     ]
-
-
-def recovery(run: Rewards) -> int | str:
-    """Number of decisions after the change until the online policy has recovered half of the loss.
-
-    The loss is the difference between the policy trained on the old channel and the one trained on the new.
-    If nothing was lost or the run is too short, a text is returned: NOTHING_LOST or NOT_WITHIN.
-    """
-    mine, old, new = (smoothed(_after(run[p]), 40) for p in ("still learning", "learnt", "learnt afterwards"))
-    lost = float(np.nanmean(new - old))
-    if not lost > 0.0:
-        return NOTHING_LOST
-    there = np.flatnonzero((mine - old >= 0.5 * lost) & (np.arange(len(mine)) >= 20))
-    return int(there[0]) if len(there) else NOT_WITHIN
 
 
 def _after(values: list[float]) -> np.ndarray:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.experiments.common.statistics import Interval, crossed
-from edge_server.experiments.studies.learning.predictability import by_ages
+from edge_server.experiments.common.statistics import crossed
 from edge_server.experiments.studies.learning.setup import (
     Parts,
     StudyTrainer,
@@ -20,7 +19,6 @@ from edge_server.experiments.studies.learning.setup import (
 from edge_server.experiments.studies.study import StudyRequest, Verdict
 from edge_server.experiments.training.scheduler.evaluation import Candidate, Evaluation, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles
-from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.scheduler.learned.learner_spec import Action
 
 KINDS: tuple[Action, ...] = ("wait", "threshold")
@@ -64,10 +62,8 @@ class PpoWait(TrainingStudy):
                 candidates |= trainer.actors(f"learnt-{kind}", name, setting, config)
             count = len(request.repeats(16, 100))
             evaluation = trainer.evaluate(setting, candidates, reward, count)
-            moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
-            there_is = [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
             found = rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
-            yield [*judge(case, channel, evaluation), *there_is], found
+            yield judge(case, channel, evaluation), found
 
 
 def named(channel: str, age: float, pixels: str) -> str:
@@ -126,15 +122,3 @@ def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
         )
     )
     return found
-
-
-def foreseen(case: str, kind: str, gain: Interval) -> Verdict:
-    """The verdict whether there is anything to learn. gain: result of ``by_ages``."""
-    return Verdict(
-        f"room, {case}, {kind}",
-        "the ages tell which omega is best: there is something to learn.",
-        f"a rule fitted to the rewards of every omega at every decision of the other seeds wins "
-        f"{gain.text(4)} over the best fixed one, over {gain.count} seeds.",
-        gain.above(0.0),
-        gain,
-    )

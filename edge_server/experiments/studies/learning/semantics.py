@@ -19,26 +19,22 @@ from edge_server.experiments.studies.learning.setup import (
     no_worse,
     simple_policies,
 )
-from edge_server.experiments.studies.learning.visibility import SeesMotion, VisibleMotion, embedding_areas
 from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
 from edge_server.experiments.studies.study import StudyRequest, Table, Verdict
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES, Evaluation, rows
-from edge_server.experiments.training.scheduler.setting import layout_of, seeds
+from edge_server.experiments.training.scheduler.setting import layout_of
 from edge_server.experiments.training.scheduler.trainer import Row
 from edge_server.report.style import CYCLE, figure, label_lines
 
 EPISODES = {True: 300, False: 1200}
 # scene -> (speed, pixels of the PSNR). A person walks or stands on one of four sides of the workshop.
 SCENES = {"somebody moves": (1.0, "moving"), "nothing moves": (0.0, "whole")}
-# Numbers of cameras used by the oracle, which knows the cameras that see the person.
-KNOWING = (1, 2, 3, 4)
 
 # In the figure: label of a family of policies -> prefix of their names.
 LEARNT = ("with-", "without-")
 FAMILIES = {
     "learnt with semantics": LEARNT[0],
     "learnt without": LEARNT[1],
-    "knows who sees it": "sees:",
     "thresholds": "threshold:",
     "freshest k": "freshest-k:",
     "random": "random",
@@ -66,17 +62,10 @@ class Semantics(TrainingStudy):
                 run_name = f"{self.name}-{scene.replace(' ', '-')}-{name}"
                 candidates |= trainer.actors(name, run_name, setting, config)
             count = len(request.repeats(10, 100))
-            visible = VisibleMotion(setting)
-            if speed:
-                candidates |= {f"sees:{k}": SeesMotion(visible, k) for k in KNOWING}
             evaluation = trainer.evaluate(setting, candidates, reward, count)
             here = rows(evaluation, scene=scene)
             found += here
-            verdicts = judge(scene, evaluation, on == "moving")
-            if speed:
-                moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
-                verdicts += why(scene, evaluation, embedding_areas(visible, moments))
-            yield verdicts, here
+            yield judge(scene, evaluation, on == "moving"), here
         draw(request.out / f"{self.name}.png", found)
 
 
@@ -94,7 +83,7 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
     else:
         claim = "semantics cost no more than 1 % where nothing moves."
         found = [no_worse(about, claim, seeing, blind, evaluation)]
-    fixed = [n for n in evaluation.outcomes if not n.startswith(("with", "random", "sees"))]
+    fixed = [n for n in evaluation.outcomes if not n.startswith(("with", "random"))]
     best = max(fixed, key=lambda n: interval(evaluation.rewards(n).values()).mean)
     return found + [
         better(
@@ -105,32 +94,6 @@ def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
             f"{best}, known from the very seeds; ",
         )
         for name, runs in (("with", seeing), ("without", blind))
-    ]
-
-
-def why(scene: str, evaluation: Evaluation, areas: tuple[float, float]) -> list[Verdict]:
-    """Verdicts whether the embedding shows which cameras see motion, and whether knowing this would help.
-
-    areas: result of ``embedding_areas``.
-    """
-    about, (embedding, camera) = f"tower, ch5, {scene}", areas
-    knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
-    best = max(knowing, key=lambda n: interval(evaluation.rewards(n).values()).mean)
-    return [
-        Verdict(
-            about,
-            "the embedding tells which cameras see what moves (better than which camera it is).",
-            f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
-            f"to; {camera:.2f} from which camera it is.",
-            embedding > camera,
-        ),
-        better(
-            about,
-            "who knows which cameras see what moves does better than what is learnt blindly.",
-            evaluation.rewards(best),
-            evaluation.runs("without"),
-            f"{best}, the best number of them known from the very seeds; ",
-        ),
     ]
 
 

@@ -33,8 +33,7 @@ def choose(policy: Policy, moment: DecisionPoint, number: int | None = None) -> 
             break
         at_ns = arrives_ns
         cameras = policy.select(_epoch(moment, at_ns, number), plan)
-    treatment = policy.treatment
-    return Choice(tuple(cameras), at_ns, treatment.name if treatment else "")
+    return Choice(tuple(cameras), at_ns)
 
 
 def choice_of_action(spec: Spec, action: Any, moment: DecisionPoint) -> Choice:

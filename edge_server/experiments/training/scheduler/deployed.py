@@ -7,14 +7,10 @@ episode share channel, motion and instants, so that the outcomes of one instant 
 
 from __future__ import annotations
 
-import os
-import struct
-import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +23,7 @@ from edge_server.experiments.training.scheduler.episode import SCORES, EpisodeFa
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.live.state import Publication
-from edge_server.scheduler import Epoch, Policy, SelectionWindow
-from edge_server.scheduler.fixed import Threshold
+from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision import Decision
@@ -38,17 +33,8 @@ from freshfield.scenario import Scenario
 SHOWN_EVERY_MS = 125.0
 
 
-@dataclass(frozen=True)
-class Hindsight:
-    """An oracle that knows the future: every ``hold_ms`` it takes the threshold with the highest PSNR shown
-    until the next decision. It is greedy: later effects of an action do not count."""
-
-    hold_ms: float
-    omegas_ms: tuple[float, ...]
-
-
-Judged = str | Actor | Hindsight
-"""A policy's name and value; an actor, which takes its most probable actions; or hindsight."""
+Judged = str | Actor
+"""A policy's name and value; or an actor, which takes its most probable actions."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +60,7 @@ def judge(factory: EpisodeFactory, seed: int, who: Judged) -> dict[str, Any]:
     if isinstance(who, Actor):
         policy = BanditPolicy(who, "learnt", rng)
     else:
-        policy = _Forking(who) if isinstance(who, Hindsight) else named(who)(rng)
+        policy = named(who)(rng)
     deployment, decided = _run(factory, seed, policy)
     outcome = _outcome(deployment, round(factory.setting.lead_ms * 1e6), deployment.clock.now_ns())
     found: dict[str, Any] = {
@@ -123,76 +109,13 @@ def _run(factory: EpisodeFactory, seed: int, policy: Policy) -> tuple[VirtualDep
         on_published=published,
     )
     deployment.updates.policy = policy
-    if isinstance(policy, _Forking):
-        policy.shown_db = lambda begin_ns, end_ns: _outcome(deployment, begin_ns, end_ns).psnr_db
-    try:
-        deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
-        if isinstance(policy, _Forking):
-            policy.report(deployment.clock.now_ns())
-    except BaseException:
-        if isinstance(policy, _Forking):
-            policy.fail()
-        raise
+    deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
     kept = [d for d in decisions if d.now_ns >= setting.lead_ms * 1e6]
     ends = [*(d.now_ns for d in kept[1:]), deployment.clock.now_ns()]
     states = channel_states(scenario, [d.now_ns for d in kept])
     return deployment, [
         Decided(d, _outcome(deployment, d.now_ns, end), state) for d, end, state in zip(kept, ends, states)
     ]
-
-
-class _Forking(Threshold):
-    """Tries the actions of each decision in forks of this process, which all continue from the same state."""
-
-    def __init__(self, who: Hindsight) -> None:
-        super().__init__(None, np.random.default_rng(0))
-        self._who, self._began_ns, self._until_ns = who, 0, 0
-        cv2.setNumThreads(1)  # a fork has no other threads
-        self._answer: int | None = None  # in a fork: file descriptor to which it writes its result
-        self.shown_db: Callable[[int, int], float | None] = lambda begin_ns, end_ns: None
-
-    def plan(self, epoch: Epoch) -> SelectionWindow:
-        if epoch.now_ns >= self._until_ns:
-            self.report(epoch.now_ns)
-            self._began_ns, self._until_ns = epoch.now_ns, epoch.now_ns + round(self._who.hold_ms * 1e6)
-            shown = {}
-            for omega_ms in self._who.omegas_ms:
-                self.value = omega_ms
-                if (found := self._fork()) is None:  # in the fork
-                    return super().plan(epoch)
-                shown[omega_ms] = found
-            # Of equal ones the largest, because leaving frames out must be an advantage.
-            self.value = max(shown, key=lambda omega_ms: (shown[omega_ms], omega_ms))
-        return super().plan(epoch)
-
-    def _fork(self) -> float | None:
-        """Fork. Returns the PSNR that the fork showed, -inf without a score; None in the fork itself."""
-        read, write = os.pipe()
-        pid = os.fork()
-        if pid == 0:
-            os.close(read)
-            self._answer = write
-            return None
-        os.close(write)
-        with os.fdopen(read, "rb") as pipe:
-            answer = pipe.read()
-        os.waitpid(pid, 0)
-        if len(answer) != 8:
-            raise RuntimeError("a fork that tried an action ended without a result")
-        return float(struct.unpack("d", answer)[0])
-
-    def report(self, now_ns: int) -> None:
-        """In a fork: write the PSNR shown since its decision, and end it. Otherwise do nothing."""
-        if self._answer is not None:
-            shown = self.shown_db(self._began_ns, now_ns)
-            os.write(self._answer, struct.pack("d", -np.inf if shown is None else shown))
-            os._exit(0)
-
-    def fail(self) -> None:
-        """In a fork: end it without a result. Otherwise do nothing."""
-        if self._answer is not None:
-            traceback.print_exc()
-            os._exit(1)
 
 
 def _outcome(deployment: VirtualDeployment, begin_ns: int, end_ns: int) -> Outcome:

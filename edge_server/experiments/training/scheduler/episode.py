@@ -34,7 +34,6 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
-from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
 from freshfield.frame import BufferedFrame, Frame
@@ -64,11 +63,10 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Choice:
-    """A policy's choice: the newest frames of ``cameras`` at ``at_ns``. treatment: its name, "" for none."""
+    """A policy's choice: the newest frames of ``cameras`` at ``at_ns``."""
 
     cameras: tuple[str, ...]
     at_ns: int
-    treatment: str = ""
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class Outcome:
 class DecisionPoint:
     """A decision as plain values: the policy's inputs and the frames that arrive while it waits.
 
-    state: at ``now_ns`` (6.33). arrivals: in order of reception; up to ``now_ns`` only each camera's two
+    state: at ``now_ns`` (6.33). arrivals: in order of reception; up to ``now_ns`` only each camera's
     youngest. until_ns: end of the channel's record.
     """
 
@@ -105,17 +103,6 @@ class DecisionPoint:
     def newest(self, at_ns: int) -> dict[str, Arrival]:
         """Omega(t) of (5.6): the newest arrival of each camera at ``at_ns``, in the cameras' order."""
         return _newest(self.arrivals, at_ns, self.cameras)
-
-    def earlier(self, at_ns: int) -> dict[str, Arrival]:
-        """The second-youngest arrival of each camera at ``at_ns``."""
-        newest = self.newest(at_ns)
-        found: dict[str, Arrival] = {}
-        for a in self.arrivals:
-            if a.received_ns <= at_ns and a.generated_ns < newest[a.camera].generated_ns:
-                known = found.get(a.camera)
-                if known is None or a.generated_ns > known.generated_ns:
-                    found[a.camera] = a
-        return found
 
     def next_arrival_ns(self, after_ns: int) -> int | None:
         """Instant of the first arrival after ``after_ns``; None if the record has none."""
@@ -307,23 +294,14 @@ class Episode:
         if not views:
             waited_ms = (choice.at_ns - moment.now_ns) / 1e6
             return Outcome(**dict.fromkeys(SCORES), aaoi_ms=None, views=0.0, wait_ms=waited_ms)
-        treated = len(views) if choice.treatment else 0
-        published_ns = choice.at_ns + setting.compute.charge_ns(setting.steps, treated)
-        shown = views
-        if choice.treatment:
-            before = moment.earlier(choice.at_ns)
-            earlier = self._decoded([before[c] for c in choice.cameras if c in before])
-            by_camera = {view.camera: view for view in earlier}
-            treatment = make_policy(choice.treatment, None, np.random.default_rng(0)).treatment
-            assert treatment is not None
-            shown = treatment.treat(views, by_camera, published_ns)
+        published_ns = choice.at_ns + setting.compute.charge_ns(setting.steps)
         field = self._factory.field(self.seed)
         warm = None if setting.scratch else self._warm_state(number)
         if warm is None:
             field.reset()
         else:
             field.load_state(warm)
-        field.fit(shown, Budget(steps=setting.steps))
+        field.fit(views, Budget(steps=setting.steps))
         score = self._truth.score(field.snapshot(published_ns), published_ns)
         scores = {name: None if score is None else getattr(score, name) for name in SCORES}
         aaoi_ms = float(np.mean([(published_ns - view.generated_ns) / 1e6 for view in views]))
@@ -333,20 +311,12 @@ class Episode:
     def _moment(self, number: int) -> DecisionPoint:
         setting, now_ns = self._factory.setting, self.instants_ns[number]
         record = self._recorded(now_ns)[1] if setting.flush else self._record
-        before: dict[str, list[Arrival]] = {}
-        after: list[Arrival] = []
-        for arrival in record:
-            if arrival.received_ns > now_ns:
-                after.append(arrival)
-                continue
-            kept = [a for a in before.get(arrival.camera, ()) if a.generated_ns != arrival.generated_ns]
-            before[arrival.camera] = sorted([*kept, arrival], key=lambda a: a.generated_ns)[-2:]
-        known = sorted((a for kept in before.values() for a in kept), key=lambda a: a.received_ns)
-        reported = [max(kept, key=lambda a: a.generated_ns) for kept in before.values()]
-        newest = {item.frame.camera: item for item in self._exposed(reported)}
         cameras = setting.scenario.training
+        reported = sorted(_newest(record, now_ns, cameras).values(), key=lambda a: a.received_ns)
+        after = [a for a in record if a.received_ns > now_ns]
+        newest = {item.frame.camera: item for item in self._exposed(reported)}
         state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
-        return DecisionPoint(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
+        return DecisionPoint(self.seed, number, now_ns, self._until_ns, cameras, (*reported, *after), state)
 
     def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[BufferedFrame, ...]:
         return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
@@ -365,7 +335,7 @@ class Episode:
         setting, field = self._factory.setting, self._factory.field(self.seed)
         while len(self._warm) <= number:
             moment = self.moments[len(self._warm)]
-            # The record has every delivery by then; a decision keeps only each camera's last two.
+            # The record has every delivery by then; a decision keeps only each camera's youngest.
             then_ns = moment.now_ns - round(setting.refresh_ms * 1e6)
             if self._warm:
                 field.load_state(self._warm[-1])

@@ -36,8 +36,6 @@ BASELINE_POLICIES = (
     "freshest-k:9",
     "freshest-k:12",
     "age-driven",
-    "mask",
-    "freshen",
 )
 HINDSIGHT = "hindsight"
 _REQUESTS_AT_ONCE = 400

@@ -2,10 +2,9 @@
 
 All policies run with the scenario's own seed, for the page; the learnt one and its reference also with other
 seeds, each with the same channel, motion and instants for both. To compare policies without learning over
-seeds, and hindsight of each second with these thresholds:
+seeds:
 
-    python -m edge_server.experiments.training.scheduler.policy_comparison card all whittle:1
-        hindsight:100,250,1000 --json FILE
+    python -m edge_server.experiments.training.scheduler.policy_comparison card all whittle:1 --json FILE
 
 --costs and --slower set the costs of another machine.
 """
@@ -23,9 +22,9 @@ from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import at_its_best, interval, paired
+from edge_server.experiments.common.statistics import interval, paired
 from edge_server.experiments.common.tables import number
-from edge_server.experiments.training.scheduler.deployed import Hindsight, Judged
+from edge_server.experiments.training.scheduler.deployed import Judged
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.training.scheduler.setting import seeds as seeds_of
 from edge_server.experiments.training.scheduler.workers import WorkerPool
@@ -53,7 +52,6 @@ POLICIES = (
 LEAD_MS = 5000.0
 # For how long shown images are scored, after the lead of an episode.
 SPAN_MS = 8000.0
-HINDSIGHT, HINDSIGHT_HOLD_MS = "hindsight:", 1000.0
 _SHOWN = ("psnr_db", "psnr_moving_db")
 
 
@@ -136,46 +134,26 @@ def compare(
     setting: Setting, pool: WorkerPool, seeds: range, names: Sequence[str], known: Path
 ) -> dict[str, dict[str, Any]]:
     """The fidelity that each policy shows, mean and interval over seeds, and minus that of the first one,
-    paired; hindsight also minus the fixed policy that is best on other seeds.
+    paired.
 
-    names: policies without learning, with their values; or ``hindsight:`` with its thresholds.
+    names: policies without learning, with their values.
     known: as in ``score_policies``.
     """
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for seed in seeds:  # one motion after the other, so that its images are rendered once
         for name in names:
-            runs[name] += _runs(setting, pool, range(seed, seed + 1), _named(name), "", known)
-    found = _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
-    fixed = [name for name in names if not name.startswith(HINDSIGHT)]
-    for metric in _SHOWN:
-        shown = {name: dict(zip(seeds, [run[metric] for run in of])) for name, of in runs.items()}
-        best = at_its_best({float(k): shown[name] for k, name in enumerate(fixed)})
-        for name in names:
-            if name.startswith(HINDSIGHT):
-                found[name][f"{metric}_over_fixed"] = paired(shown[name], best).rounded(4)
-    return found
-
-
-def _named(name: str) -> Judged:
-    if not name.startswith(HINDSIGHT):
-        return name
-    omegas_ms = tuple(float(ms) for ms in name.removeprefix(HINDSIGHT).split(","))
-    return Hindsight(HINDSIGHT_HOLD_MS, omegas_ms)
+            runs[name] += _runs(setting, pool, range(seed, seed + 1), name, "", known)
+    return _means(runs, seeds, (*_SHOWN, "views", "aaoi_ms"))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog=f"python -m {__spec__.name}",
         description="Compare what policies without learning show in a scenario in virtual time, over seeds, "
-        "each minus the first; and what hindsight of each second would gain.",
+        "each minus the first.",
     )
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one, with edge.compute")
-    parser.add_argument(
-        "policies",
-        nargs="+",
-        metavar="NAME[:VALUE]",
-        help="as edge.policy; hindsight:MS,MS,... takes each second the best of these thresholds",
-    )
+    parser.add_argument("policies", nargs="+", metavar="NAME[:VALUE]", help="as edge.policy")
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="number of seeds [%(default)s]")
     parser.add_argument(
         "--seconds", type=float, default=SPAN_MS / 1e3, metavar="S", help="seconds that are scored [%(default)g]"

@@ -58,7 +58,6 @@ class TrainingConfig:
         state cannot know.
     seed: seed of the episodes and of the learner.
     checkpoint_every: number of batches between checkpoints.
-    stages: numbers of batches after which the policy is also saved (``stage_file``).
     Raises TrainingError for values out of range.
     """
 
@@ -69,13 +68,10 @@ class TrainingConfig:
     tries: int = 2
     seed: int = 0
     checkpoint_every: int = 5
-    stages: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
             raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
-        if not all(1 <= stage <= self.batches for stage in self.stages):
-            raise TrainingError(f"stages: expected numbers of batches from 1 to {self.batches}")
 
     @property
     def batches(self) -> int:
@@ -90,8 +86,8 @@ class TrainingConfig:
 def train(setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
-    Writes OUT/training.jsonl (a line per batch), OUT/training.json, the ``stage_file`` of each stage and, at
-    the end, OUT/policy.npz. After KeyboardInterrupt the last checkpoint is there.
+    Writes OUT/training.jsonl (a line per batch), OUT/training.json and, at the end, OUT/policy.npz. After
+    KeyboardInterrupt the last checkpoint is there.
 
     setting: the setting that decisions are drawn from.
     pool: draws and evaluates them.
@@ -118,18 +114,11 @@ def train(setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path,
         rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
         if (number + 1) % config.checkpoint_every == 0 or number + 1 == config.batches:
             checkpoint.save(learner, rows)
-        if number + 1 in config.stages:
-            learner.save(stage_file(out, number + 1))
         spent = time.monotonic() - began
         left = spent / (number + 1 - first) * (config.batches - number - 1)
         say(f"{_progress_text(config, row)}; {left:.0f} s left")
     learner.save(out / "policy.npz")
     return learner
-
-
-def stage_file(out: Path, batches: int) -> Path:
-    """File of the policy after that many batches of a training in ``out``."""
-    return out / f"after-{batches:05d}.npz"
 
 
 def read_log(out: Path) -> list[Row]:

@@ -17,7 +17,7 @@ from edge_server.experiments.common.statistics import paired
 from edge_server.experiments.training.scheduler import command, policy_comparison
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main
-from edge_server.experiments.training.scheduler.deployed import Decided, Hindsight, _run, judge, sibling_advantages
+from edge_server.experiments.training.scheduler.deployed import Decided, _run, sibling_advantages
 from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, baseline_policies, evaluate_policies, rows
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
@@ -27,7 +27,6 @@ from edge_server.experiments.training.scheduler.trainer import (
     TrainingConfig,
     TrainingError,
     read_log,
-    stage_file,
     subtract_sibling_baseline,
     train,
 )
@@ -166,7 +165,7 @@ def test_the_sibling_baseline_is_the_mean_of_the_other_tries():
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    names = baseline_policies((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
+    names = baseline_policies((40.0, 120.0), ["threshold"], ("random", "all"))
     with WorkerPool(NOTHING) as pool:
         actor = Learner(CONFIG.spec, 0).actor
         return evaluate_policies(setting(), pool, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
@@ -304,7 +303,6 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
             "all",
             "aoii:2",
             "covariance:2",
-            "hindsight:50,200",
             "--seeds",
             "2",
             "--seconds",
@@ -321,8 +319,6 @@ def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_scored
     assert shown["all"]["psnr_db_over_all"] == [0.0, 0.0, 0.0] and shown["all"]["views"][0] > 3.0
     for name in ("aoii:2", "covariance:2"):
         assert shown[name]["views"][0] == 2.0 and shown[name]["psnr_db"][0] > 5.0
-    ahead = shown["hindsight:50,200"]
-    assert ahead["psnr_db"][0] > 5.0 and len(ahead["psnr_db_over_fixed"]) == 3
     with pytest.raises(SystemExit):
         policy_comparison.main([words[0], "all", "--slower", "0", "--json", str(compared)])
     assert "--slower 0: expected more than 0" in capsys.readouterr().err
@@ -338,14 +334,6 @@ def test_a_running_deployment_decides_as_often_as_an_update_lasts_and_takes_in_w
     decided_ms = [p.published_ns / 1e6 - p.update_ms for p in deployment.publications]
     assert len(decided_ms) > 10 and np.median(np.diff(decided_ms)) == pytest.approx(50.0)
     assert deployment.settings.most_new == 96
-
-
-def test_hindsight_with_one_decision_shows_what_the_best_threshold_shows():
-    brief = dataclasses.replace(setting(), refresh_ms=0.5, lead_ms=1.0, span_ms=1500.0)
-    factory = EpisodeFactory(brief, NOTHING)
-    fixed = [judge(factory, 5, f"threshold:{omega_ms}")["psnr_db"] for omega_ms in (20, 90, 400)]
-    found = judge(factory, 5, Hindsight(1e6, (20.0, 90.0, 400.0)))
-    assert found["psnr_db"] == max(fixed) > min(fixed)
 
 
 def test_tries_are_compared_with_the_others_that_decided_at_the_same_time():
@@ -506,16 +494,6 @@ def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path:
     with WorkerPool(NOTHING, known=known) as pool:
         pool.evaluate(setting(), asked)
         assert pool.evaluated == len(asked)
-
-
-def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path, pool: WorkerPool):
-    config = dataclasses.replace(CONFIG, stages=(1, 3))
-    learner = train(setting(), config, pool, tmp_path / "a", quiet)
-    first = train(setting(), dataclasses.replace(CONFIG, episodes=2), pool, tmp_path / "b", quiet)
-    assert same(Learner.load(stage_file(tmp_path / "a", 1)), first)
-    assert same(Learner.load(stage_file(tmp_path / "a", 3)), learner) and not same(first, learner)
-    with pytest.raises(TrainingError, match="stages"):
-        dataclasses.replace(CONFIG, stages=(4,))
 
 
 def test_other_learners_are_never_given_an_episode_that_policies_are_tested_on():
