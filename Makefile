@@ -96,7 +96,7 @@ bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, run
 	@mkdir -p runs
 	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all $(if $(DATA),peer) \
 	  --json $(if $(findstring --quick,$(BENCH)),runs/quick,docs/results)/field.json $(BENCH)
-	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
+	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 	$(PY) docs/tables.py  # the tables of docs/ are made from these files
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick

@@ -34,23 +34,20 @@ In the help of a command, [x] after an option is its default.
   channel-emu replay trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
   channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
-  channel-emu bench --seconds 20 --load 2
-  channel-emu bench --simulate
-  channel-emu accuracy --out runs/accuracy
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
 
-    Returns the exit status: 0; 1 if a replay differed, a bench lost frames or the live emulator failed; 2 for
-    bad input; 130 after Ctrl-C.
+    Returns the exit status: 0; 1 if a replay differed or the live emulator failed; 2 for bad input; 130 after
+    Ctrl-C.
     """
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_run, _add_simulate, _add_presets, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
+    for add in (_add_run, _add_simulate, _add_presets, _add_replay, _add_proxy, _add_fit):
         add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -168,12 +165,6 @@ def _add_simulate(commands: Any) -> None:
         "--slot-ms", type=float, default=1.0, metavar="MS", help="slot of the slotted mean age [%(default)g]"
     )
     sub.add_argument(
-        "--engine",
-        choices=["auto", "python", "kernel"],
-        default="auto",
-        help="python: any channel; kernel: faster, no faults but loss; same results [auto: kernel if possible]",
-    )
-    sub.add_argument(
         "--metric",
         action="append",
         default=[],
@@ -252,7 +243,6 @@ def _simulate(args: argparse.Namespace) -> int:
         args.cameras,
         args.seconds,
         args.seed,
-        engine=args.engine,
         frame_period_ms=args.frame_period_ms,
         frame_bytes=args.frame_bytes,
         slot_ms=args.slot_ms,
@@ -273,7 +263,7 @@ def _simulate(args: argparse.Namespace) -> int:
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
         **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
-        **{key: result[key] for key in ("cameras", "seconds", "seed", "engine")},
+        **{key: result[key] for key in ("cameras", "seconds", "seed")},
     }
     print(format_table([{"what": k, "value": "-" if v is None else v} for k, v in shown.items()]))
     return 0
@@ -435,83 +425,6 @@ def _fit(args: argparse.Namespace) -> int:
     if args.plot:
         report.plot(result, args.plot)
     print(json.dumps(result.summary()) if args.json else report.format_fit(result))
-    return 0
-
-
-def _add_bench(commands: Any) -> None:
-    sub = commands.add_parser(
-        "bench",
-        help="measure the live emulator on this machine: throughput and error of its delays",
-        description="Runs cameras, emulator and a sink as separate processes on loopback, with exponential "
-        "delays, every frame delivered. Prints messages a second, frames lost, a histogram of delay error. "
-        "With --simulate or --cost: links in virtual time instead.",
-    )
-    what = sub.add_mutually_exclusive_group()
-    what.add_argument(
-        "--simulate",
-        action="store_true",
-        help="measure link-slots a second in virtual time, and of a plain Python loop over slots",
-    )
-    what.add_argument(
-        "--cost",
-        action="store_true",
-        help="measure ns per frame of an ideal link, and what each fault, delay distribution and chain adds",
-    )
-    sub.add_argument("--cameras", type=int, default=18, metavar="N", help="number of cameras [%(default)s]")
-    sub.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="frames a second per camera [%(default)g]")
-    sub.add_argument("--bytes", type=int, default=20_000, metavar="N", help="bytes per frame [%(default)s]")
-    sub.add_argument("--seconds", type=float, metavar="S", help="seconds [15; with --simulate 2000, virtual]")
-    sub.add_argument("--load", type=int, default=0, metavar="N", help="busy processes running beside it [%(default)s]")
-    sub.add_argument("--no-priority", action="store_true", help="run at normal scheduling priority, not raised")
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    sub.set_defaults(go=_bench)
-
-
-def _bench(args: argparse.Namespace) -> int:
-    if args.cost:
-        from channel_emu.virtual.benchmark import bench_cost
-
-        rows = bench_cost()
-        print(json.dumps(rows) if args.json else format_table(rows))
-        return 0
-    if args.simulate:
-        from channel_emu.virtual.benchmark import bench_simulate
-
-        found = bench_simulate(args.cameras, 2000.0 if args.seconds is None else args.seconds)
-        rows = [{"what": name, "value": value} for name, value in found.items()]
-        print(json.dumps(found) if args.json else format_table(rows))
-        return 0
-    from channel_emu.live.benchmark import bench, show
-
-    seconds = 15.0 if args.seconds is None else args.seconds
-    result = bench(args.cameras, args.rate, args.bytes, seconds, args.load, not args.no_priority)
-    print(json.dumps(result) if args.json else show(result))
-    return 0 if result["lost"] == 0 else 1
-
-
-def _add_accuracy(commands: Any) -> None:
-    sub = commands.add_parser(
-        "accuracy",
-        help="measure the simulation's error against computing time and slot length",
-        description="Measures the error of the simulated mean age against its exact value: by seconds "
-        "simulated and computed, and by slot length (bias and speed).",
-    )
-    sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
-    sub.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
-    sub.add_argument("--out", type=out_folder, metavar="DIR", help="folder to write the tables (CSV) and a figure to")
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    sub.set_defaults(go=_accuracy)
-
-
-def _accuracy(args: argparse.Namespace) -> int:
-    from channel_emu.virtual.accuracy_cost import measure, show, write
-
-    if args.out:  # before measuring: it takes minutes
-        args.out.mkdir(parents=True, exist_ok=True)
-    tables = measure(args.quick, args.seed)
-    print(json.dumps(tables) if args.json else show(tables))
-    for path in write(tables, args.out) if args.out else ():
-        print(f"wrote {path}", file=sys.stderr)
     return 0
 
 

@@ -2,8 +2,7 @@
 
 Renewal argument over periods: a frame that starts in state i occupies the link for K periods, then the next
 one starts; from its delivery to the next one, the age is the frame's delay plus the time since its delivery.
-``accuracy_cost`` compares the simulator with this; ``slot_ms`` shows the bias of sampling the chain at slot
-boundaries.
+The tests compare the link with this; ``slot_ms`` shows the bias of sampling the chain at slot boundaries.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class ChainConfig:
     scope: str = "shared"
     sampled: str = "continuous"
     """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
-    the slot, as the thesis does; ``channel-emu accuracy`` measures the bias."""
+    the slot, as the thesis does; ``closed_forms`` has the bias."""
     slot_ms: float | None = None
 
     def __post_init__(self) -> None:

@@ -2,8 +2,8 @@
 
 A stateful generator would make a frame's outcome depend on how many numbers other frames used. Here number
 ``n`` of a stream is a pure function (Philox4x32-10, Salmon et al., "Parallel random numbers: as easy as
-1, 2, 3", SC 2011), so adding a camera changes nothing for the others, and the kernel in
-``virtual/kernels/philox.py`` computes the same numbers in any order.
+1, 2, 3", SC 2011), so adding a camera changes nothing for the others, and a replay that asks in another
+order gets the same numbers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Conversion and rounding of times.
 
 The emulator's times are int64 nanoseconds since the channel's origin; float milliseconds occur only in
-configurations and reports. All rounding is defined here, so the kernel and the Python link agree.
+configurations and reports. All rounding is defined here.
 """
 
 from __future__ import annotations

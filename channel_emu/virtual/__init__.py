@@ -1,1 +1,1 @@
-"""The same links simulated in virtual time, and benchmarks of accuracy against cost."""
+"""The same links simulated in virtual time, and the replay of a trace."""

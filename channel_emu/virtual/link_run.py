@@ -1,4 +1,4 @@
-"""The result of an engine for one camera, and values that both engines derive from a configuration."""
+"""The simulated frames of one camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from channel_emu.model import ages
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind
 
 OUTCOMES = (
@@ -26,7 +25,6 @@ OUTCOMES = (
     ),
 )
 OUTCOME_CODES = {name: code for code, name in enumerate(OUTCOMES)}
-DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 
 
 @dataclass(frozen=True)
@@ -62,13 +60,3 @@ class LinkRun:
         """The drawn delay of every frame that started and was due within the run."""
         done = (self.started_ns >= 0) & (self.due_ns <= self.end_ns)
         return (self.due_ns - self.started_ns)[done] / 1e6
-
-
-def name_ranks(names: list[str]) -> list[int]:
-    """Each camera's rank in the sorted names, which orders frames of the same instant."""
-    return [sorted(names).index(name) for name in names]
-
-
-def camera_period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
-    """The cameras' capture period: as given, else the configuration's, else the default."""
-    return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS

@@ -314,17 +314,6 @@ def test_a_killed_emulator_leaves_readable_books(scenario: Path, tmp_path: Path)
     assert sum(e.event == "received" for e in emulator.events) == 20
 
 
-def test_bench_loses_nothing_and_reports_its_errors(capsys) -> None:
-    assert main(["bench", "--cameras", "3", "--rate", "20", "--seconds", "1.5", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["lost"] == 0 and found["sent"] == found["arrived"] > 30
-    assert found["delay_error_ms"]["count"] == found["sent"]
-    assert 0 < found["delay_error_ms"]["p50"] <= found["arrival_error_ms"]["p50"]
-    from channel_emu.live.benchmark import show
-
-    assert "delay error" in show(found)
-
-
 def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
     from tests.channel_emu.test_testing import HELLO, Greeter
 
@@ -352,11 +341,6 @@ def test_bare_mmpp_is_the_thesiss() -> None:
     assert spelling.arrivals("mmpp") == spelling.arrivals("mmpp:1/120ms,1/30ms")
 
 
-def test_a_bench_of_no_seconds_is_refused(capsys) -> None:
-    assert main(["bench", "--simulate", "--seconds", "0"]) == 2
-    assert "seconds: expected more than 0" in capsys.readouterr().err
-
-
 def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     rows = tmp_path / "rows.csv"
@@ -365,7 +349,6 @@ def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Pat
     for words in (
         ["fit", str(rows), "--states", "1", "--out", nowhere],
         ["fit", str(rows), "--states", "1", "--plot", nowhere],
-        ["accuracy", "--quick", "--out", nowhere],
         ["simulate", "--seconds", "1", "--csv", nowhere],
         ["simulate", "--seconds", "1", "--plot", nowhere],
         ["run", str(scenario), "--no-priority", "--listen", listen, "--out", nowhere],

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import platform
-import re
 import subprocess
 import sys
 import time
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import channel_emu
 from channel_emu.live import timer
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.frame_stream import damage_payload
@@ -131,14 +128,6 @@ def test_freed_memory_is_returned() -> None:
     code = _MEMORY_AFTER_A_FLOOD
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(found.stdout) < 10.0  # 80 otherwise
-
-
-@pytest.mark.parametrize("package", ["model", "live", "virtual", "estimate"])
-def test_the_packages_import_the_model_and_not_each_other(package: str) -> None:
-    folder = Path(channel_emu.__file__).parent / package
-    text = "\n".join(file.read_text() for file in folder.rglob("*.py"))
-    found = re.findall(r"^\s*(?:from|import) channel_emu\.(\w+)", text, re.MULTILINE)
-    assert set(found) <= {"model", package}
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), max_size=30), st.integers(0, 10**9))

@@ -33,24 +33,6 @@ def test_transition_matrix_of_two_states_is_the_thesis_closed_form() -> None:
     np.testing.assert_allclose(transition_matrix(two_state_generator(mu1, mu2), u), expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize("span_ms", [0.0, 1e-6, 0.3, 10.0, 1e5])
-def test_transition_matrix_of_more_states_against_the_matrix_exponential(span_ms: float) -> None:
-    expm = pytest.importorskip("scipy.linalg").expm
-    expected = expm(THREE * span_ms)
-    np.testing.assert_allclose(transition_matrix(THREE, span_ms), expected, rtol=1e-9, atol=1e-14)
-
-
-@pytest.mark.parametrize("span_ms", [0.0, 1e-9, 1.0, 1e9, 1e15])
-def test_stiff_transition_matrices_stay_stochastic(span_ms: float) -> None:
-    for generator in (
-        two_state_generator(1e-9, 1e9),
-        np.array([[-1e9, 1e9, 0], [1e-9, -1 - 1e-9, 1], [0, 1e-9, -1e-9]]),
-    ):
-        p = transition_matrix(generator, span_ms)
-        assert (p >= 0).all()
-        np.testing.assert_allclose(p.sum(1), 1, rtol=1e-12)
-
-
 @pytest.mark.parametrize("span_ms", [1e-3, 1.0, 1e6, 3e9])
 def test_stiff_transition_matrices_keep_their_digits(span_ms: float) -> None:
     """Rates of 1e-9 and 1e9 together, against 200 digits: every probability to ten."""
@@ -121,11 +103,6 @@ def test_autocorrelation_fades_at_the_sum_of_the_rates() -> None:
         assert correlation == pytest.approx(math.exp(-(mu1 + mu2) * 5 * lag), abs=0.015)
 
 
-def test_initial_state_follows_the_stationary_distribution() -> None:
-    started = [path(two_state_generator(0.2, 0.6), seed).initial for seed in range(1000)]
-    assert np.mean(started) == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 1000) ** 0.5)
-
-
 def test_path_does_not_depend_on_how_it_is_asked() -> None:
     at = np.random.default_rng(0).integers(0, 10**11, 500)
     forwards, anyhow = path(THREE), path(THREE)
@@ -175,13 +152,3 @@ def test_degenerate_chains(slot_ms: float | None) -> None:
     absorbed = Chain(np.array([[-1.0, 1.0], [0.0, 0.0]]), CounterRng(0, "", "channel.chain"), 0, slot_ms)
     left = absorbed.segment(0)[1]
     assert left < 100 * 10**6 and absorbed.segment(left) == (1, NEVER_NS)
-
-
-@pytest.mark.parametrize("slot_ms", [None, 2.5])
-def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
-    kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
-    for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
-        chain = Chain(np.array(generator), CounterRng(9, "", "channel.chain"), None, slot_ms)
-        key = np.array(CounterRng(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11)
-        assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

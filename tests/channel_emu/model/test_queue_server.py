@@ -1,4 +1,4 @@
-"""One line for several cameras: by example, by property, and kernel against link."""
+"""One line for several cameras: by example and by property."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
-from channel_emu.virtual.simulate import OUTCOMES, simulate
+from channel_emu.virtual.simulate import simulate
 from tests.channel_emu.virtual.test_simulate import same
 
 MS = 10**6
@@ -126,48 +126,12 @@ def test_a_camera_has_one_link() -> None:
 SECTIONS = [{"discipline": discipline, "server": {"shared": True}} for discipline in DISCIPLINES]
 
 
-def kernel_and_link(section: dict, cameras: list[str], seconds: float, period_ms: float | None) -> None:
-    config = channel_from_mapping(section)
-    python = simulate(config, cameras, seconds, 7, engine="python", frame_period_ms=period_ms)
-    kernel = simulate(config, cameras, seconds, 7, engine="kernel", frame_period_ms=period_ms)
-    for a, b in zip(python.runs, kernel.runs):
-        assert a.camera == b.camera and len(a.offered_ns) > 20
-        same(a, b)
-    counts = kernel.summary()
-    assert counts["offered"] == sum(counts[name] for name in OUTCOMES)
-
-
-@pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s["discipline"])
-def test_kernel_and_link_decide_alike(section: dict) -> None:
-    """Names out of order, few waiting places, cameras that fire at one instant and Poisson ones; service by
-    the shared chain, by chains of the cameras' own, at the start and modulated."""
-    pytest.importorskip("numba")
-    cameras = ["d", "b", "a", "c"]
-    section = {"preset": "ch6", "queue_limit": 5, **section, "service": {"mean_ms": [8.0, 25.0]}}
-    for more, period_ms in (
-        ({}, None),
-        ({"chain": {"scope": "per-camera"}, "service_state": "modulated"}, 33.0),
-        ({"arrivals": {"process": "periodic", "period_ms": 30.0, "spread": True}}, None),
-        ({"service": {"mean_ms": [1e300, 0.0]}}, None),  # stuck, or through at once
-        (
-            {
-                "arrivals": {"process": "periodic", "period_ms": 30.0},
-                "service": {"law": "deterministic", "mean_ms": 10.0},
-            },
-            None,
-        ),
-    ):
-        kernel_and_link({**section, **more}, cameras, 5, period_ms)
-
-
 @pytest.mark.parametrize("discipline", DISCIPLINES)
 def test_a_shared_line_for_one_camera_is_a_line_of_its_own(discipline: str) -> None:
-    pytest.importorskip("numba")
     own = channel_from_mapping({"preset": "ch6", "discipline": discipline})
     alone = channel_from_mapping({"preset": "ch6", "discipline": discipline, "server": {"shared": True}})
-    for engine in ("python", "kernel"):
-        a, b = (simulate(config, 1, 20, 3, engine=engine).runs[0] for config in (own, alone))
-        same(a, b)
+    a, b = (simulate(config, 1, 20, 3).runs[0] for config in (own, alone))
+    assert same(a, b)
 
 
 @settings(max_examples=40, deadline=None)
@@ -213,15 +177,3 @@ def test_every_frame_ends_once_and_looking_changes_nothing(
         assert server.busy or not server.waiting
         fates.append([(t.offered_ns, t.started_ns, t.due_ns, t.outcome, t.ended_ns) for t in transits])
     assert fates[0] == fates[1]
-
-
-@pytest.mark.parametrize(
-    ("section", "why"),
-    [
-        ({"server": {"order": "round-robin"}}, "order: unknown key"),
-        ({"arrivals": {"process": "poisson", "rate_per_ms": 1, "spread": True}}, "spread: belongs to"),
-    ],
-)
-def test_mistakes_are_named(section: dict, why: str) -> None:
-    with pytest.raises(ValueError, match=why):
-        channel_from_mapping(section)

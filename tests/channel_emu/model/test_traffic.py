@@ -18,40 +18,19 @@ def chain(mu1: float, mu2: float, seed: int = 0, initial: int | None = None) -> 
 
 def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
     """Var N(w) = mean w + 2 (l1 - l2)² p1 p2 (w/r - (1 - e^(-rw))/r²); the Poisson part alone is far off."""
-    kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
-    mu1, mu2, rates, window = 1 / 300, 1 / 150, np.array([1 / 120, 1 / 10]), 200.0
-    horizon_ms = 40_000_000
-    path = chain(mu1, mu2, seed=3)
-    key = np.array(CounterRng(3, "", "channel.chain").key, np.uint64)
-    starts, states = kernel.chain_path(
-        path.sojourn_rate, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
-    )
-    arrivals_key = np.array(CounterRng(3, "cam00", "channel.arrivals").key, np.uint64)
-    found = kernel.poisson_arrivals(rates / 1e6, starts, states, arrivals_key, horizon_ms * 10**6)
-    counts = np.bincount(found // round(window * 1e6), minlength=int(horizon_ms / window))
+    mu1, mu2, rates, window, horizon_ms = 1 / 300, 1 / 150, (1 / 120, 1 / 10), 200.0, 4_000_000
+    arrivals = PoissonArrivals(rates, chain(mu1, mu2, seed=3), CounterRng(3, "cam00", "channel.arrivals"))
+    found, at_ns = [], 0
+    while (at_ns := arrivals.next_ns(at_ns, len(found))) <= horizon_ms * 10**6:
+        found.append(at_ns)
+    counts = np.bincount(np.array(found) // round(window * 1e6), minlength=int(horizon_ms / window))
     r, p1, p2 = mu1 + mu2, mu2 / (mu1 + mu2), mu1 / (mu1 + mu2)
     mean = window * (p1 * rates[0] + p2 * rates[1])
     burst = window / r - (1 - math.exp(-r * window)) / r**2
     variance = mean + 2 * (rates[0] - rates[1]) ** 2 * p1 * p2 * burst
-    assert counts.mean() == pytest.approx(mean, rel=0.01)
-    assert counts.var() == pytest.approx(variance, rel=0.01)
+    assert counts.mean() == pytest.approx(mean, rel=0.03)
+    assert counts.var() == pytest.approx(variance, rel=0.03)
     assert variance > 5 * mean
-
-
-def test_python_arrivals_are_the_kernels() -> None:
-    kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
-    path = chain(1 / 30, 1 / 50, seed=6)
-    rng = CounterRng(6, "cam00", "channel.arrivals")
-    arrivals = PoissonArrivals([1 / 120, 1 / 30], path, rng)
-    found, at_ns = [], 0
-    while (at_ns := arrivals.next_ns(at_ns, len(found))) <= 10**11:
-        found.append(at_ns)
-    pairs = path.recent(0, 2 * 10**11)
-    starts = np.array([p[0] for p in pairs] + [NEVER_NS])
-    states = np.array([p[1] for p in pairs])
-    key = np.array(rng.key, np.uint64)
-    same = kernel.poisson_arrivals(np.array([1 / 120, 1 / 30]) / 1e6, starts, states, key, 10**11)
-    assert same.tolist() == found
 
 
 def test_spending_follows_the_state() -> None:

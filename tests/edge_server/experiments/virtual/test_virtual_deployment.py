@@ -140,7 +140,7 @@ def test_the_links_decide_as_the_simulation_does(channel):
     what = scenario(channel)
     deployment = run(what, RunSettings(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
     config = channel_from_mapping(what.channel)
-    alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15, engine="python")
+    alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15)
     expected = {r.camera: r.count("delivered") for r in alone.runs}
     assert dict(deployment.delivered) == expected
 

@@ -14,62 +14,54 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.simulate import simulate
 
 MS = 10**6
-ENGINES = ["python", "kernel"]
+pytestmark = pytest.mark.stability
 
 
-def run(section: dict, engine: str = "auto", seconds: float = 10, **more):
-    if engine == "kernel":
-        pytest.importorskip("numba")
-    return simulate(channel_from_mapping(section), 2, seconds, 1, engine=engine, **more).summary()
+def run(section: dict, seconds: float = 10, **more):
+    return simulate(channel_from_mapping(section), 2, seconds, 1, **more).summary()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("discipline", DISCIPLINES)
-def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: str, engine: str) -> None:
-    found = run({"preset": "ch5", "service": {"mean_ms": 0.0}, "discipline": discipline}, engine)
+def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: str) -> None:
+    found = run({"preset": "ch5", "service": {"mean_ms": 0.0}, "discipline": discipline})
     assert found["delivered"] == found["offered"] and found["dropped"] == 0
     assert found["mean_age_ms"] == pytest.approx(15.0, abs=0.05)
     assert found["delay_ms"]["mean"] == 0.0
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("discipline", DISCIPLINES)
 @pytest.mark.parametrize("mean_ms", [1e12, 1e30, 1e300])
-def test_huge_delays_saturate(discipline: str, engine: str, mean_ms: float) -> None:
+def test_huge_delays_saturate(discipline: str, mean_ms: float) -> None:
     found = run(
         {
             "preset": "ch5",
             "service": {"law": "deterministic", "mean_ms": mean_ms},
             "queue_limit": 8,
             "discipline": discipline,
-        },
-        engine,
+        }
     )
     assert found["delivered"] == 0 and found["mean_age_ms"] is None
     assert found["in_flight"] <= 2 * 9
     assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("discipline", DISCIPLINES)
-def test_delays_equal_to_the_period_lose_nothing(discipline: str, engine: str) -> None:
+def test_delays_equal_to_the_period_lose_nothing(discipline: str) -> None:
     """Every completion falls on the next arrival's instant: the server is free for it."""
     service = {"law": "deterministic", "mean_ms": 30.0}
-    found = run({"preset": "ch5", "service": service, "discipline": discipline}, engine)
+    found = run({"preset": "ch5", "service": service, "discipline": discipline})
     assert found["offered"] - found["delivered"] - found["in_flight"] == 0
     assert found["mean_age_ms"] == pytest.approx(45.0, abs=0.1)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_chain_that_never_switches(engine: str) -> None:
+def test_a_chain_that_never_switches() -> None:
     chain = {"mu1_per_ms": 0.0, "mu2_per_ms": 0.0, "initial": "high"}
-    found = run({"preset": "ch6", "chain": chain}, engine)
+    found = run({"preset": "ch6", "chain": chain})
     assert found["state_share"] == {"low": 0.0, "high": 1.0}
     assert found["delay_ms"]["mean"] == pytest.approx(60, rel=0.25)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_chain_that_always_switches(engine: str) -> None:
+def test_a_chain_that_always_switches() -> None:
     """40 switches a millisecond: the channel is its average."""
     section = {
         "preset": "ch6",
@@ -77,7 +69,7 @@ def test_a_chain_that_always_switches(engine: str) -> None:
         "discipline": "parallel",
         "service_state": "modulated",
     }
-    found = run(section, engine, seconds=2)
+    found = run(section, seconds=2)
     assert found["state_share"]["low"] == pytest.approx(0.5, abs=0.01)
     # Speeds 1/30 and 1/60 average to 1/40.
     expected = 4 * 40 / max(found["delivered"], 1) ** 0.5
@@ -107,11 +99,10 @@ def test_rates_of_1e_minus_9_and_1e9_together() -> None:
     assert found["delay_ms"]["mean"] == pytest.approx(30, rel=0.2)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("rate", [1e-9, 1e9])
-def test_arrival_rates_at_both_ends(rate: float, engine: str) -> None:
+def test_arrival_rates_at_both_ends(rate: float) -> None:
     section = {"preset": "ch6-low", "arrivals": {"rate_per_ms": rate}, "service": {"mean_ms": 1.0}}
-    found = run(section, engine, frame_period_ms=33.0)
+    found = run(section, frame_period_ms=33.0)
     if rate < 1:  # nothing is ever sampled
         assert found["skipped"] == found["offered"] - 2 and found["delivered"] == 0
     else:  # everything is, at once
@@ -125,10 +116,10 @@ def test_service_rates_at_both_ends_under_one_chain() -> None:
         "service_state": "modulated",
         "discipline": "drop-new",
     }
-    python, kernel = run(section, "python"), run(section, "auto")
-    assert python["delivered"] == kernel["delivered"] > 0
+    found = run(section)
+    assert found["delivered"] > 0
     # A frame that starts in the slow state waits for the fast one, half a sojourn of 30 ms and more away.
-    assert 0 < python["delay_ms"]["mean"] < 60
+    assert 0 < found["delay_ms"]["mean"] < 60
 
 
 def test_a_camera_that_never_reports() -> None:
