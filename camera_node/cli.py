@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camera_node.robot import arm_cli
-from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration import command as calibrate
+from camera_node.robot.calibration import CalibrationError, calibrate_command
 from freshfield import transport
 from freshfield.files import out_folder
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -30,7 +29,7 @@ EXAMPLES = """examples:
   camera-node effects                                        effects that a source section can list
   camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
   camera-node drive-arm cell                                 move its camera around the target
-  camera-node teleop cell --stylus keyboard                  an operator moves it; or gamepad, network:PORT
+  camera-node teleop cell --stylus keyboard                  an operator moves it; or network:PORT
   camera-node doctor cell                                    what is missing on this machine
 
 In the help of a command, [x] after an option is its default.
@@ -68,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     _add_cameras(prepare)
     prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     prepare.set_defaults(run=_prepare)
-    calibrate.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
+    calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
     sources = commands.add_parser("sources", help="list the kinds of sources and their keys")
     effects = commands.add_parser("effects", help="list effects and their parameters")
     for each in (sources, effects):

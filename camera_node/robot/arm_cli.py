@@ -24,7 +24,7 @@ def add_commands(commands: Any) -> None:
         "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",
     )
-    simulate.set_defaults(run=partial(_run, "simulated_controller.command"))
+    simulate.set_defaults(run=partial(_run, "simulated_controller.simulate_command"))
     add = simulate.add_argument
     add("scenario", nargs="?", help="scenario whose source.arm gives address, robot and calibration")
     add(
@@ -56,8 +56,7 @@ def add_commands(commands: Any) -> None:
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
     add("--rounds", type=int, default=0, metavar="N", help="number of tours; 0: until Ctrl-C [%(default)s]")
-    add("--show", action="store_true", help="print the tour from the arm's joint angles and exit without moving")
-    add("--joints", metavar="DEG,...", help="with --show: start from these six joint angles, in degrees")
+    add("--show", action="store_true", help="print the tour from where the arm stands and exit without moving")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
 
     _add_teleop(commands)
@@ -71,7 +70,6 @@ source.arm.teleop.
 
   camera-node simulate-arm cell &                                   an arm on this machine
   camera-node teleop cell --stylus keyboard                         keys are listed when it starts
-  camera-node teleop cell --stylus gamepad                          hold the south button (A, cross) to move
   camera-node teleop cell --stylus network:7010                     a driver sends the stylus's poses
   camera-node teleop cell --stylus network:7010 --dry-run path.csv  no arm: write joint angles to a file
 
@@ -88,19 +86,14 @@ HD_CURRENT_BUTTONS.
 def _add_teleop(commands: Any) -> None:
     teleop = commands.add_parser(
         "teleop",
-        help="move an arm by keyboard, gamepad or a stylus on the network",
+        help="move an arm by keyboard or a stylus on the network",
         description=TELEOP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    teleop.set_defaults(run=partial(_run, "teleop.command"))
+    teleop.set_defaults(run=partial(_run, "teleop.teleop_command"))
     add = teleop.add_argument
     add("scenario", help="a scenario with a source.arm")
-    add(
-        "--stylus",
-        required=True,
-        metavar="WHICH",
-        help="keyboard, gamepad[:/dev/input/eventN], network:[HOST:]PORT [HOST: 127.0.0.1]",
-    )
+    add("--stylus", required=True, metavar="WHICH", help="keyboard, network:[HOST:]PORT [HOST: 127.0.0.1]")
     add("--dry-run", type=Path, metavar="FILE", help="write the trajectory to FILE (CSV) instead of moving an arm")
     add("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")

@@ -9,12 +9,12 @@ import pytest
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, inverse
 from freshfield.geometry import so3_exp
+from tests.camera_node.robot.calibration import known_truth as simulated
 from tests.camera_node.robot.calibration.pictures import noisy_samples
 
 X = simulated.CAMERA_IN_HAND

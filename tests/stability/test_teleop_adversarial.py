@@ -3,10 +3,7 @@ joint, speed and acceleration limits hold at every tick, and the arm can always 
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,9 +13,8 @@ from camera_node.robot.teleop.stylus import StylusSample
 from camera_node.robot.teleop.teleoperator import SILENT, Command, Teleoperator
 from tests.camera_node.robot.teleop.checks import HOME, assert_within_limits, drive, sample
 
-CONFIG = TeleopConfig(solver="dls", scale=(3.0, 3.0, 3.0), rate_hz=100.0)
+CONFIG = TeleopConfig(scale=(3.0, 3.0, 3.0), rate_hz=100.0)
 TICK_NS = 10_000_000
-SOLVERS = ["dls"] + (["pink"] if importlib.util.find_spec("pink") else [])
 
 any_float = st.floats(allow_nan=True, allow_infinity=True, width=64)
 near = st.floats(-0.4, 0.4)
@@ -65,20 +61,13 @@ def test_limits_hold_whatever_is_sent(script):
     assert_within_limits(CONFIG, run(operator, script))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @settings(max_examples=4)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_limits_hold_while_an_operator_pulls_everywhere(solver, seed):
+def test_limits_hold_while_an_operator_pulls_everywhere(seed):
     """Sound messages, so that the arm does move: wide swings, a clutch that chatters, lost and late ones."""
     rng = np.random.default_rng(seed)
     config = TeleopConfig(
-        solver=solver,
-        scale=(4.0, 4.0, 4.0),
-        rate_hz=100.0,
-        speed_rad_s=3.0,
-        acceleration_rad_s2=8.0,
-        speed_m_s=1.0,
-        gain_per_s=15.0,
+        scale=(4.0, 4.0, 4.0), rate_hz=100.0, speed_rad_s=3.0, acceleration_rad_s2=8.0, speed_m_s=1.0, gain_per_s=15.0
     )
     operator = Teleoperator(UR3E, config, HOME)
     position, way, commands = np.zeros(3), np.zeros(3), []
@@ -96,10 +85,9 @@ def test_limits_hold_while_an_operator_pulls_everywhere(solver, seed):
     assert operator.mapping.counts.engaged > 0
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_push_into_the_floor_and_into_itself_leaves_the_hand_at_rest_inside(solver):
+def test_a_push_into_the_floor_and_into_itself_leaves_the_hand_at_rest_inside():
     for way in ((0.0, 0.0, -0.004), (-0.004, 0.0, 0.0), (0.004, 0.004, 0.0), (0.0, 0.0, 0.004)):
-        config = TeleopConfig(solver=solver, rate_hz=50.0)
+        config = TeleopConfig(rate_hz=50.0)
         operator = Teleoperator(UR3E, config, HOME)
         sent = [sample(1, clutch=False)] + [
             sample((k + 1) * 20_000_000, np.array(way) * min(k, 200)) for k in range(500)
@@ -128,12 +116,10 @@ def test_silence_brings_the_arm_to_rest_within_its_limits():
 
 
 def test_the_same_messages_give_the_same_motion_to_the_last_bit():
-    for solver in SOLVERS:
-        config = TeleopConfig(solver=solver)
-        runs = []
-        for _ in range(2):
-            operator = Teleoperator(UR3E, config, HOME)
-            sent = [sample(k * TICK_NS + 1, (0.002 * k, 0.001 * k, 0.0), k > 0) for k in range(60)]
-            runs.append(drive(operator, [(k * TICK_NS, [each]) for k, each in enumerate(sent)]))
-        assert all(np.array_equal(a.joints, b.joints) for a, b in zip(*runs))
-        assert np.abs(runs[0][-1].joints - HOME).max() > 0.01
+    runs = []
+    for _ in range(2):
+        operator = Teleoperator(UR3E, TeleopConfig(), HOME)
+        sent = [sample(k * TICK_NS + 1, (0.002 * k, 0.001 * k, 0.0), k > 0) for k in range(60)]
+        runs.append(drive(operator, [(k * TICK_NS, [each]) for k, each in enumerate(sent)]))
+    assert all(np.array_equal(a.joints, b.joints) for a, b in zip(*runs))
+    assert np.abs(runs[0][-1].joints - HOME).max() > 0.01

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.config import ArmConfig, errors_of
+from camera_node.config import ArmConfig, errors_of, source_config
 from camera_node.pose.providers import FixedPose, PoseProvider
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, read_hand_eye
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
@@ -18,6 +18,14 @@ from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
+
+
+def require_arm(scenario: Scenario) -> ArmConfig:
+    """The arm of a scenario. Raises ScenarioError if it has none."""
+    arm: ArmConfig | None = getattr(source_config(scenario), "arm", None)
+    if arm is None:
+        raise ScenarioError(f"{scenario.path}: source.arm: missing: this scenario has no arm")
+    return arm
 
 
 def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
@@ -58,12 +66,12 @@ def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]
     return found
 
 
-def mount_on_hand(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64]:
-    """Flange-from-camera (4, 4) of the first camera on the hand. Raises ScenarioError if there is none."""
+def mount_on_flange(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64]:
+    """Flange-from-camera (4, 4) of the first camera on the arm. Raises ScenarioError if there is none."""
     for mount in load_hand_eyes(scenario, config, config.cameras).values():
         if mount.setup != EYE_TO_HAND:
             return mount.transform
-    raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
+    raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the arm")
 
 
 def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str]) -> dict[str, PoseProvider]:

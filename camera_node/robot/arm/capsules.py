@@ -84,25 +84,6 @@ class CapsuleModel:
         return apart - (radii[first] + radii[second]), lowest.min(axis=1)
 
 
-def link_frames(arm: ArmModel, joints: Array) -> Array:
-    """``ArmModel.link_frames`` of many postures: (T, 7, 4, 4) for joints (T, 6)."""
-    count = len(joints)
-    theta = joints + np.array(arm.theta_rad)
-    cos, sin = np.cos(theta), np.sin(theta)
-    out = np.zeros((count, 7, 4, 4))
-    out[:, 0] = np.eye(4)
-    step = np.zeros((count, 4, 4))
-    step[:, 3, 3] = 1.0
-    for i in range(6):
-        ca, sa = np.cos(arm.alpha_rad[i]), np.sin(arm.alpha_rad[i])
-        c, s = cos[:, i], sin[:, i]
-        step[:, 0, 0], step[:, 0, 1], step[:, 0, 2], step[:, 0, 3] = c, -s * ca, s * sa, arm.a_m[i] * c
-        step[:, 1, 0], step[:, 1, 1], step[:, 1, 2], step[:, 1, 3] = s, c * ca, -c * sa, arm.a_m[i] * s
-        step[:, 2, 1], step[:, 2, 2], step[:, 2, 3] = sa, ca, arm.d_m[i]
-        np.matmul(out[:, i], step, out=out[:, i + 1])
-    return out
-
-
 def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
     """Distances (...) between segments a-b and c-d, each end (..., 3); either may be a point.
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from camera_node.config import ArmConfig, PathConfig
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_hand
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
 from freshfield.clock import WallClock
@@ -57,7 +57,7 @@ def joint_states(arm: ArmConfig) -> str:
 
 def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
     """Check that the arm reaches most viewpoints of its tour."""
-    model, base, mount = arm_model(scenario, arm), base_matrix(arm), mount_on_hand(scenario, arm)
+    model, base, mount = arm_model(scenario, arm), base_matrix(arm), mount_on_flange(scenario, arm)
     tour = plan_tour(model, base, mount, tour_path)
     count = len(viewpoints(tour_path))
     summary = f"the arm reaches {tour.reached} of {count} viewpoints"

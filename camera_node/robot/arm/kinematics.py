@@ -37,8 +37,8 @@ _WRIST_FREE_SIN = 1e-9
 _REFINE_ITERATIONS = 50
 _REACHED_M = 1e-7
 _REACHED_RAD = 1e-7
-SINGULAR_SIN = math.sin(math.radians(5.0))
-SINGULAR_M = 0.02
+_SINGULAR_SIN = math.sin(math.radians(5.0))
+_SINGULAR_M = 0.02
 
 
 class KinematicsError(ValueError):
@@ -74,22 +74,20 @@ class ArmModel:
         return self.nominal or self
 
     def link_frames(self, joints: ArrayLike) -> Array:
-        """Base-from-link transforms (7, 4, 4) for joint angles (6,) in radians: the base itself, then each
-        link; the last one is the flange. For the positions of the arm's parts use ``nominal_model``. Raises
+        """Base-from-link transforms (..., 7, 4, 4) for joint angles (..., 6) in radians: the base itself, then
+        each link; the last one is the flange. For the positions of the arm's parts use ``nominal_model``. Raises
         KinematicsError for angles that are not finite."""
         q = _check_joints(joints)
-        out = np.empty((7, 4, 4))
-        out[0] = np.eye(4)
+        out = np.empty((*q.shape[:-1], 7, 4, 4))
+        out[..., 0, :, :] = np.eye(4)
         for i in range(6):
-            out[i + 1] = out[i] @ _dh_transform(
-                float(q[i]) + self.theta_rad[i], self.d_m[i], self.a_m[i], self.alpha_rad[i]
-            )
+            link = _dh_transform(q[..., i] + self.theta_rad[i], self.d_m[i], self.a_m[i], self.alpha_rad[i])
+            np.matmul(out[..., i, :, :], link, out=out[..., i + 1, :, :])
         return out
 
     def forward(self, joints: ArrayLike) -> Array:
-        """Base-from-flange transform (4, 4) for joint angles (6,) in radians (thesis 4.1)."""
-        flange: Array = self.link_frames(joints)[6]
-        return flange
+        """Base-from-flange transforms (..., 4, 4) for joint angles (..., 6) in radians (thesis 4.1)."""
+        return np.asarray(self.link_frames(joints)[..., 6, :, :])
 
     def jacobian(self, joints: ArrayLike) -> Array:
         """Geometric Jacobian (6, 6) at the flange in base axes: rows are linear (m/rad), then angular."""
@@ -99,27 +97,22 @@ class ArmModel:
         return np.concatenate([np.cross(axes, levers).T, axes.T])
 
     def singularities(self, joints: ArrayLike) -> tuple[str, ...]:
-        """Names of the singularities nearby: ``shoulder`` (the wrist's center within 2 cm of the base's
-        axis), ``elbow`` and ``wrist`` (within 5 degrees)."""
-        factors = self.singularity_factors(joints)
-        limits = (SINGULAR_M, SINGULAR_SIN, SINGULAR_SIN)
-        names = ("shoulder", "elbow", "wrist")
-        return tuple(name for name, f, limit in zip(names, factors, limits) if abs(f) < limit)
-
-    def singularity_factors(self, joints: ArrayLike) -> tuple[float, float, float]:
-        """Factors of the Jacobian's determinant: shoulder (meters), elbow and wrist (sines)."""
+        """Names of the singularities near joint angles (6,): ``shoulder`` (the wrist's center within 2 cm of
+        the base's axis), ``elbow`` and ``wrist`` (within 5 degrees)."""
         base = self.nominal_model
         q = _check_joints(joints)
-        reach = (
+        reach_m = (
             base.a_m[1] * math.cos(q[1])
             + base.a_m[2] * math.cos(q[1] + q[2])
             + base.d_m[4] * math.sin(q[1] + q[2] + q[3])
         )
-        return reach, math.sin(q[2]), math.sin(q[4])
+        factors = {"shoulder": reach_m / _SINGULAR_M, "elbow": math.sin(q[2]) / _SINGULAR_SIN}
+        factors["wrist"] = math.sin(q[4]) / _SINGULAR_SIN
+        return tuple(name for name, factor in factors.items() if abs(factor) < 1.0)
 
-    def inverse(self, target: ArrayLike, near: ArrayLike | None = None) -> list[Posture]:
-        """All postures, at most eight, that bring the flange to a target; none if the joint limits exclude
-        it.
+    def inverse(self, target: ArrayLike, near: ArrayLike | None = None) -> list[Array]:
+        """All postures (6,), at most eight, that bring the flange to a target; none if the joint limits
+        exclude it.
 
         target: base-from-flange (4, 4).
         near: joint angles (6,); each joint is shifted by full turns towards them within the limits, and the
@@ -131,17 +124,17 @@ class ArmModel:
             raise KinematicsError("the target must be a finite 4 x 4 matrix")
         start = np.zeros(6) if near is None else _check_joints(near)
         base = self.nominal_model
-        found: list[Posture] = []
+        found: list[Array] = []
         for q in _closed_form(base, wanted, float(start[5])):
             solution = q if self.nominal is None else self.refine(wanted, q)
             if solution is None or not _reaches(self.forward(solution), wanted):
                 continue
             placed = self._unwrap_near(solution, start)
-            if placed is None or any(np.abs(placed - p.joints).max() < 1e-7 for p in found):
+            if placed is None or any(np.abs(placed - p).max() < 1e-7 for p in found):
                 continue
-            found.append(Posture(placed, self.singularities(placed)))
+            found.append(placed)
         if near is not None:
-            found.sort(key=lambda p: float(np.abs(p.joints - start).max()))
+            found.sort(key=lambda p: float(np.abs(p - start).max()))
         return found
 
     def refine(self, target: ArrayLike, start: ArrayLike) -> Array | None:
@@ -173,14 +166,6 @@ class ArmModel:
         q = np.where(q > high, q - turn * np.ceil((q - high) / turn), q)
         q = np.where(q < low, q + turn * np.ceil((low - q) / turn), q)
         return q if np.all((q >= low - _REACH_TOLERANCE) & (q <= high + _REACH_TOLERANCE)) else None
-
-
-@dataclass(frozen=True)
-class Posture:
-    """An inverse-kinematics solution. joints: (6,) radians. singular: see ``ArmModel.singularities``."""
-
-    joints: Array
-    singular: tuple[str, ...]
 
 
 # Universal Robots' data sheet (https://www.universal-robots.com/articles/ur/application-installation/
@@ -265,12 +250,16 @@ def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
     return postures
 
 
-def _dh_transform(theta: float, d: float, a: float, alpha: float) -> Array:
-    """Rz(theta) Tz(d) Tx(a) Rx(alpha), (4, 4)."""
-    ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-    return np.array(
-        [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
-    )
+def _dh_transform(theta: ArrayLike, d: float, a: float, alpha: float) -> Array:
+    """Rz(theta) Tz(d) Tx(a) Rx(alpha), (..., 4, 4) for angles (...)."""
+    ct, st = np.cos(theta), np.sin(theta)
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    out = np.zeros((*np.shape(theta), 4, 4))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2], out[..., 0, 3] = ct, -st * ca, st * sa, a * ct
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2], out[..., 1, 3] = st, ct * ca, -ct * sa, a * st
+    out[..., 2, 1], out[..., 2, 2], out[..., 2, 3] = sa, ca, d
+    out[..., 3, 3] = 1.0
+    return out
 
 
 def pose_difference(now: Array, wanted: Array) -> Array:
@@ -291,7 +280,7 @@ def _wrapped(q: Array) -> Array:
 
 def _check_joints(values: ArrayLike) -> Array:
     q = np.asarray(values, dtype=np.float64)
-    if q.shape != (6,) or not np.all(np.isfinite(q)):
+    if q.shape[-1:] != (6,) or not np.all(np.isfinite(q)):
         raise KinematicsError(f"expected six finite joint angles, got {values!r}")
     return q
 

@@ -1,9 +1,10 @@
 """Plans a tour of viewpoints around a target for a camera on an arm.
 
 A viewpoint is left out if the arm cannot reach it, reaches it only near a singularity, or has no free path to
-it (see ``roadmap``). The floor check looks at joint centers only, so ``floor_m`` must include the thickness
-of links, camera and cable. Other obstacles are unknown: on a real bench, watch the first round with a hand on
-the stop.
+it. A path is a straight line in joint space on which the arm keeps clear of itself, of a camera of usual size
+on its flange, and of one floor. The floor check looks at joint centers only, so ``floor_m`` must include the
+thickness of links, camera and cable. Other obstacles are unknown: on a real bench, watch the first round with a
+hand on the stop.
 """
 
 from __future__ import annotations
@@ -16,11 +17,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.config import PathConfig
+from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.roadmap import Roadmap, is_free
 from freshfield.geometry import look_at, se3_inverse
 
 Array = NDArray[np.float64]
+
+FARTHEST_RAD = 2.0
+"""Largest turn of a joint in one move."""
+_CHECKED_POSTURES = 24  # tested along a path
+_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and its mount
+_MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
 
 
 class PathError(ValueError):
@@ -60,8 +67,8 @@ def _roll(angle_deg: float) -> Array:
 class Tour:
     """A tour of an arm.
 
-    stops: joint angles (6,) in the order of the drive. A viewpoint may be visited more than once.
-    places: for each stop, the number of its viewpoint in ``viewpoints``.
+    stops: joint angles (6,) in the order of the drive, with the ways back through earlier ones.
+    places: numbers of the viewpoints visited, in order.
     """
 
     stops: list[Array]
@@ -70,39 +77,36 @@ class Tour:
     @property
     def reached(self) -> int:
         """Number of viewpoints visited."""
-        return len(set(self.places))
+        return len(self.places)
 
     def reached_by_ring(self, path: PathConfig) -> list[int]:
         """Number of viewpoints visited in each ring, in the order of ``path.elevations_deg``."""
         elevations_deg = [elevation_deg for elevation_deg, _ in _places(path)]
-        visited_deg = [elevations_deg[place] for place in set(self.places)]
+        visited_deg = [elevations_deg[place] for place in self.places]
         return [visited_deg.count(elevation_deg) for elevation_deg in path.elevations_deg]
 
 
-def plan_tour(arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, start: ArrayLike | None = None) -> Tour:
-    """Plan a tour that always goes on to the nearest viewpoint left, if necessary through earlier ones.
+def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start: ArrayLike | None = None) -> Tour:
+    """Plan a tour that goes on to the nearest viewpoint left; where no straight path leads on, it goes back.
 
     base: world-from-base (4, 4).
-    hand_eye: flange-from-camera (4, 4).
+    mount: flange-from-camera (4, 4).
     start: current joint angles (6,); the tour begins near them, with a viewpoint to which the path is free.
     Raises PathError if the arm can visit fewer than three viewpoints.
     """
     poses = viewpoints(path)
     begin = None if start is None else np.asarray(start, dtype=np.float64)
-    postures = _postures(arm, base, hand_eye, path, poses, begin)
-    if begin is not None:
-        postures.sort(key=lambda each: float(np.abs(each[0] - begin).max()))
-    roadmap = Roadmap(arm, base, [joints for joints, _ in postures], [k for _, k in postures], path.floor_m)
-    best = Tour([], [])
-    for joints, k in postures:
-        # The first posture decides which viewpoints a tour can reach. Every posture that an earlier search
-        # visited reaches the same ones.
-        if best.reached == roadmap.reachable:
-            break
-        if roadmap.has_visited(joints):
+    joints, places = _free_postures(arm, base, mount, path, poses, begin)
+    order = np.arange(len(joints)) if begin is None else np.argsort(np.abs(joints - begin).max(axis=1), kind="stable")
+    best, visited = Tour([], []), np.zeros(len(joints), np.bool_)
+    for k in order:
+        # Every posture that an earlier tour came through leads to the same viewpoints.
+        if best.reached == len(set(places.tolist())) or visited[k]:
             continue
-        if is_free(arm, base, joints if begin is None else begin, joints, path.floor_m).all():
-            best = max(best, _extend_tour(roadmap, len(poses), joints, k), key=lambda each: each.reached)
+        if begin is None or is_free(arm, base, begin, joints[k], path.floor_m).all():
+            tour, used = _extend_tour(arm, base, path.floor_m, joints, places, int(k))
+            visited |= used
+            best = max(best, tour, key=lambda each: each.reached)
     if best.reached < 3:
         raise PathError(
             f"the arm reaches {best.reached} of {len(poses)} viewpoints: change radius_m, elevations_deg, "
@@ -111,43 +115,82 @@ def plan_tour(arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, sta
     return best
 
 
-def reachable(
-    arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, poses: Sequence[Array]
-) -> NDArray[np.bool_]:
+def reachable(arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array]) -> NDArray[np.bool_]:
     """Whether the arm can hold the camera at each pose, (N,): in a posture that is not singular and touches
     neither itself nor the floor. Paths to the poses are not checked.
 
     poses: camera-to-world (N, 4, 4).
     Other arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are used.
     """
-    found = _postures(arm, base, hand_eye, path, poses, None)
-    joints, places = np.reshape([q for q, _ in found], (-1, 6)), np.array([k for _, k in found], np.int64)
     out = np.zeros(len(poses), np.bool_)
-    out[places[is_free(arm, base, joints, joints, path.floor_m)]] = True
+    out[_free_postures(arm, base, mount, path, poses, None)[1]] = True
     return out
 
 
-def _postures(
-    arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, poses: Sequence[Array], near: Array | None
-) -> list[tuple[Array, int]]:
-    """Joint angles (6,) that bring the camera to each of ``poses``, with the pose's number."""
-    camera_to_flange, base_inverse = se3_inverse(hand_eye), se3_inverse(base)
-    return [
-        (p.joints, k)
+def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> NDArray[np.bool_]:
+    """Whether straight paths in joint space are free (N,): the arm's parts keep their distance, and every
+    joint center beyond the shoulder stays above the floor.
+
+    base: world-from-base (4, 4).
+    a, b: joint angles of both ends, (6,) or (N, 6).
+    floor_m: height of the floor in the world.
+    """
+    a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
+    share = np.linspace(0.0, 1.0, _CHECKED_POSTURES)[:, None, None]
+    frames = arm.nominal_model.link_frames((a + share * (b - a)).reshape(-1, 6))
+    lowest_m = (base @ frames)[:, 2:, 2, 3].min(axis=1)
+    apart_m = CapsuleModel(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
+    free = (lowest_m >= floor_m) & (apart_m >= _MARGIN_M)
+    return np.asarray(free.reshape(_CHECKED_POSTURES, -1).all(axis=0))
+
+
+def _free_postures(
+    arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array], near: Array | None
+) -> tuple[Array, NDArray[np.int64]]:
+    """Joint angles (N, 6) that bring the camera to ``poses``, not singular and free, and each pose's number."""
+    camera_to_flange, base_inverse = se3_inverse(mount), se3_inverse(base)
+    found = [
+        (joints, k)
         for k, pose in enumerate(poses)
         for turn in path.rolls_deg
-        for p in arm.inverse(base_inverse @ pose @ _roll(turn) @ camera_to_flange, near)
-        if not p.singular
+        for joints in arm.inverse(base_inverse @ pose @ _roll(turn) @ camera_to_flange, near)
+        if not arm.singularities(joints)
     ]
+    postures = np.reshape([joints for joints, _ in found], (-1, 6))
+    places = np.array([k for _, k in found], dtype=np.int64)
+    free = is_free(arm, base, postures, postures, path.floor_m) if found else np.zeros(0, np.bool_)
+    return postures[free], places[free]
 
 
-def _extend_tour(roadmap: Roadmap, count: int, first: Array, place: int) -> Tour:
-    """Tour of ``count`` viewpoints that begins with the posture ``first`` (6,) at viewpoint ``place``."""
-    stops, places = [first], [place]
-    left = set(range(count)) - {place}
-    while left and (steps := roadmap.shortest_path(stops[-1], left)) is not None:
-        for joints, visited in steps:
-            stops.append(joints)
-            places.append(visited)
-            left.discard(visited)
-    return Tour(stops, places)
+def _extend_tour(
+    arm: ArmModel, base: Array, floor_m: float, joints: Array, places: NDArray[np.int64], first: int
+) -> tuple[Tour, NDArray[np.bool_]]:
+    """The tour that begins with posture ``first`` of ``joints`` (N, 6), and which postures led on (N,).
+
+    Depth first: from each stop to the nearest posture of a viewpoint left; back where there is none.
+    """
+    low, high = np.array(arm.lower_rad), np.array(arm.upper_rad)
+    stops, visited = [joints[first]], [int(places[first])]
+    used = np.zeros(len(joints), np.bool_)
+    used[first] = True
+    trail = [joints[first]]
+    back: list[Array] = []
+    while trail:
+        at = trail[-1]
+        # Shifted by full turns towards the present posture.
+        near = joints + 2.0 * np.pi * np.round((at - joints) / (2.0 * np.pi))
+        far_rad = np.abs(near - at).max(axis=1)
+        left = ~np.isin(places, visited) & np.all((near >= low) & (near <= high), axis=1) & (far_rad <= FARTHEST_RAD)
+        order = np.flatnonzero(left)[np.argsort(far_rad[left], kind="stable")]
+        step = next((k for k in order if is_free(arm, base, at, near[k], floor_m)[0]), None)
+        if step is None:
+            trail.pop()
+            back += trail[-1:]
+            continue
+        # Ways back that lead nowhere are not driven: they are added only before a further viewpoint.
+        stops += [*back, near[step]]
+        visited.append(int(places[step]))
+        used[step] = True
+        trail.append(near[step])
+        back = []
+    return Tour(stops, visited), used

@@ -13,7 +13,3 @@ WANT_MM = 0.5  # a guided session ends when the standard deviation of the transl
 
 class CalibrationError(ValueError):
     """The data do not determine a calibration. The message says why and what to do."""
-
-
-class ArmStopped(Exception):
-    """The arm of a session stopped and cannot move again. The message says why."""

@@ -16,7 +16,8 @@ import tty
 import numpy as np
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.stylus import PoseIntegrator, StylusSample
+from camera_node.robot.teleop.stylus import FARTHEST_M, StylusSample
+from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 KEYS = """\
   w s   forwards, back (x)       i k   tip up, down
@@ -49,7 +50,8 @@ class KeyboardStylus:
     def __init__(self, fd: int | None = None) -> None:
         self._fd = sys.stdin.fileno() if fd is None else fd
         self.ended = False
-        self._hand, self._clutch = PoseIntegrator(), False
+        self._clutch = False
+        self._position, self._quaternion = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         try:
             self._before = termios.tcgetattr(self._fd)
             tty.setcbreak(self._fd)
@@ -58,7 +60,7 @@ class KeyboardStylus:
 
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``. Returns one sample, also if no key was pressed."""
-        shift = np.zeros(6)
+        step = np.zeros(6)
         for key in self._read():
             if key in ("q", _END_OF_FILE):
                 self.ended = True
@@ -66,9 +68,13 @@ class KeyboardStylus:
                 self._clutch = not self._clutch
             elif key in _MOVES:
                 axis, sign = _MOVES[key]
-                shift[axis] += sign * (_STEP_M if axis < 3 else _STEP_RAD)
-        self._hand.shift(shift[:3], shift[3:])
-        return [self._hand.advance(now_ns, np.zeros(3), np.zeros(3), self._clutch and not self.ended)]
+                step[axis] += sign * (_STEP_M if axis < 3 else _STEP_RAD)
+        half = 0.5 * FARTHEST_M  # with the clutch open it may move without end
+        self._position = np.clip(self._position + step[:3], -half, half)
+        turned = matrix_to_quaternion(so3_exp(step[3:]))
+        self._quaternion = quaternion_normalize(quaternion_multiply(turned, self._quaternion))
+        (x, y, z), (qw, qx, qy, qz) = self._position.tolist(), self._quaternion.tolist()
+        return [StylusSample(now_ns, (x, y, z), (qw, qx, qy, qz), self._clutch and not self.ended)]
 
     def close(self) -> None:
         """Restore the terminal's settings."""

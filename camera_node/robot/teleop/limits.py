@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel, link_frames
+from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -52,7 +52,7 @@ class JointLimits:
         up = np.minimum(self._speed, self._max_stoppable_speed(self.high - q))
         down = np.maximum(-self._speed, -self._max_stoppable_speed(q - self.low))
         change = np.minimum(np.maximum(wanted, down), up) - v
-        # All changes are scaled alike, by the largest one, so that the hand keeps its direction.
+        # All changes are scaled alike, by the largest one, so that the flange keeps its direction.
         most = float(np.abs(change).max())
         change *= min(1.0, self._change / most) if most > 0.0 else 1.0
         allowed = np.minimum(np.maximum(v + change, down), up)
@@ -128,7 +128,7 @@ class Limiter:
         """The limit that a stop from (q, v) would break, or None."""
         path, _ = self.joint_limits.stop(q, v)
         arm = self.shape.arm
-        frames = link_frames(arm, np.concatenate([self.q[None], path]))
+        frames = arm.link_frames(np.concatenate([self.q[None], path]))
         flange = frames[:, 6, :3, 3]
         if np.any(flange[1:] < self._low_m) or np.any(flange[1:] > self._high_m):
             return "box"
@@ -137,7 +137,7 @@ class Limiter:
         if np.einsum("ij,ij->i", steps, steps).max() > most:
             return "speed"
         apart, lowest = self.shape.clearance(
-            frames[1:] if arm.nominal_model is arm else link_frames(arm.nominal_model, path)
+            frames[1:] if arm.nominal_model is arm else arm.nominal_model.link_frames(path)
         )
         if lowest.min() < self.config.floor_m + _ROUNDING:
             return "floor"
@@ -155,14 +155,14 @@ class Limiter:
                 f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
                 "its limit: turn it back with the pendant"
             )
-        at = link_frames(self.shape.arm, q[None])[0, 6, :3, 3]
+        at = self.shape.arm.forward(q)[:3, 3]
         if np.any(at < self._low_m) or np.any(at > self._high_m):
             raise TeleopError(
                 f"the flange stands at {np.round(at, 3).tolist()} m, outside the workspace "
                 f"{c.workspace_low_m} to {c.workspace_high_m}: move it inside, or change workspace_low_m and "
                 "workspace_high_m"
             )
-        apart, lowest = self.shape.clearance(link_frames(self.shape.arm.nominal_model, q[None]))
+        apart, lowest = self.shape.clearance(self.shape.arm.nominal_model.link_frames(q[None]))
         if lowest[0] < c.floor_m + _ROUNDING:
             raise TeleopError(f"a part of the arm stands {lowest[0]:.3f} m high, below floor_m {c.floor_m:g}")
         if apart.min() < c.margin_m + _ROUNDING:

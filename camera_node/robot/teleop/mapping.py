@@ -1,4 +1,4 @@
-"""Maps poses of the stylus to target poses of the hand: a scaled map with a clutch (4.1).
+"""Maps poses of the stylus to target poses of the flange: a scaled map with a clutch (4.1).
 
 ``p_ee = p_ee0 + S R (p_h - p_h0)``: both references are the poses of arm and stylus when the clutch is
 pressed. So pressing it commands no motion, wherever the stylus is. A stylus that jumps from one message to
@@ -52,14 +52,14 @@ class Mapping:
         self._scale = np.array(self.config.scale)
         self._low, self._high = np.array(self.config.workspace_low_m), np.array(self.config.workspace_high_m)
         self._filter = OneEuro(self.config.filter_hz, self.config.filter_hz_s_m)
-        # Hand pose (4, 4), and position (3,) and rotation (3, 3) of the stylus, when the clutch was pressed.
+        # Flange pose (4, 4), and position (3,) and rotation (3, 3) of the stylus, when the clutch was pressed.
         self._reference: tuple[Array, Array, Array] | None = None
         self._last: tuple[int, Array, Array] | None = None
         # A clutch that is held in the first message does not count: it must be released once.
         self._released = False
 
-    def add_sample(self, sample: StylusSample, hand: Array) -> bool:
-        """Process a message. hand: the commanded pose (4, 4). Returns False for a message that is invalid or
+    def add_sample(self, sample: StylusSample, flange: Array) -> bool:
+        """Process a message. flange: the commanded pose (4, 4). Returns False for a message that is invalid or
         older than the last one, which is counted and otherwise ignored."""
         if not sample.is_valid():
             self.counts.unsound += 1
@@ -79,7 +79,7 @@ class Mapping:
         if not sample.clutch:
             self._released = True
         elif self._released:
-            self._follow(position, quaternion, dt_s, hand)
+            self._follow(position, quaternion, dt_s, flange)
         return True
 
     def silence(self) -> None:
@@ -100,19 +100,19 @@ class Mapping:
         angle = 2.0 * math.acos(min(1.0, abs(float(turned @ quaternion))))
         return bool(np.abs(position - before).max() > self.config.jump_m or angle > self.config.jump_rad)
 
-    def _follow(self, position: Array, quaternion: Array, dt_s: float, hand: Array) -> None:
+    def _follow(self, position: Array, quaternion: Array, dt_s: float, flange: Array) -> None:
         position, quaternion = self._filter(position, quaternion, dt_s)
         rotation = quaternion_to_matrix(quaternion)
         if self._reference is None:
-            self._reference = hand.copy(), position.copy(), rotation
+            self._reference = flange.copy(), position.copy(), rotation
             self.counts.engaged += 1
-        hand_0, position_0, rotation_0 = self._reference
-        target = hand_0.copy()
-        moved = hand_0[:3, 3] + self._scale * (self._axes @ (position - position_0))
+        flange_0, position_0, rotation_0 = self._reference
+        target = flange_0.copy()
+        moved = flange_0[:3, 3] + self._scale * (self._axes @ (position - position_0))
         # The target stays inside the box and returns from its wall together with the stylus.
         target[:3, 3] = np.clip(moved, self._low, self._high)
         if self.config.orientation:
             turn = self._axes @ rotation @ rotation_0.T @ self._axes.T
             # Products of rotations drift; the conversion to a quaternion keeps them rigid.
-            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ hand_0[:3, :3]
+            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ flange_0[:3, :3]
         self.target = target

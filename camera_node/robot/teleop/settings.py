@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from camera_node.bounds import Bounded, bounded, one_of
+from camera_node.bounds import Bounded, bounded
 
 Vector3 = tuple[float, float, float]
-
-SOLVERS = ("auto", "pink", "dls")
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,6 @@ class TeleopConfig(Bounded):
     margin_m: distance between parts of the arm that are not neighbors.
     floor_m: lowest height of the arm's parts beyond the shoulder.
     tool_m, tool_radius_m: the camera and its mount, as a capsule along the flange's axis.
-
-    solver: pink (extra ``teleop``), dls (damped least squares, no extra), or auto: pink if it is installed.
     """
 
     scale: Vector3 = (1.0, 1.0, 1.0)
@@ -56,7 +52,6 @@ class TeleopConfig(Bounded):
     floor_m: float = bounded(0.0, -2.0, 1.0)
     tool_m: float = bounded(0.08, 0.0, 0.5)
     tool_radius_m: float = bounded(0.04, 1e-3, 0.2)
-    solver: str = one_of("auto", SOLVERS)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.teleop.ik_solver import make_solver
+from camera_node.robot.teleop.damped_least_squares import joint_speeds
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.mapping import Mapping
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -47,7 +47,6 @@ class Teleoperator:
     def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
         self.arm, self.config = arm, config
         self.limiter = Limiter(arm, config, joints)
-        self.solver = make_solver(arm, config)
         self.mapping = Mapping(config)
         self.state = WAITING
         self.ticks = 0
@@ -56,11 +55,11 @@ class Teleoperator:
 
     def tick(self, now_ns: int, samples: Iterable[StylusSample]) -> Command:
         """The command of this tick, given the messages since the last one."""
-        hand = self.arm.forward(self.limiter.q)
+        flange = self.arm.forward(self.limiter.q)
         if self._heard_ns is not None and now_ns < self._heard_ns:
             self._heard_ns = now_ns  # the clock was set back: restart the watchdog
         for sample in samples:
-            if self.mapping.add_sample(sample, hand):
+            if self.mapping.add_sample(sample, flange):
                 self._heard_ns, self.state = now_ns, HOLDING
         if self._heard_ns is not None and now_ns - self._heard_ns > self._watchdog_ns:
             self.mapping.silence()
@@ -69,7 +68,7 @@ class Teleoperator:
         wanted = np.zeros(6)
         if target is not None:
             self.state = FOLLOWING
-            wanted = self.solver.speeds(self.limiter.q, target)
+            wanted = joint_speeds(self.arm, self.config, self.limiter.q, target)
         return self._step(wanted)
 
     def stop(self) -> tuple[Command, bool]:
@@ -91,6 +90,4 @@ class Teleoperator:
             "state": self.state,
             "messages": vars(self.mapping.counts),
             "refused": self.limiter.refused,
-            "solver": self.solver.name,
-            "unsolved": self.solver.failed,
         }

@@ -123,11 +123,11 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
 
 
 def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidates) -> NDArray[np.bool_]:
-    from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_hand
+    from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange
     from camera_node.robot.arm.viewpoint_tour import reachable
 
     arm = source.arm  # type: ignore[attr-defined]
-    mount = mount_on_hand(scenario, arm)
+    mount = mount_on_flange(scenario, arm)
     return reachable(arm_model(scenario, arm), base_matrix(arm), mount, arm.path, list(candidates.poses))
 
 

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import signal
 import sys
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import sort_samples
 from camera_node.pose.providers import PoseProvider, Trajectory, read_samples
 from camera_node.robot.arm.camera_poses import base_matrix
-from camera_node.robot.arm.drive import stop_signals
-from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
-from camera_node.robot.calibration import ArmStopped, CalibrationError, live_camera
+from camera_node.robot.calibration import CalibrationError, live_camera
 from camera_node.robot.calibration.files import pairs_json, read_pairs
-from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, HandEyeSession, HandEyeStep, preview
+from camera_node.robot.calibration.hand_eye.session import HandEyeSession, HandEyeStep, preview
 from camera_node.robot.calibration.hand_eye.tracks import StreamRecorder, follow_arm
 from camera_node.robot.calibration.targets import Target
 from camera_node.sources.base import Source
@@ -42,17 +36,6 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     config = source_config(loaded)
     arm: ArmConfig | None = getattr(config, "arm", None)
     to_base = None if arm is None or args.hand is not None else _to_base(loaded, arm, args.camera)
-    if args.tracks is not None and not (args.moving and to_base is not None):
-        raise CalibrationError("--tracks: goes with --moving and the poses of a scenario's arm")
-    if args.yes and not args.drive:
-        raise CalibrationError("--yes: goes with --drive")
-    if args.drive and (to_base is None or args.moving or setup == EYE_TO_HAND):
-        raise CalibrationError(
-            "--drive: goes with a scenario's arm, a camera on its hand, and pictures from a hand that stands "
-            "(without --hand, --moving and --eye-to-hand: what a hand holds is not known to be kept clear of)"
-        )
-    if args.tracks is not None:
-        _create_writable(args.tracks)
     source = live_camera.open_source(loaded, config, args)
     before = None
     if args.samples is not None and args.samples.exists():
@@ -75,13 +58,9 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
     pace = live_camera.Pace(float(source.fps), args.seconds)
     tracks = StreamRecorder() if args.moving and to_base is not None else None
-    mover = None
     try:
         with contextlib.ExitStack() as stack:
             stack.callback(source.release)
-            if args.drive and arm is not None:
-                mover = _open_arm(loaded, arm, args.yes)
-                stack.callback(mover.close)
             if tracks is not None and arm is not None:
                 stack.callback(follow_arm(loaded, arm, tracks).stop)
             guide(
@@ -92,41 +71,17 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
                 pace,
                 show,
                 hands,
-                move=mover,
                 to_base=to_base,
                 tracks=tracks,
                 first=live_camera.first_tick(source),
             )
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
-    except ArmStopped as error:
-        print(f"\n{error}; what there is:", file=sys.stderr)
     except OSError as error:
         raise CalibrationError(f"--samples or --preview cannot be written: {error}") from None
     if tracks is None:
         return calibrate(session.samples(), args.method)
-    if args.tracks is not None:
-        tracks.write(args.tracks)
     return calibrate_tracks(tracks.hand(), tracks.target(), setup, args.method, args.max_gap_ms / 1e3)
-
-
-def _create_writable(folder: Path) -> None:
-    """Create the folder of ``--tracks`` before the session, whose data would be lost without it. Raises
-    CalibrationError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
-
-
-def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
-    """Connect to the arm. From now on a termination signal stops a move first. Raises as ``ArmMover``."""
-    mover = ArmMover(loaded, arm, agreed_to)
-    for number in stop_signals():
-        if number != signal.SIGINT:
-            signal.signal(number, signal.default_int_handler)
-    return mover
 
 
 def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
@@ -148,7 +103,6 @@ def guide(
     pace: Callable[[int], bool],
     show: Callable[[live_camera.Image, HandEyeStep, HandEyeSession], None],
     hands: PoseProvider | None = None,
-    move: Callable[[Array], None] | None = None,
     to_base: Array | None = None,
     tracks: StreamRecorder | None = None,
     first: int = 0,
@@ -158,7 +112,6 @@ def guide(
     lens: replaces the source's own.
     show: called with every image, its step and the session.
     hands: hand poses by time since the first shot; None: the shots' poses are the hand's.
-    move: moves the hand to a pose (4, 4), ValueError if it cannot; None: an operator moves it.
     to_base: base-from-world (4, 4), if the hand's poses are in the world.
     tracks: records the target poses and decides when there is enough.
     first: first tick of the source.
@@ -185,18 +138,4 @@ def guide(
         show(image, step, session)
         if step.enough:
             return step
-        if move is not None and step.outcome != MOVING:
-            _move_to_next_pose(session, step, move)
     return step
-
-
-def _move_to_next_pose(session: HandEyeSession, step: HandEyeStep, move: Callable[[Array], None]) -> None:
-    if step.outcome != KEPT:
-        session.reject_pose()
-    wanted = session.next_hand_pose()
-    if wanted is None:
-        return
-    try:
-        move(wanted)
-    except ValueError as error:  # the hand stays, so the next image is rejected and another pose is proposed
-        live_camera.report_skipped(error)

@@ -14,8 +14,14 @@ from camera_node.robot.calibration import WANT_MM, CalibrationError
 from camera_node.robot.calibration.files import to_samples
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
-from camera_node.robot.calibration.hand_eye.next_pose import describe_motion, initial_pose, propose_pose
-from camera_node.robot.calibration.hand_eye.samples import Array, Diversity, Samples, angles, diversity
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Diversity,
+    Samples,
+    angles,
+    diversity,
+    rotation_vectors,
+)
 from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose, to_gray
 from freshfield.geometry import Pinhole
 
@@ -77,8 +83,6 @@ class HandEyeSession:
         self._hands: list[Array] = []
         self._last: Array | None = None
         self._refined: Refinement | None = None
-        self._wanted: Array | None = None
-        self._rejected = 0
         self._diversity = diversity(self.samples())
         self.corners: Corners | None = None
         """Found in the last image."""
@@ -119,36 +123,9 @@ class HandEyeSession:
         self._kept(self.samples())
         return self._step(KEPT, self._advice())
 
-    def next_hand_pose(self) -> Array | None:
-        """Hand pose (4, 4) for the next sample, the same until a sample is kept or the pose rejected: first
-        small rotations about each axis, then where the variance falls most. None until the target has been
-        seen. Reach and collisions are not considered."""
-        if not self._seen:
-            return None
-        if self._wanted is None:
-            found = self._refined
-            if found is None:
-                self._wanted = initial_pose(self._hands[0], len(self._hands) - 1 + self._rejected)
-            else:
-                self._wanted = propose_pose(
-                    self.samples(),
-                    found.x,
-                    found.y,
-                    (found.arm_noise_rad, found.arm_noise_m),
-                    self._seen[0].corners.points.mean(axis=0),
-                    np.random.default_rng([len(self._seen), self._rejected]),
-                    NEW_DEG,
-                )
-        return self._wanted
-
-    def reject_pose(self) -> None:
-        """Propose another pose next, because this one cannot be reached or gave no sample."""
-        self._rejected += 1
-        self._wanted = None
-
     def _solve(self) -> None:
         samples = self.samples()
-        self._refined, self._wanted = None, None
+        self._refined = None
         if self._diversity.reason is None and len(samples) >= _MIN_TO_SOLVE:
             self._refined = refine(samples)
 
@@ -172,10 +149,7 @@ class HandEyeSession:
     def _advice(self) -> str:
         if self._enough:
             return "enough"
-        wanted = self.next_hand_pose()
-        if wanted is None or self._last is None:
-            return "bring the target into the picture"
-        return describe_motion(self._last, wanted)
+        return missing_turn(self.samples().hand)
 
     def _step(self, outcome: str, advice: str) -> HandEyeStep:
         found = self._refined
@@ -188,6 +162,16 @@ class HandEyeSession:
             self._enough,
             advice,
         )
+
+
+def missing_turn(hands: Array) -> str:
+    """Instruction to an operator: the axis about which poses (N, 4, 4) differ least from the first."""
+    if not len(hands):
+        return "bring the target into the picture"
+    turns = rotation_vectors(hands[0, :3, :3].T @ hands[:, :3, :3])
+    axis = int(np.argmin((turns**2).sum(axis=0)))
+    sign = "-" if turns[:, axis].sum() > 0 else "+"
+    return f"turn the flange by 20 to 40 degrees about its {sign}{'xyz'[axis]}, the target in sight"
 
 
 def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:

@@ -1,31 +1,25 @@
 """Records both streams of a guided calibration: hand poses and detected target poses.
 
 Each keeps its own stamps, and ``time_offset`` estimates the offset between them (camera delay, transport of
-the joint states) from the motion. ``--hand`` and ``--target`` read the files.
+the joint states) from the motion.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from camera_node.config import ArmConfig
 from camera_node.robot.arm.camera_poses import arm_model
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track, sorted_track
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, HandEyeStep
-from freshfield import files
 from freshfield.clock import WallClock
-from freshfield.geometry import Pose
 from freshfield.scenario import Scenario
 
-HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
 # Motion with the target in sight. The offset's deviation falls with the square root of its duration.
 MIN_SECONDS = 10.0
 _GAP_NS = 125_000_000  # longest gap between two detections that counts as motion
-_HEADER = "t,x,y,z,qx,qy,qz,qw"
 
 
 class StreamRecorder:
@@ -71,15 +65,6 @@ class StreamRecorder:
         """The target's stream. Raises CalibrationError for fewer than two poses."""
         return sorted_track(*_columns(self._targets), "sightings of the target")
 
-    def write(self, folder: Path) -> None:
-        """Write ``hand.csv`` and ``target.csv``. Raises CalibrationError."""
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for name, rows in ((HAND_FILE, list(self._hands)), (TARGET_FILE, self._targets)):
-                files.write_text(folder / name, "\n".join([_HEADER, *(_line(*row) for row in rows), ""]))
-        except OSError as error:
-            raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
-
 
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
@@ -96,11 +81,3 @@ def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) ->
 
 def _columns(rows: list[tuple[int, Array]]) -> tuple[list[int], list[Array]]:
     return [t_ns for t_ns, _ in list(rows)], [pose for _, pose in list(rows)]
-
-
-def _line(t_ns: int, pose: Array) -> str:
-    made = Pose.from_matrix(pose)
-    w, *xyz = made.quaternion
-    # Whole nanoseconds: a float of seconds since 1970 keeps a quarter of a microsecond only.
-    stamp = f"{t_ns // 10**9}.{t_ns % 10**9:09d}"
-    return ",".join([stamp, *(f"{float(v):.9f}" for v in (*made.translation_m, *xyz, w))])

@@ -56,6 +56,7 @@ def by_exponentials(joints):
 def test_forward_is_the_product_of_exponentials():
     for q in POSTURES:
         assert np.abs(UR3E.forward(q) - by_exponentials(q)).max() < 1e-14
+    np.testing.assert_array_equal(UR3E.forward(POSTURES), [UR3E.forward(q) for q in POSTURES])
 
 
 def test_forward_and_jacobian_are_pinocchios():
@@ -83,10 +84,10 @@ def test_the_inverse_finds_the_posture_and_only_such_as_reach_the_target():
         target = UR3E.forward(q)
         found = UR3E.inverse(target, near=q)
         counts.add(len(found))
-        assert np.abs(found[0].joints - q).max() < 1e-9
+        assert np.abs(found[0] - q).max() < 1e-9
         for posture in found:
-            assert np.abs(UR3E.forward(posture.joints) - target).max() < 1e-9
-        apart = [np.abs(a.joints - b.joints).max() for a in found for b in found if a is not b]
+            assert np.abs(UR3E.forward(posture) - target).max() < 1e-9
+        apart = [np.abs(a - b).max() for a in found for b in found if a is not b]
         assert min(apart, default=1.0) > 1e-4
     assert counts <= {2, 4, 6, 8} and 8 in counts
 
@@ -94,8 +95,8 @@ def test_the_inverse_finds_the_posture_and_only_such_as_reach_the_target():
 def test_postures_are_turned_to_be_near_and_within_the_limits():
     q = np.array([3.5, -4.0, 1.0, -5.0, 2.0, 6.2])
     found = UR3E.inverse(UR3E.forward(q), near=q)
-    assert np.abs(found[0].joints - q).max() < 1e-9
-    assert all(np.abs(p.joints).max() <= 2 * math.pi + 1e-9 for p in found)
+    assert np.abs(found[0] - q).max() < 1e-9
+    assert all(np.abs(p).max() <= 2 * math.pi + 1e-9 for p in found)
 
 
 def test_out_of_reach_has_no_posture():
@@ -106,14 +107,6 @@ def test_out_of_reach_has_no_posture():
     assert UR3E.inverse(far) == [] and UR3E.inverse(inside) == []
 
 
-def test_the_determinant_vanishes_as_the_three_factors_do():
-    (_, a2, a3, *_) = UR3E.a_m
-    for q in POSTURES:
-        shoulder, elbow, wrist = UR3E.singularity_factors(q)
-        expected = a2 * a3 * shoulder * elbow * wrist
-        assert abs(abs(np.linalg.det(UR3E.jacobian(q))) - abs(expected)) < 1e-15
-
-
 def test_singular_postures_are_named():
     free = np.array([0.3, -1.2, 1.1, -0.9, 1.4, 0.2])
     assert UR3E.singularities(free) == ()
@@ -121,8 +114,8 @@ def test_singular_postures_are_named():
     assert "elbow" in UR3E.singularities(np.where(np.arange(6) == 2, 0.0, free))
     above = free.copy()  # turn the upper arm until the wrist's centre is above the base
     turns = np.linspace(-math.pi, math.pi, 20001)
-    reach = [abs(UR3E.singularity_factors([0.3, t, *free[2:]])[0]) for t in turns]
-    above[1] = turns[int(np.argmin(reach))]
+    least = [abs(np.linalg.det(UR3E.jacobian([0.3, t, *free[2:]]))) for t in turns[::10]]
+    above[1] = turns[::10][int(np.argmin(least))]
     assert UR3E.singularities(above) == ("shoulder",)
 
 
@@ -134,9 +127,9 @@ def test_a_calibration_moves_the_hand_and_the_inverse_follows_it(factory):
         moved_m.append(np.linalg.norm(target[:3, 3] - UR3E.forward(q)[:3, 3]))
         found = arm.inverse(target, near=q)
         if min(map(abs, (math.sin(q[2]), math.sin(q[4])))) > 0.1:
-            assert np.abs(found[0].joints - q).max() < 1e-6
+            assert np.abs(found[0] - q).max() < 1e-6
         for posture in found:
-            assert np.abs(arm.forward(posture.joints) - target).max() < 2e-7
+            assert np.abs(arm.forward(posture) - target).max() < 2e-7
     assert max(moved_m) > 1e-3
 
 

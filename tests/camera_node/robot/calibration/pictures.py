@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse, transform_of
 from camera_node.robot.calibration.targets import GrayImage, Target, parse_target
 from camera_node.synthetic.lighting import Light
@@ -24,6 +23,7 @@ from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Quad
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, se3_inverse, so3_exp
+from tests.camera_node.robot.calibration import known_truth as simulated
 
 BOARD = "charuco:7x5:24mm:18mm"
 LENS = Pinhole.from_fov(320, 240, 65.0)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.arm.capsules import CapsuleModel, link_frames
+from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -47,6 +47,6 @@ def assert_within_limits(config: TeleopConfig, commands: Sequence[Command], star
     assert (flange <= np.array(config.workspace_high_m) + EPS).all()
     fastest = np.linalg.norm(np.diff(flange, axis=0), axis=1).max() / dt_s
     assert fastest <= config.speed_m_s + EPS
-    apart, lowest = CapsuleModel(UR3E, config.tool_m, config.tool_radius_m).clearance(link_frames(UR3E, q))
+    apart, lowest = CapsuleModel(UR3E, config.tool_m, config.tool_radius_m).clearance(UR3E.link_frames(q))
     assert apart.min() >= config.margin_m - EPS
     assert lowest.min() >= config.floor_m - EPS

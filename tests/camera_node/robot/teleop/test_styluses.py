@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.command import open_stylus
-from camera_node.robot.teleop.gamepad import SPEED_M_S, TURN_RAD_S, AxisRange, GamepadState
 from camera_node.robot.teleop.keyboard import KeyboardStylus
 from camera_node.robot.teleop.network_stylus import MAX_BYTES, NetworkStylus, encode, parse
-from camera_node.robot.teleop.stylus import PoseIntegrator
+from camera_node.robot.teleop.teleop_command import open_stylus
 from tests.camera_node.robot.teleop.checks import sample
 
 GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}
@@ -97,7 +95,9 @@ def test_a_taken_port_is_one_clear_line():
     stylus.close()
 
 
-@pytest.mark.parametrize("text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"])
+@pytest.mark.parametrize(
+    "text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"]
+)
 def test_unknown_styluses_are_refused(text):
     with pytest.raises(TeleopError, match="--stylus: expected"):
         open_stylus(text)
@@ -139,53 +139,3 @@ def test_a_terminal_that_is_gone_ends_it():
     stylus.poll(0)
     assert stylus.ended
     os.close(terminal)
-
-
-def test_a_pad_gives_speeds_outside_its_dead_zone_only():
-    stick, trigger = AxisRange(-32768, 32767, 1000), AxisRange(0, 255)
-    pad = GamepadState({0: stick, 1: stick, 2: trigger, 3: stick, 4: stick, 5: trigger})
-    for code in (0, 1, 3, 4):
-        pad.update(3, code, 1500)
-    assert not np.any(np.concatenate(pad.speeds()))
-    pad.update(3, 1, -32768)
-    pad.update(3, 5, 255)
-    pad.update(3, 3, 32767)
-    speed, turn = pad.speeds()
-    assert speed == pytest.approx([SPEED_M_S, 0.0, SPEED_M_S])
-    assert turn == pytest.approx([0.0, 0.0, -TURN_RAD_S])
-    assert not pad.clutch
-    pad.update(1, 0x130, 1)
-    assert pad.clutch
-    pad.update(1, 0x130, 0)
-    assert not pad.clutch
-    pad.update(3, 1, 10**9)
-    assert pad.speeds()[0][0] == pytest.approx(-SPEED_M_S)
-
-
-def test_a_pad_through_the_kernel():
-    """The real library and a virtual device, where this machine has them."""
-    evdev = pytest.importorskip("evdev", reason="needs evdev: pip install -e '.[gamepad]'")
-    if not os.access("/dev/uinput", os.W_OK):
-        pytest.skip("needs /dev/uinput, writable")
-    from camera_node.robot.teleop.gamepad import GamepadStylus
-
-    axis = evdev.AbsInfo(0, -32768, 32767, 0, 128, 0)
-    with evdev.UInput({1: [0x130], 3: [(0, axis), (1, axis)]}, name="freshfield test pad") as device:
-        time.sleep(0.5)
-        stylus = GamepadStylus(device.device.path)
-        device.write(3, 1, -32768)
-        device.write(1, 0x130, 1)
-        device.syn()
-        time.sleep(0.1)
-        stylus.poll(0)
-        (held,) = stylus.poll(20_000_000)
-        assert held.clutch and held.position_m[0] > 0
-        stylus.close()
-
-
-def test_a_hand_moves_with_time_and_not_over_a_standstill():
-    hand = PoseIntegrator()
-    hand.advance(0, (1.0, 0.0, 0.0), np.zeros(3), True)
-    assert hand.advance(10_000_000, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.01)
-    assert hand.advance(10**10, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)
-    assert hand.advance(0, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)

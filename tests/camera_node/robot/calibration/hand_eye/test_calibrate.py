@@ -8,13 +8,13 @@ import pytest
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import read_pairs, read_visp_folder
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, residuals, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, diversity
 from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.datasets.records import DatasetError
+from tests.camera_node.robot.calibration import known_truth as simulated
 from tests.camera_node.robot.calibration.pictures import noisy_samples
 from tests.conftest import data_dir
 

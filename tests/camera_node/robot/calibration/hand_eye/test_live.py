@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import _thread
 import dataclasses
-import io
 import json
 import subprocess
 import sys
-import threading
-import time
 from fractions import Fraction
 
 import cv2
@@ -22,18 +18,13 @@ from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.arm.roadmap import is_free
-from camera_node.robot.arm.viewpoint_tour import PathError
-from camera_node.robot.calibration import ArmStopped, live_camera
-from camera_node.robot.calibration.accuracy_study import streams
-from camera_node.robot.calibration.files import read_track
+from camera_node.robot.arm.viewpoint_tour import is_free
+from camera_node.robot.calibration import live_camera
 from camera_node.robot.calibration.hand_eye import live
-from camera_node.robot.calibration.hand_eye import simulated as simulate
-from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate_tracks, distance_mm
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.hand_eye.session import HandEyeSession
-from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, MIN_SECONDS, TARGET_FILE, StreamRecorder
+from camera_node.robot.calibration.hand_eye.tracks import MIN_SECONDS, StreamRecorder
 from camera_node.robot.calibration.targets import parse_target
 from camera_node.robot.hand_camera import TruthClient
 from camera_node.sources.base import Shot
@@ -41,6 +32,8 @@ from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import simulated_arm
+from tests.camera_node.robot.calibration import known_truth as simulate
+from tests.camera_node.robot.calibration.known_truth import streams
 from tests.camera_node.robot.calibration.pictures import BOARD, LENS, camera_in_target, render, taken
 
 X = simulate.CAMERA_IN_HAND
@@ -109,17 +102,7 @@ def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("camera", "options", "message"),
-    [
-        ("eye.yaml", [], "source.arm.cameras: set eye: null for the calibration"),
-        (None, ["--tracks", "."], "--tracks: goes with --moving"),
-        (None, ["--moving", "--tracks", "/dev/null"], "--tracks: /dev/null"),  # before the camera is opened
-        (None, ["--yes"], "--yes: goes with --drive"),
-        # An arm is driven only where its surroundings are known.
-        (None, ["--drive", "--moving"], "--drive: goes with"),
-        (None, ["--drive", "--eye-to-hand"], "--drive: goes with"),
-        (None, ["--drive", "--hand", "hand.csv"], "--drive: goes with"),
-    ],
+    ("camera", "options", "message"), [("eye.yaml", [], "source.arm.cameras: set eye: null for the calibration")]
 )
 def test_options_that_do_not_fit_are_refused(camera, options, message, tmp_path, capsys):
     words = ["--live", str(scenario(tmp_path, camera)), "--camera", "eye", "--board", BOARD]
@@ -139,7 +122,7 @@ def test_the_cameras_own_stamps_are_kept_with_what_was_seen():
     assert tracks.seen_s == pytest.approx(0.35, abs=1e-3) and not step.enough
 
 
-def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
+def test_recorded_streams_give_the_time_offset():
     hand, target = streams(simulate.Sweep(0.15), MIN_SECONDS + 3, 0.0371, np.random.default_rng(1))
     epoch_ns = 1_790_000_000 * 10**9
     tracks = StreamRecorder()
@@ -147,14 +130,9 @@ def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
         for t_ns, pose in zip(stream.times_ns, stream.poses):
             add(int(t_ns) + epoch_ns, pose)
     assert MIN_SECONDS < tracks.seen_s < MIN_SECONDS + 3.1
-    tracks.write(tmp_path)
-    for a, b in (
-        (tracks.hand(), tracks.target()),
-        (read_track(tmp_path / HAND_FILE), read_track(tmp_path / TARGET_FILE)),
-    ):
-        found = calibrate_tracks(a, b, EYE_IN_HAND)
-        assert found.time_offset_s == pytest.approx(0.0371, abs=5e-4)
-        assert distance_mm(found.transform, X) < 1.0
+    found = calibrate_tracks(tracks.hand(), tracks.target(), EYE_IN_HAND)
+    assert found.time_offset_s == pytest.approx(0.0371, abs=5e-4)
+    assert distance_mm(found.transform, X) < 1.0
 
 
 def test_it_is_not_enough_before_there_is_motion_to_tell_the_offset_from():
@@ -174,15 +152,15 @@ MOVES = """
 import sys
 import numpy as np
 from rtde_control import RTDEControlInterface
-from camera_node.robot.calibration.hand_eye.simulated import random_hands
+from tests.camera_node.robot.calibration.known_truth import random_hands
 from camera_node.robot.arm.kinematics import UR3E
 
 host, at = sys.argv[1], np.array(eval(sys.argv[2]))
 control, rng = RTDEControlInterface(host), np.random.default_rng(4)
 while True:
     postures = UR3E.inverse(random_hands(1, rng, 30.0)[0], at)
-    if postures and np.abs(postures[0].joints - at).max() < 1.5:
-        at = postures[0].joints
+    if postures and np.abs(postures[0] - at).max() < 1.5:
+        at = postures[0]
         control.moveJ(at.tolist(), rng.uniform(0.3, 0.9), rng.uniform(1.0, 3.0))
 """
 
@@ -221,93 +199,9 @@ def bench(folder, host, **arm):
 def looking():
     """--joints of an arm whose camera sees the board."""
     hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
-    postures = (p.joints for hand in hands for p in UR3E.inverse(hand) if not p.singular)
+    postures = (q for hand in hands for q in UR3E.inverse(hand) if not UR3E.singularities(q))
     begin = next(joints for joints in postures if is_free(UR3E, np.eye(4), joints, joints, 0.05).all())
     return begin, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))
-
-
-@pytest.mark.slow
-def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys, host):
-    """The real client library moves a simulated arm, from one look at the board to the answer."""
-    path = {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0, "floor_m": 0.02}
-    file = bench(tmp_path, host, path=path)
-    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
-    samples = tmp_path / "samples.json"
-    with simulated_arm(host, looking()[1]):
-        arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--drive", "--json"]
-        limits = ["--seconds", "100", "--want-mm", "1", "--samples", str(samples)]
-        assert main(["calibrate", "hand-eye", *arguments, *limits]) == 0
-    said = capsys.readouterr()
-    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 2.0
-    hands = np.array([hand for hand, _ in json.loads(samples.read_text())])
-    assert len(hands) >= 10 and "enough" in said.err
-    assert np.linalg.norm(np.ptp(hands[:, :3, 3], axis=0)) > 0.1  # nobody else has moved it
-
-
-def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends_the_session(tmp_path, host):
-    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 3.0, "floor_m": 0.02})))
-    begin, joints = looking()
-    with simulated_arm(host, joints) as process:
-        mover = ArmMover(plan, source_config(plan).arm, agreed_to=False)
-        try:
-            hand = UR3E.forward(begin)
-            for down_m, why in ((2.0, "at all"), (hand[2, 3] - 0.01, "the floor")):
-                lower = hand.copy()
-                lower[2, 3] -= down_m
-                with pytest.raises(PathError, match=why):
-                    mover(lower)
-            process.kill()
-            process.wait()
-            with pytest.raises(ArmStopped, match=host):
-                mover(hand)
-        finally:
-            mover.close()
-
-
-def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path, host):
-    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 0.2, "floor_m": 0.02})))
-    begin, joints = looking()
-    goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
-    with simulated_arm(host, joints):
-        truth, clock = TruthClient(host), WallClock()
-        mover = ArmMover(plan, source_config(plan).arm, agreed_to=False)
-
-        def press() -> None:
-            watched = TruthClient(host)
-            while np.abs(watched.joints(clock.now_ns()) - begin).max() < 0.05:
-                time.sleep(0.01)
-            _thread.interrupt_main()
-
-        thread = threading.Thread(target=press, daemon=True)
-        thread.start()
-        try:
-            with pytest.raises(KeyboardInterrupt):
-                mover(UR3E.forward(goal))
-            stopped = truth.joints(clock.now_ns())
-            time.sleep(0.3)
-            # On its way it would have turned by .06.
-            np.testing.assert_allclose(truth.joints(clock.now_ns()), stopped, atol=1e-4)
-            assert 0.05 < np.abs(stopped - begin).max() < 0.6
-        finally:
-            thread.join()
-            mover.close()
-
-
-def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, capsys, host):
-    file = bench(tmp_path, host, simulated=False)
-    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
-    begin, joints = looking()
-    words = ["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD, "--drive"]
-    with simulated_arm(host, joints):
-        assert main(words) == 2
-        assert "say that its space is clear with --yes" in capsys.readouterr().err
-        terminal = io.StringIO("n\n")
-        terminal.isatty = lambda: True
-        monkeypatch.setattr("sys.stdin", terminal)
-        assert main([*words, "--json"]) == 2
-        said = capsys.readouterr()
-        assert "Is its space clear" in said.err and "nothing was moved" in said.err and not said.out
-        np.testing.assert_allclose(TruthClient(host).joints(WallClock().now_ns()), begin, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -321,7 +215,7 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
         moving = subprocess.Popen([sys.executable, "-c", MOVES, host, str(begin.tolist())])
         try:
             # Real clocks on a machine that may be held up for a moment: of two recordings, one is not.
-            for tracks in ("first", "second"):
+            for _ in range(2):
                 arguments = [
                     "--live",
                     str(file),
@@ -331,8 +225,6 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
                     BOARD,
                     "--moving",
                     "--json",
-                    "--tracks",
-                    str(tmp_path / tracks),
                     "--seconds",
                     "60",
                 ]
@@ -345,7 +237,3 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
             moving.wait()
     assert found["time_offset_s"] == pytest.approx(-0.060, abs=0.006)  # joint states take their time too
     assert distance_mm(np.array(found["transform"]), X) < 2.0
-    words = ["--hand", str(tmp_path / tracks / HAND_FILE), "--target", str(tmp_path / tracks / TARGET_FILE)]
-    assert main(["calibrate", "hand-eye", *words, "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert again["time_offset_s"] == pytest.approx(found["time_offset_s"], abs=1e-5)

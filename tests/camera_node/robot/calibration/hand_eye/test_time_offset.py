@@ -7,12 +7,12 @@ import pytest
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.accuracy_study import streams
 from camera_node.robot.calibration.files import Track
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate_tracks, distance_mm
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.hand_eye.time_offset import calibrate_streams, coarse_offset
+from tests.camera_node.robot.calibration import known_truth as simulated
+from tests.camera_node.robot.calibration.known_truth import streams
 
 X = simulated.CAMERA_IN_HAND
 

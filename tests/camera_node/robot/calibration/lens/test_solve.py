@@ -11,11 +11,11 @@ import pytest
 from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import list_images, read_lens
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.lens.solve import calibrate, calibrate_folder
 from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
+from tests.camera_node.robot.calibration import known_truth as simulated
 from tests.camera_node.robot.calibration import pictures
 from tests.conftest import data_dir
 

@@ -11,12 +11,12 @@ import pytest
 
 from camera_node.cli import main
 from camera_node.robot.arm.hand_eye_mount import read_hand_eye
-from camera_node.robot.calibration.accuracy_study import streams
 from camera_node.robot.calibration.files import pairs_json, read_visp_pose
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.targets import parse_target
+from tests.camera_node.robot.calibration import known_truth as simulated
+from tests.camera_node.robot.calibration.known_truth import streams
 from tests.camera_node.robot.calibration.pictures import noisy_samples, write_poses
 from tests.camera_node.sources.datasets.photos import BOMB
 from tests.conftest import data_dir
@@ -213,7 +213,7 @@ def test_a_printed_chessboard_measures_what_is_said(tmp_path, capsys):
     assert np.ptp(corners.pixels[:, 0]) / 300 * 25.4 == pytest.approx(80.0, abs=0.05)
 
 
-@pytest.mark.parametrize("what", ["hand-eye --pairs x", "intrinsics x --board x", "accuracy"])
+@pytest.mark.parametrize("what", ["hand-eye --pairs x", "intrinsics x --board x"])
 def test_without_scipy_it_says_what_to_install(what, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "scipy", None)
     assert main(["calibrate", *what.split()]) == 2
@@ -227,41 +227,3 @@ def test_visps_poses_are_rotation_vectors(tmp_path):
     found = read_visp_pose(file)
     np.testing.assert_allclose(found[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
     assert found[:3, 3].tolist() == [0.1, 0.2, 0.3]
-
-
-def test_the_study_prints_its_tables(tmp_path, capsys):
-    from camera_node.robot.calibration import accuracy_study
-    from freshfield.files import format_table, write_csv
-
-    tables = {
-        "pairing": accuracy_study.pairing(1.0, (8.0, 100.0), (0.25,)),
-        "poses": accuracy_study.poses((6, 15), 2),
-        "offset": accuracy_study.offset(1, (5.0,)),
-    }
-    of = {(r["arm_period_ms"], r["pairing"]): r for r in tables["pairing"]}
-    for period_ms in (8.0, 100.0):
-        assert of[period_ms, "line"]["mm_p95"] < 0.2 * of[period_ms, "nearest"]["mm_p95"]
-    assert of[100.0, "nearest"]["mm_p95"] > 5 * of[8.0, "nearest"]["mm_p95"]
-    by = {(r["poses"], r["method"]): r for r in tables["poses"]}
-    assert by[15, "refined"]["bound_mm"] < by[6, "refined"]["bound_mm"]
-    assert all(r["trials"] == 2 and r["rms_mm_std"] > 0 and r["rms_deg_std"] > 0 for r in tables["poses"])
-    assert all(r["error_ms"] < 1.0 and not r["failed"] for r in tables["offset"])
-    for name, rows in tables.items():
-        write_csv(tmp_path / "out" / f"{name}.csv", rows)
-        assert format_table(rows).count("\n") == len(rows)
-    accuracy_study.plot(tables["pairing"], tables["poses"], tmp_path / "out" / "accuracy.png")
-    assert (tmp_path / "out" / "pairing.csv").read_text().count("\n") == 5
-    assert cv2.imread(str(tmp_path / "out" / "accuracy.png")) is not None
-
-
-def test_the_deviation_of_an_rms_is_what_it_deviates_by():
-    from camera_node.robot.calibration.accuracy_study import rms
-
-    rng = np.random.default_rng(4)
-    errors = np.linalg.norm(rng.normal(size=(500, 20, 2, 3)), axis=-1) * [1.0, 5.0]
-    found, deviations = map(np.array, zip(*map(rms, errors)))
-    np.testing.assert_allclose(found.mean(axis=0), np.sqrt(3) * np.array([1.0, 5.0]), rtol=0.02)
-    np.testing.assert_allclose(deviations.mean(axis=0), found.std(axis=0), rtol=0.1)
-    few, unknown = rms(np.array([[3.0, 4.0]]))
-    assert few.tolist() == [3.0, 4.0] and np.isnan(unknown).all()
-    assert np.isnan(rms(np.zeros((0, 2)))).all() and np.array_equal(rms(np.zeros((3, 2))), np.zeros((2, 2)))

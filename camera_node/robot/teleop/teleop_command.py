@@ -14,11 +14,10 @@ import numpy as np
 
 from camera_node.config import ArmConfig
 from camera_node.robot import stdout
-from camera_node.robot.arm.camera_poses import arm_model
-from camera_node.robot.arm.drive import confirm_motion, open_stream, stop_event
+from camera_node.robot.arm.camera_poses import arm_model, require_arm
+from camera_node.robot.arm.control import confirm_motion, open_stream, stop_event
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.simulated_controller.command import require_arm
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -78,8 +77,8 @@ def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
 
 
 def open_stylus(text: str) -> Stylus:
-    """Open a stylus by its name on the command line: ``keyboard``, ``gamepad``,
-    ``gamepad:/dev/input/eventN``, ``network:PORT`` or ``network:HOST:PORT``. Raises TeleopError."""
+    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or
+    ``network:HOST:PORT``. Raises TeleopError."""
     kind, _, rest = text.partition(":")
     if kind == "keyboard" and not rest:
         from camera_node.robot.teleop.keyboard import KEYS, KeyboardStylus
@@ -87,10 +86,6 @@ def open_stylus(text: str) -> Stylus:
         keyboard = KeyboardStylus()
         print(KEYS, file=sys.stderr)
         return keyboard
-    if kind == "gamepad":
-        from camera_node.robot.teleop.gamepad import GamepadStylus
-
-        return GamepadStylus(rest or None)
     if kind == "network":
         from camera_node.robot.teleop.network_stylus import NetworkStylus
 
@@ -100,7 +95,7 @@ def open_stylus(text: str) -> Stylus:
         stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
         log.info("waiting for a stylus at UDP port %d", stylus.port)
         return stylus
-    raise TeleopError(f"--stylus: expected keyboard, gamepad or network:PORT, got {text!r}")
+    raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")
 
 
 def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: TeleopConfig) -> Sink:

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, inverse, transform_of
 from freshfield.geometry import look_at, so3_exp
 
 # The arm's noise in the project's results.
 ARM_RAD, ARM_M = 0.002, 0.0005
 REACH_M = 0.5
+# Error of a detected target pose at this distance (measured with rendered images).
+_DETECTION_RAD, _DETECTION_M = 0.0005, 0.0003
 
 
 def _rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> Array:
@@ -85,3 +88,16 @@ class Sweep:
         roll = 0.6 * np.sin(0.71 * u + 0.3) + 0.25 * np.sin(1.93 * u)
         slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
         return np.array([_camera(*row) for row in zip(azimuth, slope, distance_m, roll)]).reshape(-1, 4, 4)
+
+
+def streams(sweep: Sweep, seconds: float, offset_s: float, rng: np.random.Generator) -> tuple[Track, Track]:
+    """Tracks of the flange at 125 Hz and of the target at 15 Hz, both noisy, with ``offset_s`` between their
+    stamps."""
+    hand_s = np.arange(0.0, seconds, 1 / 125.0)
+    seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
+    hands = add_noise(sweep.hands(hand_s), rng, ARM_RAD, ARM_M)
+    targets = observed_targets(sweep.hands(seen_s))
+    targets = add_noise(targets, rng, _DETECTION_RAD, _DETECTION_M)
+    hand_ns = np.round((hand_s + offset_s) * 1e9).astype(np.int64)
+    seen_ns = np.round(seen_s * 1e9).astype(np.int64)
+    return Track(hand_ns, hands), Track(seen_ns, targets)

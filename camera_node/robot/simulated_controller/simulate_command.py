@@ -10,13 +10,13 @@ import sys
 
 import numpy as np
 
-from camera_node.config import ArmConfig, errors_of, source_config
-from camera_node.robot.arm.camera_poses import arm_model
+from camera_node.config import errors_of
+from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
 from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
 from camera_node.robot.simulated_controller.server import ControllerServer
 from freshfield.clock import WallClock
-from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.scenario import ScenarioError, load
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,14 +44,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"camera-node: {host}: {error.strerror}: is another arm simulated there? --host", file=sys.stderr)
         return 1
     return 0
-
-
-def require_arm(scenario: Scenario) -> ArmConfig:
-    """The arm of a scenario. Raises ScenarioError if it has none."""
-    arm: ArmConfig | None = getattr(source_config(scenario), "arm", None)
-    if arm is None:
-        raise ScenarioError(f"{scenario.path}: source.arm: missing: this scenario has no arm")
-    return arm
 
 
 def read_joints(text: str) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""``camera-node calibrate``: hand-eye, intrinsics, a target to print, and the accuracy study."""
+"""``camera-node calibrate``: hand-eye, intrinsics, and a target to print."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import math
 import sys
@@ -11,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from camera_node.robot import stdout
 from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, WANT_MM, CalibrationError
 
 if TYPE_CHECKING:
@@ -25,8 +23,6 @@ EXAMPLES = """examples:
   camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [hand, target] pairs
   camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
-  camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --drive
-  camera-node calibrate accuracy --quick                                    errors by gaps, speed and poses
 """
 
 HAND_EYE = """Estimates the pose of a camera on the end effector ("hand"), T_EE^C of the thesis (4.2), or with
@@ -39,8 +35,8 @@ input, one of:
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
   --live SCENARIO --camera ID   guided session: move the hand, hold still; it says which poses are missing and
-                 when there are enough; with --drive the arm moves by itself. Hand poses come from the
-                 camera's source (without hand_eye), or from --hand CSV, by seconds since the first frame
+                 when there are enough. Hand poses come from the camera's source (without hand_eye), or from
+                 --hand CSV, by seconds since the first frame
 """
 
 
@@ -49,9 +45,7 @@ _GOES_WITH = {
     "board": ("folder", "live"),
     "lens": ("folder", "live"),
     "max_gap_ms": ("hand", "live"),
-    **dict.fromkeys(
-        ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"), ("live",)
-    ),
+    **dict.fromkeys(("camera", "data", "want_mm", "moving", "samples", "preview", "seconds"), ("live",)),
 }
 _INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
 
@@ -101,13 +95,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     target.add_argument("board", metavar="SPEC", help="target, as in hand-eye --board")
     target.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="image to write")
     target.add_argument("--dpi", type=float, default=300.0, help="dots per inch [%(default)g]")
-    study = what.add_parser(
-        "accuracy", help="simulated errors by gaps, speed and number of poses", epilog=EXAMPLES, formatter_class=raw
-    )
-    study.add_argument("--quick", action="store_true", help="a smaller study: seconds, not minutes")
-    study.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    study.add_argument("--out", type=Path, metavar="DIR", help="folder to write the tables (CSV) and a figure to")
-    study.add_argument("--json", action="store_true", help="print the tables as JSON")
 
 
 def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
@@ -131,7 +118,6 @@ def _add_board(parser: argparse.ArgumentParser, required: bool) -> None:
     )
 
 
-# fmt: off
 def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and hand poses, see above")
@@ -140,33 +126,59 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add("--target", type=Path, metavar="CSV", help="stream of target poses in the camera")
     add("--live", metavar="SCENARIO", help="guided session with a camera of this scenario")
     _add_board(parser, required=False)
-    add("--lens", type=Path, metavar="FILE",
-        help="intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]")
+    add(
+        "--lens",
+        type=Path,
+        metavar="FILE",
+        help="intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]",
+    )
     add("--eye-to-hand", action="store_true", help="the camera stands still, the hand holds the target")
-    add("--method", default=DEFAULT_METHOD, metavar="NAME",
-        help="tsai, park, horaud, andreff, daniilidis or refined [%(default)s]")
-    add("--max-gap-ms", type=float, metavar="MS",
-        help=f"largest time from a target pose to a hand pose of a stream [{MAX_GAP_S * 1e3:g}]")
-    add("--json", action="store_true",
-        help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
-    add("--out", type=Path, metavar="FILE.yaml",
-        help="file to write, for source.arm.cameras or source.trajectory.hand_eye")
-    add("--plot", type=Path, metavar="FILE.png",
-        help="figure to write: residuals, rotation axes, scatter of the target")
+    add(
+        "--method",
+        default=DEFAULT_METHOD,
+        metavar="NAME",
+        help="tsai, park, horaud, andreff, daniilidis or refined [%(default)s]",
+    )
+    add(
+        "--max-gap-ms",
+        type=float,
+        metavar="MS",
+        help=f"largest time from a target pose to a hand pose of a stream [{MAX_GAP_S * 1e3:g}]",
+    )
+    add(
+        "--json",
+        action="store_true",
+        help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}",
+    )
+    add(
+        "--out",
+        type=Path,
+        metavar="FILE.yaml",
+        help="file to write, for source.arm.cameras or source.trajectory.hand_eye",
+    )
+    add(
+        "--plot", type=Path, metavar="FILE.png", help="figure to write: residuals, rotation axes, scatter of the target"
+    )
     live = _add_live_group(parser)
     live("--camera", metavar="ID", help="camera of the scenario")
-    live("--want-mm", type=float, metavar="MM",
-         help=f"end when the standard deviation of the position is below this [{WANT_MM:g}]")
-    live("--moving", action="store_true", help="also take pictures while the hand moves; with an arm, the "
-         "time offset between its stamps and the camera's is estimated from the motion")
-    live("--drive", action="store_true", help="once the target is seen, move the scenario's arm to the "
-         "proposed poses, with the speed and floor_m of source.arm.path; asks first")
-    live("--yes", action="store_true", help="with --drive: the arm's workspace is clear, do not ask")
-    live("--tracks", type=Path, metavar="DIR",
-         help="with --moving and an arm: write both streams to hand.csv and target.csv, for --hand, --target")
-    live("--samples", type=Path, metavar="FILE",
-         help="write each sample, as --pairs reads it; continues from those of an earlier session")
-# fmt: on
+    live(
+        "--want-mm",
+        type=float,
+        metavar="MM",
+        help=f"end when the standard deviation of the position is below this [{WANT_MM:g}]",
+    )
+    live(
+        "--moving",
+        action="store_true",
+        help="also take pictures while the hand moves; with an arm, the "
+        "time offset between its stamps and the camera's is estimated from the motion",
+    )
+    live(
+        "--samples",
+        type=Path,
+        metavar="FILE",
+        help="write each sample, as --pairs reads it; continues from those of an earlier session",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -177,10 +189,8 @@ def run(args: argparse.Namespace) -> int:
         import scipy  # noqa: F401
     except ImportError:
         raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
-    moves_arm = args.what == "hand-eye" and args.drive
     try:
-        with stdout.only_python_output() if moves_arm else contextlib.nullcontext():
-            return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
+        return {"hand-eye": _hand_eye, "intrinsics": _intrinsics}[args.what](args)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
@@ -302,29 +312,6 @@ def _target(args: argparse.Namespace) -> int:
         f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "
         f"{board.pattern_m[0] * 1e3:.1f} x {board.pattern_m[1] * 1e3:.1f} mm"
     )
-    return 0
-
-
-def _accuracy(args: argparse.Namespace) -> int:
-    from camera_node.robot.calibration import accuracy_study
-    from freshfield.files import format_table, write_csv
-
-    if args.seed < 0:
-        raise CalibrationError("--seed: expected a whole number from 0")
-    tables = {}
-    try:
-        for name, rows in accuracy_study.run_tables(args.quick, args.seed):
-            tables[name] = rows
-            if not args.json:
-                print(f"{name}\n{format_table(rows)}\n", flush=True)
-            if args.out is not None:
-                write_csv(args.out / f"{name}.csv", rows)
-        if args.out is not None:
-            accuracy_study.plot(tables["pairing"], tables["poses"], args.out / "accuracy.png")
-    except OSError as error:
-        raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
-    if args.json:
-        print(json.dumps(tables))
     return 0
 
 
