@@ -95,9 +95,7 @@ def test_a_taken_port_is_one_clear_line():
     stylus.close()
 
 
-@pytest.mark.parametrize(
-    "text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"]
-)
+@pytest.mark.parametrize("text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"])
 def test_unknown_styluses_are_refused(text):
     with pytest.raises(TeleopError, match="--stylus: expected"):
         open_stylus(text)
