@@ -1,4 +1,4 @@
-"""COLMAP models: cameras, images and points3D, as text or binary (COLMAP's documentation, "Output Format").
+"""COLMAP models: cameras, images and points3D as text (COLMAP's documentation, "Output Format").
 
 COLMAP's poses are world-to-camera with OpenCV axes, its quaternions w-first and its pixels counted from the
 image's corner, as here. A camera without distortion becomes PINHOLE, another one OPENCV (k1 k2 p1 p2).
@@ -7,7 +7,6 @@ Points have tracks: where in which images they are seen.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError, PosedImage
-from freshfield.files import write_bytes, write_text
+from freshfield.files import write_text
 from freshfield.geometry import Pinhole, matrix_to_quaternion, se3_inverse
-
-_PINHOLE, _OPENCV = 1, 4
-_NAMES = {_PINHOLE: "PINHOLE", _OPENCV: "OPENCV"}
 
 
 @dataclass(frozen=True)
@@ -44,9 +40,9 @@ class _Image:
     points: NDArray[np.int64]  # (M,), numbers of points from 1
 
 
-def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud, binary: bool = False) -> None:
-    """Write cameras, images and points3D (.txt, or .bin if ``binary``) to ``folder``, which is created.
-    Images are named NAME.png. ExportError: no shots."""
+def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None:
+    """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. Images are named
+    NAME.png. ExportError: no shots."""
     if not shots:
         raise ExportError("no camera has reported: there is nothing to write")
     folder.mkdir(parents=True, exist_ok=True)
@@ -57,14 +53,9 @@ def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud, binary:
     for image in images:
         for place, point in enumerate(image.points):
             tracks[point - 1].append((image.number, place))
-    if binary:
-        write_bytes(folder / "cameras.bin", _cameras_binary(lenses))
-        write_bytes(folder / "images.bin", _images_binary(images))
-        write_bytes(folder / "points3D.bin", _points_binary(cloud, tracks))
-    else:
-        write_text(folder / "cameras.txt", _cameras_text(lenses))
-        write_text(folder / "images.txt", _images_text(images))
-        write_text(folder / "points3D.txt", _points_text(cloud, tracks))
+    write_text(folder / "cameras.txt", _cameras_text(lenses))
+    write_text(folder / "images.txt", _images_text(images))
+    write_text(folder / "points3D.txt", _points_text(cloud, tracks))
 
 
 def _image(k: int, shot: PosedImage, lenses: list[Pinhole], cloud: Cloud) -> _Image:
@@ -82,9 +73,10 @@ def _image(k: int, shot: PosedImage, lenses: list[Pinhole], cloud: Cloud) -> _Im
     )
 
 
-def _model(lens: Pinhole) -> tuple[int, list[float]]:
+def _model(lens: Pinhole) -> tuple[str, list[float]]:
+    """Name of COLMAP's camera model, and its parameters."""
     focal = [lens.fx, lens.fy, lens.cx, lens.cy]
-    return (_OPENCV, [*focal, *lens.distortion]) if lens.distorted else (_PINHOLE, focal)
+    return ("OPENCV", [*focal, *lens.distortion]) if lens.distorted else ("PINHOLE", focal)
 
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
@@ -95,7 +87,7 @@ def _cameras_text(lenses: list[Pinhole]) -> str:
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for k, lens in enumerate(lenses):
         model, params = _model(lens)
-        lines.append(f"{k + 1} {_NAMES[model]} {lens.width} {lens.height} {_numbers(params)}")
+        lines.append(f"{k + 1} {model} {lens.width} {lens.height} {_numbers(params)}")
     return "\n".join(lines) + "\n"
 
 
@@ -121,31 +113,3 @@ def _points_text(cloud: Cloud, tracks: list[list[tuple[int, int]]]) -> str:
         places = " ".join(f"{image} {place}" for image, place in track)
         lines.append(f"{k + 1} {_numbers(point)} {color[0]} {color[1]} {color[2]} 0.0 {places}".rstrip())
     return "\n".join(lines) + "\n"
-
-
-def _cameras_binary(lenses: list[Pinhole]) -> bytes:
-    out = [struct.pack("<Q", len(lenses))]
-    for k, lens in enumerate(lenses):
-        model, params = _model(lens)
-        out.append(struct.pack("<iiQQ", k + 1, model, lens.width, lens.height))
-        out.append(struct.pack(f"<{len(params)}d", *params))
-    return b"".join(out)
-
-
-def _images_binary(images: list[_Image]) -> bytes:
-    out = [struct.pack("<Q", len(images))]
-    for i in images:
-        out.append(struct.pack("<I7dI", i.number, *i.quaternion, *i.translation, i.camera))
-        out.append(i.name.encode() + b"\0" + struct.pack("<Q", len(i.points)))
-        rows = np.zeros(len(i.points), dtype=[("pixel", "<f8", 2), ("point", "<i8")])
-        rows["pixel"], rows["point"] = i.pixels, i.points
-        out.append(rows.tobytes())
-    return b"".join(out)
-
-
-def _points_binary(cloud: Cloud, tracks: list[list[tuple[int, int]]]) -> bytes:
-    out = [struct.pack("<Q", len(cloud.points))]
-    for k, (point, color, track) in enumerate(zip(cloud.points, cloud.color, tracks)):
-        out.append(struct.pack("<Q3d3BdQ", k + 1, *point, *map(int, color), 0.0, len(track)))
-        out.append(np.array(track, dtype="<i4").tobytes())
-    return b"".join(out)

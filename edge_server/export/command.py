@@ -26,7 +26,7 @@ Write the results of a run or fit as files for other programs. RUN is its folder
 --mesh         triangles with colors: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
 --points       surface points with colors (.ply)
---colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
+--colmap       DIR/images and a model in DIR/sparse/0, as text
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 --trajectory   poses in the format of the TUM benchmark; a file for each camera that moved
 
@@ -64,7 +64,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--splats", type=out_file, metavar="FILE", help="Gaussians: .ply")
     add("--points", type=out_file, metavar="FILE", help="surface points: .ply")
     add("--colmap", type=out_folder, metavar="DIR", help="COLMAP model with images")
-    add("--binary", action="store_true", help="write the --colmap model as binary, not text")
     add("--transforms", type=out_folder, metavar="DIR", help="transforms.json with images and points")
     add("--trajectory", type=out_file, metavar="FILE", help="camera poses, TUM format")
     add(
@@ -156,8 +155,6 @@ class Export:
                 raise ExportError(f"--{name} {path}: expected a file that ends in {' or '.join(endings)}")
         if args.count < 1:
             raise ExportError(f"--count {args.count}: expected 1 or more")
-        if args.binary and args.colmap is None:
-            raise ExportError("--binary is for --colmap DIR")
         if args.mesh is None and (args.measure is not None or args.json is not None):
             raise ExportError("--measure and --json are for --mesh FILE")
         if args.measure is not None:
@@ -240,7 +237,7 @@ class Export:
         from edge_server.export.colmap import write_model
         from edge_server.export.run_source import write_images
 
-        write_model(folder / "sparse" / "0", self.source.shots, self.cloud, self.args.binary)
+        write_model(folder / "sparse" / "0", self.source.shots, self.cloud)
         write_images(folder / "images", self.source.shots)
         print(f"{folder}: {len(self.source.shots)} images, {len(self.cloud.points)} points", flush=True)
 

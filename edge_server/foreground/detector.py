@@ -1,5 +1,4 @@
-"""Boxes, and masks, from any YOLO detection or segmentation model in ONNX (v8 and v11 heads): letterbox, run,
-decode, suppress."""
+"""Boxes and masks from any YOLO segmentation model in ONNX (v8 and v11 heads): letterbox, run, decode, suppress."""
 
 from __future__ import annotations
 
@@ -14,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.embed import EmbeddingError, model_path
+from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, parse_model
 from edge_server.embed.embedder import open_session, reason_of
 from edge_server.embed.letterbox import blob, checked
-from edge_server.foreground import MODELS, OBJECTS, ForegroundError
+from edge_server.foreground import MODELS, SHIPPED, ForegroundError
 
 Array = NDArray[np.float64]
 
@@ -31,20 +30,20 @@ _MOST = 300
 @dataclass(frozen=True)
 class Detection:
     """box: left, top, right, bottom in pixels of the image, not clipped to it. kind: the model's name of the
-    class. mask: computes the object's mask (H, W), not clipped to the box; None if the model gives none."""
+    class. mask: computes the object's mask (H, W), not clipped to the box."""
 
     box: tuple[float, float, float, float]
     score: float
     kind: str
-    mask: Callable[[], NDArray[np.bool_]] | None = None
+    mask: Callable[[], NDArray[np.bool_]]
 
 
 class Detector:
-    """A YOLO detection or segmentation model. path: its ONNX file, or the name of a shipped one (``default``,
-    ``OBJECTS``). ForegroundError: the file is missing or unusable."""
+    """A YOLO segmentation model. path: its ONNX file, or the name of a shipped one (``SHIPPED``).
+    ForegroundError: the file is missing or unusable, or its model gives no masks."""
 
     def __init__(self, path: str) -> None:
-        file = MODELS / OBJECTS[path] if path in OBJECTS else model_path(path)
+        file = MODELS / SHIPPED[path] if path in SHIPPED else Path(path)
         self.name = file.name
         self._session = open_model(file)
         image = self._session.get_inputs()[0]
@@ -55,7 +54,8 @@ class Detector:
         self.height, self.width = _size(image.shape, meta, file)
         self.kinds = _kinds(meta)
         outputs = self._session.get_outputs()
-        self.gives_masks = len(outputs) == 2 and len(outputs[1].shape) == 4
+        if len(outputs) != 2 or len(outputs[1].shape) != 4:
+            raise ForegroundError(f"{file}: gives no masks; name a YOLO segmentation model (-seg)")
         self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # a model that cannot run fails here
 
     def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
@@ -65,19 +65,18 @@ class Detector:
         whole = checked(image, 0)
         try:
             given = blob([whole], self.height, self.width, self._dtype)
-            out, *prototypes = map(np.asarray, self._session.run(None, {self._input: given}))
+            out, prototypes = map(np.asarray, self._session.run(None, {self._input: given}))
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
-        if self.gives_masks and len(prototypes[0]) != 1:
-            raise ForegroundError(f"{self.name}: gives {prototypes[0].shape}, not masks (1, n, height, width)")
-        coefficients = prototypes[0].shape[1] if self.gives_masks else 0
-        rows = decode(out, confidence, self.name, coefficients)
+        if len(prototypes) != 1:
+            raise ForegroundError(f"{self.name}: gives {prototypes.shape}, not masks (1, n, height, width)")
+        rows = decode(out, confidence, self.name, prototypes.shape[1])
         h, w = whole.shape[:2]
         scale, _, (left, top) = self._placed((h, w))
         found = []
         for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
-            mask = partial(self._mask, weights, prototypes[0][0], (h, w)) if self.gives_masks else None
+            mask = partial(self._mask, weights, prototypes[0], (h, w))
             found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
@@ -102,7 +101,7 @@ class Detector:
 
 
 def decode(
-    output: NDArray[np.floating], confidence: float, name: str, coefficients: int = 0
+    output: NDArray[np.floating], confidence: float, name: str, coefficients: int
 ) -> list[tuple[float, ...]]:
     """Decode a YOLO head's ``output`` (1, 4 + kinds + coefficients, cells) or its transpose: center, size and
     a score per class, in pixels of the model's input, and the weights of the masks.
@@ -124,8 +123,8 @@ def decode(
     best = best[np.argsort(-scores[best], kind="stable")][:_MOST]
     if not len(best):
         return []
-    centre, size = table[best, :2], table[best, 2:4]
-    low = centre - size / 2
+    center, size = table[best, :2], table[best, 2:4]
+    low = center - size / 2
     rectangles = np.concatenate([low, size], axis=1)
     kept = cv2.dnn.NMSBoxesBatched(rectangles.tolist(), scores[best].tolist(), kinds[best].tolist(), 0.0, NMS_IOU)
     columns = (low, low + size, scores[best, None], kinds[best, None], table[best, end:])

@@ -5,27 +5,29 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.foreground import BOX, DEFAULT, OBJECTS, OWN, WHY, ForegroundConfig, ForegroundError
-from edge_server.foreground.segment import Box, Segmenter, make_segmenter, whole_box
+from edge_server.foreground import SHIPPED, WHY, ForegroundConfig, ForegroundError
+
+if TYPE_CHECKING:
+    from edge_server.foreground.detector import Detector
 
 log = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8]
-Weight = NDArray[np.float32]
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom: whole pixels within the image, not empty."""
 
 
 @dataclass
 class Counts:
     """Images per result: masked, or unchanged because nothing was detected, the box or the mask had no area,
-    the mask covered everything, or a model failed."""
+    the mask covered everything, or the model failed."""
 
     masked: int = 0
     not_detected: int = 0
@@ -38,21 +40,19 @@ class Counts:
 class Foreground:
     """Applied once to every decoded image. ``seconds``: total run time, for reports only."""
 
-    def __init__(self, config: ForegroundConfig, boxes: Boxes, segmenter: Segmenter) -> None:
-        self.config = config
+    def __init__(self, config: ForegroundConfig, detector: Detector) -> None:
+        self.config, self.detector = config, detector
         self.counts = Counts()
         self.seconds = 0.0
-        self._boxes, self._segmenter = boxes, segmenter
         self._said: set[tuple[str, str]] = set()
 
-    def apply(self, camera: str, image: Image) -> tuple[Image, Weight | None]:
-        """Mask uint8 ``image`` (H, W, 3 or 4). Returns RGBA (H, W, 4) and each pixel's supervision weight,
-        float32 (H, W), or None if all are 1. Background pixels become transparent and black, so that changes
-        there do not count as motion; transparent pixels stay transparent. Without a mask, returns ``image``
-        itself."""
+    def apply(self, camera: str, image: Image) -> Image:
+        """Mask uint8 ``image`` (H, W, 3 or 4). Returns RGBA (H, W, 4): background pixels become transparent
+        and black, so that changes there do not count as motion; transparent pixels stay transparent. Without
+        a mask, returns ``image`` itself."""
         begun = time.perf_counter()
         try:
-            found = self._mask(camera, image)
+            found = self._mask(image)
         except (ForegroundError, EmbeddingError):
             found = "failed"
         self.seconds += time.perf_counter() - begun
@@ -60,19 +60,11 @@ class Foreground:
         setattr(self.counts, counted, getattr(self.counts, counted) + 1)
         if isinstance(found, str):
             self._say(camera, found)
-            return image, None
-        mask, box = found
+            return image
         out = np.empty((*image.shape[:2], 4), np.uint8)
-        out[..., :3] = np.where(mask[..., None], image[..., :3], 0)
-        out[..., 3] = np.where(mask, image[..., 3] if image.shape[2] == 4 else 255, 0)
-        doubt = np.float32(self.config.doubt)
-        # A whole-box mask labels no pixel within the box as background.
-        if doubt == 1.0 or self.config.segment == BOX:
-            return out, None
-        weight: Weight = np.ones(mask.shape, np.float32)
-        inside = weight[box[1] : box[3], box[0] : box[2]]
-        inside[~mask[box[1] : box[3], box[0] : box[2]]] = doubt
-        return out, weight
+        out[..., :3] = np.where(found[..., None], image[..., :3], 0)
+        out[..., 3] = np.where(found, image[..., 3] if image.shape[2] == 4 else 255, 0)
+        return out
 
     def _say(self, camera: str, why: str) -> None:
         """Log a camera's first unmasked image for each reason, if the camera has a name."""
@@ -80,75 +72,28 @@ class Foreground:
             self._said.add((camera, why))
             log.warning("camera %s: an image is used whole: %s (further ones: edge.json)", camera, WHY[why])
 
-    def _mask(self, camera: str, image: Image) -> tuple[NDArray[np.bool_], Box] | str:
-        """Object mask (H, W) and box; if the image passes unchanged, why: a name of ``Counts``."""
-        height, width = image.shape[:2]
-        found = self._boxes.of(camera, image)
-        if found is None:
+    def _mask(self, image: Image) -> NDArray[np.bool_] | str:
+        """Object mask (H, W); if the image passes unchanged, why: a name of ``Counts``."""
+        c = self.config
+        found = [d for d in self.detector.detect(image, c.confidence) if not c.kinds or d.kind in c.kinds]
+        if not found:
             return "not_detected"
-        box = clipped(found.box, width, height)
+        x0, y0, x1, y1 = found[0].box
+        dx, dy = c.margin * (x1 - x0), c.margin * (y1 - y0)
+        box = clipped((x0 - dx, y0 - dy, x1 + dx, y1 + dy), image.shape[1], image.shape[0])
         if box is None:
             return "empty_box"
-        if self.config.segment in (None, OWN) and found.mask is not None:
-            mask = found.mask() & whole_box(image, box)
-        else:
-            mask = self._segmenter(np.ascontiguousarray(image[..., :3]), box)
+        inside = np.zeros(image.shape[:2], np.bool_)
+        inside[box[1] : box[3], box[0] : box[2]] = True
+        mask: NDArray[np.bool_] = found[0].mask() & inside
         if not mask.any():
             return "empty_mask"
-        return "full_mask" if mask.all() else (mask, box)
+        return "full_mask" if mask.all() else mask
 
     def status(self) -> dict[str, Any]:
         """Counts, and milliseconds per image."""
         images = sum(vars(self.counts).values())
         return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / images if images else None}
-
-
-@dataclass(frozen=True)
-class Found:
-    """The object. box: left, top, right, bottom in pixels, possibly beyond the image. mask: computes the
-    detector's own mask (H, W); None without one."""
-
-    box: tuple[float, float, float, float]
-    mask: Callable[[], NDArray[np.bool_]] | None = None
-
-
-class Boxes:
-    """The object's box, fixed or detected. Raises ForegroundError."""
-
-    def __init__(self, config: ForegroundConfig) -> None:
-        self._config = config
-        self._detector = None
-        if config.detector is not None:
-            from edge_server.foreground.detector import Detector
-
-            self._detector = Detector(config.detector)
-            known = set(self._detector.kinds.values())
-            if known and (unknown := set(config.kinds) - known):
-                raise ForegroundError(
-                    f"kinds: {self._detector.name} knows no {', '.join(sorted(unknown))}; "
-                    f"it knows {', '.join(sorted(known))}"
-                )
-        if config.segment == OWN and (self._detector is None or not self._detector.gives_masks):
-            raise ForegroundError(
-                f"segment: {OWN}: {self._detector.name if self._detector else 'a fixed box'} gives no masks; "
-                "name a YOLO segmentation model (-seg), or grabcut"
-            )
-
-    def of(self, camera: str, image: Image) -> Found | None:
-        """None if nothing was detected."""
-        c = self._config
-        if self._detector is None:
-            share = c.boxes.get(camera, c.box)
-            if share is None:
-                return None
-            height, width = image.shape[:2]
-            return Found((share[0] * width, share[1] * height, share[2] * width, share[3] * height))
-        found = [d for d in self._detector.detect(image, c.confidence) if not c.kinds or d.kind in c.kinds]
-        if not found:
-            return None
-        x0, y0, x1, y1 = found[0].box
-        dx, dy = c.margin * (x1 - x0), c.margin * (y1 - y0)
-        return Found((x0 - dx, y0 - dy, x1 + dx, y1 + dy), found[0].mask)
 
 
 def clipped(box: tuple[float, float, float, float], width: int, height: int) -> Box | None:
@@ -162,14 +107,22 @@ def clipped(box: tuple[float, float, float, float], width: int, height: int) -> 
 
 
 def make_foreground(config: ForegroundConfig) -> Foreground:
-    """Create from a config. Raises ForegroundError: a library is not installed, or a model is unusable."""
+    """Create from a config. Raises ForegroundError: a library is not installed, or the model is unusable."""
     try:
-        return Foreground(config, Boxes(config), make_segmenter(config))
+        from edge_server.foreground.detector import Detector
+
+        detector = Detector(config.detector)
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in ("onnx", "onnxruntime"):
             raise
         package = error.name.split(".")[0]
-        what = "the shipped detector" if config.detector in (DEFAULT, *OBJECTS) else "an ONNX model"
+        what = "the shipped model" if config.detector in SHIPPED else "an ONNX model"
         raise ForegroundError(
             f"{what} needs {package}, which is not installed: pip install 'freshfield[embed]'"
         ) from None
+    known = set(detector.kinds.values())
+    if known and (unknown := set(config.kinds) - known):
+        raise ForegroundError(
+            f"kinds: {detector.name} knows no {', '.join(sorted(unknown))}; it knows {', '.join(sorted(known))}"
+        )
+    return Foreground(config, detector)

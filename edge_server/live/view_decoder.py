@@ -96,10 +96,9 @@ class ViewDecoder:
             image = payload.decode(frame.payload, frame.codec, k.width, k.height, halvings)
         except payload.PayloadError:
             return None
-        weight = None
         if self.foreground is not None:
-            image, weight = self.foreground.apply(frame.camera, image)
-        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), item.generated_ns, weight)
+            image = self.foreground.apply(frame.camera, image)
+        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), item.generated_ns)
 
     def _halvings(self, k: Pinhole) -> int:
         if self.most_pixels is None:

@@ -15,8 +15,7 @@ from edge_server.surface.volume import Volume, unblock
 
 Floats = NDArray[np.float32]
 
-SLAB_CELLS = 1 << 24  # voxels per marching cubes call: 64 MB, and a few times that inside the call
-LAYER_CELLS = 1 << 23  # voxels in one layer, at most; the thinnest slab has SIDE layers
+MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
 LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
 KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
 INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
@@ -49,42 +48,24 @@ class Mesh:
         return areas
 
 
-def extract_mesh(
-    volume: Volume, min_weight: float = 0.0, watertight: bool = False, on_slab: Callable[[float], None] | None = None
-) -> Mesh:
+def extract_mesh(volume: Volume, min_weight: float = 0.0, watertight: bool = False) -> Mesh:
     """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant).
 
     min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
     watertight: treat space in the box that no camera looked through as solid; this closes the surface.
-    on_slab: called with the completed share. SurfaceError: scikit-image is missing, or there is no surface.
+    SurfaceError: scikit-image is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
     """
     marching_cubes = import_marching_cubes()
     dense = _Dense(volume, min_weight, watertight)
-    vertices: list[NDArray[np.float64]] = []
-    faces: list[NDArray[np.int64]] = []
-    seams: dict[bytes, int] = {}
-    count = 0
-    for first, last in dense.slabs():
-        distance, known = dense.slab(first, last)
-        # scikit-image reads a cell's mask at its upper corner.
-        cells = np.zeros(known.shape, np.bool_)
-        cells[1:, 1:, 1:] = _all_corners(known) & _crosses_surface(distance)
-        if cells.any():
-            points, triangles, *_ = marching_cubes(distance, 0.0, mask=cells)
-            points = points.astype(np.float64) + np.array([first, 0, 0])
-            number = _merge_seams(points, count, (first, last), seams)
-            new = number >= count
-            vertices.append(points[new])
-            faces.append(number[triangles])
-            count += int(new.sum())
-        if on_slab is not None:
-            on_slab(last / (dense.span[0] - 1))
-    if not count:
+    distance, known = dense.distances()
+    # scikit-image reads a cell's mask at its upper corner.
+    cells = np.zeros(known.shape, np.bool_)
+    cells[1:, 1:, 1:] = _all_corners(known) & _crosses_surface(distance)
+    if not cells.any():
         raise SurfaceError("the depth maps hold no surface within the bounds")
-    index = np.concatenate(vertices)
-    color = dense.colors(index)
-    meters = dense.meters(index)
-    mesh = Mesh(meters.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
+    points, faces, *_ = marching_cubes(distance, 0.0, mask=cells)
+    index = points.astype(np.float64)
+    mesh = Mesh(dense.meters(index).astype(np.float32), faces.astype(np.int32), dense.colors(index))
     return remove_degenerate(mesh)
 
 
@@ -95,22 +76,6 @@ def import_marching_cubes() -> Callable[..., Any]:
     except ImportError:
         raise SurfaceError(INSTALL) from None
     return marching_cubes
-
-
-def _merge_seams(
-    points: NDArray[np.float64], count: int, planes: tuple[int, int], seams: dict[bytes, int]
-) -> NDArray[np.int64]:
-    """Vertex indices of ``points`` (N, 3); new indices start at ``count``. Points on a plane between slabs
-    share one index: both slabs compute them from the same voxels, so they are equal bit for bit."""
-    number = np.full(len(points), -1, np.int64)
-    at_seam = np.isin(points[:, 0], planes)
-    for k in np.flatnonzero(at_seam):
-        number[k] = seams.get(points[k].tobytes(), -1)
-    fresh = number < 0
-    number[fresh] = count + np.arange(int(fresh.sum()))
-    for k in np.flatnonzero(at_seam & fresh):
-        seams[points[k].tobytes()] = int(number[k])
-    return number
 
 
 def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -134,8 +99,8 @@ def _crosses_surface(distance: Floats) -> NDArray[np.bool_]:
 
 
 class _Dense:
-    """Slabs of a volume as dense arrays. Indices start at the first voxel of block ``low``. A watertight
-    surface adds one empty layer before the first voxel and one after the last; indices include it."""
+    """A volume as dense arrays. Indices start at the first voxel of block ``low``. A watertight surface adds one
+    empty layer before the first voxel and one after the last; indices include it."""
 
     def __init__(self, volume: Volume, min_weight: float, watertight: bool) -> None:
         self.volume, self.min_weight, self.watertight = volume, min_weight, watertight
@@ -147,43 +112,35 @@ class _Dense:
             low, high = np.zeros(3, np.int64), volume.grid.blocks
         self.pad = int(watertight)
         self.low, self.high = low.astype(np.int64), high.astype(np.int64)
-        self.span = tuple(int(n) for n in (self.high - self.low) * SIDE + 2 * self.pad)
-        if self.span[1] * self.span[2] > LAYER_CELLS:
-            raise SurfaceError("the volume is too wide for one slab: take larger voxels or smaller bounds")
+        voxels = int(np.prod((self.high - self.low) * SIDE))
+        if voxels > MOST_VOXELS:
+            least_m = volume.grid.voxel_m * (voxels / MOST_VOXELS) ** (1 / 3)
+            raise SurfaceError(
+                f"a mesh at {1e3 * volume.grid.voxel_m:g} mm has too many voxels: take {1e3 * least_m:.2g} mm "
+                "or more, or smaller bounds"
+            )
 
-    def slabs(self) -> list[tuple[int, int]]:
-        """(first, last) layers along x; neighboring slabs share one layer."""
-        layers = max(SIDE, SLAB_CELLS // (self.span[1] * self.span[2]))
-        end = self.span[0] - 1
-        return [(x, min(x + layers, end)) for x in range(0, end, layers)]
-
-    def slab(self, first: int, last: int) -> tuple[Floats, NDArray[np.bool_]]:
-        """Distances of layers first to last inclusive, and whether each is known."""
-        grid, blocks, pad = self.volume.grid, self.volume.blocks, self.pad
-        inner = self.span[0] - 2 * pad
-        begin, end = max(first - pad, 0), min(last + 1 - pad, inner)  # voxels
-        b0, b1 = begin // SIDE, -(-end // SIDE)
-        box = (slice(self.low[0] + b0, self.low[0] + b1), *map(slice, self.low[1:], self.high[1:]))
-        part = self.volume.table[box]
-        known = part >= 0
-        distance = np.full((*part.shape, CELLS), grid.band_m, np.float32)
-        sure = np.zeros((*part.shape, CELLS), np.bool_)
-        distance[known] = blocks.distance[part[known]]
-        sure[known] = blocks.weight[part[known]] > self.min_weight
+    def distances(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Distances of all voxels (X, Y, Z), meters, and whether each is known."""
+        grid, blocks = self.volume.grid, self.volume.blocks
+        box = tuple(map(slice, self.low, self.high))
+        table = self.volume.table[box]
+        known = table >= 0
+        distance = np.full((*table.shape, CELLS), grid.band_m, np.float32)
+        sure = np.zeros((*table.shape, CELLS), np.bool_)
+        distance[known] = blocks.distance[table[known]]
+        sure[known] = blocks.weight[table[known]] > self.min_weight
         if self.watertight:
             distance = np.where(sure, distance, np.float32(-grid.band_m))
-            free = self.volume.through[box] & ~known
-            distance[free] = grid.band_m
+            distance[self.volume.through[box] & ~known] = grid.band_m
             sure[:] = True
-        cut = slice(begin - b0 * SIDE, end - b0 * SIDE)
         least = np.float32(LEAST * grid.voxel_m)
-        dense, known = unblock(distance)[cut], unblock(sure)[cut]
+        dense, sure = unblock(distance), unblock(sure)
         dense = np.where(np.abs(dense) < least, np.where(dense < 0, -least, least), dense)
-        if pad:
-            width = ((pad - (first > 0), pad - (last < self.span[0] - 1)), (1, 1), (1, 1))
-            dense = np.pad(dense, width, constant_values=grid.band_m)
-            known = np.pad(known, width, constant_values=True)
-        return np.ascontiguousarray(dense), known
+        if self.pad:
+            dense = np.pad(dense, self.pad, constant_values=grid.band_m)
+            sure = np.pad(sure, self.pad, constant_values=True)
+        return np.ascontiguousarray(dense), sure
 
     def meters(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
         """World coordinates (N, 3), meters, of voxel indices (N, 3)."""

@@ -88,8 +88,9 @@ def mesh_from_depth_maps(
         volume = fit_sdf(grid, maps, settings.memory_mb, say, pool)
     else:
         volume = fuse_maps(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
-    mesh = extract_mesh(volume, settings.min_weight, settings.watertight, lambda share: say("extract", share))
-    return remove_small_components(mesh)
+    mesh = remove_small_components(extract_mesh(volume, settings.min_weight, settings.watertight))
+    say("extract", 1.0)
+    return mesh
 
 
 def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:

@@ -40,8 +40,6 @@ ingest     a real edge server that trains, and a real client: response time, gro
 decide     time of a learned policy's decision, without embeddings, with 18 and with 200 cameras
 embed      ms to embed a frame with the shipped detectors or --model FILE, beside plain ONNX Runtime; needs
            the extra embed; not part of all
-foreground masks of lego against its alpha: IoU and ms by option, and dB that a field gains; needs
-           FRESHFIELD_DATA; not part of all
 peer       seconds to 20 and 25 dB on lego and kitchen, beside ngp in plain torch and, where installed
            (docs/fields.md), nerfstudio's nerfacto and OpenSplat; needs FRESHFIELD_DATA; not part of all
 shown      what is shown at random instants of synthetic scenes, in virtual time: content lag, ages, what a
@@ -50,8 +48,8 @@ growth     how cost grows with cameras, image size, speed and people, from room:
            frames left out of updates; in virtual time; not part of all
 surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
            each stage; needs the extra surface; not part of all
-scanned    meshes of the tile alone, of scenario scan: from images masked by its detector, by GrabCut, by
-           true masks, and unmasked; needs the extras surface and embed; not part of all
+scanned    meshes of the tile alone, of scenario scan: from images masked by its detector, by true masks,
+           and unmasked; needs the extras surface and embed; not part of all
 
 With --json FILE, figures are written scene by scene as they are measured, and at the end of a part also
 its tables (FILE with .md) and PART.png. After Ctrl-C, --resume continues where it stopped.
@@ -59,7 +57,7 @@ its tables (FILE with .md) and PART.png. After Ctrl-C, --resume continues where 
 
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
-MORE = ("embed", "foreground", "peer", "shown", "growth", "surface", "scanned")
+MORE = ("embed", "peer", "shown", "growth", "surface", "scanned")
 # Parts that store each figure when it is measured, and skip known ones.
 _RESUMABLE = ("field", "track", "drift", "options", "peer", "shown", "growth", "surface")
 _MODULES = {"growth": "shown.growth", "drift": "track"}  # parts whose module has another name

@@ -1,8 +1,7 @@
 """Measures meshes of one object: the tile on its bench (scenario ``scan``), segmented in several ways.
 
 The viewpoints are those of the scenario's arm. A field is fitted to whole images, and to images cut by the
-scenario's ``edge.foreground``, by GrabCut in its detector's boxes, by these boxes, and by true masks. Each
-mesh is compared with the tile's surface, without bench and tools: error, the share of the surface within 3 mm
+scenario's ``edge.foreground``, and by true masks. Each mesh is compared with the tile's surface, without bench and tools: error, the share of the surface within 3 mm
 of the mesh, and the share of the mesh within 3 mm of the surface. From whole images, a mesh is also made
 within the tile's bounding box, given by hand.
 """
@@ -27,7 +26,7 @@ from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
 from edge_server.experiments.training.detector.mask_quality import found_mask, iou
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
-from edge_server.foreground import BOX, GRABCUT, ForegroundError
+from edge_server.foreground import ForegroundError
 from edge_server.foreground.foreground import make_foreground
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
@@ -40,7 +39,7 @@ SCENARIO = "scan"
 SPACING_M = 0.0015  # spacing of the points of the truth
 ABOVE_M = 0.015  # lower end of the box by hand, above that of the scene's bounds
 _WHOLE, _BY_HAND, _TRUE = "whole images", "whole images, mesh cut to a box by hand", "true masks"
-WAYS: tuple[str, ...] = (_WHOLE, "box", "grabcut", "detector", _TRUE)
+WAYS: tuple[str, ...] = (_WHOLE, "detector", _TRUE)
 
 Mask = NDArray[np.bool_]
 
@@ -98,18 +97,17 @@ def _cut(way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfi
             for v, m in zip(views, masks)
         ]
         return [dataclasses.replace(v, image=i) for v, i in zip(views, images)], {"iou": 1.0, "least": 1.0}
-    segment = {"box": BOX, "grabcut": GRABCUT}.get(way, edge.foreground.segment)
     try:
-        cut = make_foreground(dataclasses.replace(edge.foreground, segment=segment))
+        cut = make_foreground(edge.foreground)
     except ForegroundError as error:
         raise BenchError(str(error)) from None
     out, ious = [], []
     for view, mask in zip(views, masks):
-        image, weight = cut.apply(view.camera, view.image)
+        image = cut.apply(view.camera, view.image)
         # An image in which nothing is found is used whole.
         found = found_mask(image, full=True)
         ious.append(0.0 if found is None else iou(found, mask))
-        out.append(dataclasses.replace(view, image=image, weight=weight))
+        out.append(dataclasses.replace(view, image=image))
     status = cut.status()
     return out, {
         "iou": float(np.mean(ious)),

@@ -165,7 +165,6 @@ def test_a_run_writes_down_where_its_cameras_were(tmp_path):
         (("--mesh", "m.ply", "--voxel", "0"), "--voxel 0: expected more than 0 mm"),
         (("--mesh", "m.ply", "--method", "poisson"), "method must be one of tsdf, sdf"),
         (("--mesh", "m.ply", "--min-weight", "-1"), "min_weight must be in 0..1e+06"),
-        (("--points", "p.ply", "--binary"), "--binary is for --colmap"),
         (("--points", "p.ply", "--count", "0"), "--count 0"),
         (("--mesh", "m.ply", "--voxel", "10", "--bounds", *["1", "1", "1", "0", "0", "0"]), "lower corner"),
     ],

@@ -48,12 +48,11 @@ def pixels(shot: PosedImage, points: np.ndarray) -> np.ndarray:
     return shot.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
 
-@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
-def test_colmap_opens_in_colmap(tmp_path, binary):
+def test_colmap_opens_in_colmap(tmp_path):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (extra colmap)")
     of = shots()
     points = cloud(of)
-    write_model(tmp_path, of, points, binary)
+    write_model(tmp_path, of, points)
     model = pycolmap.Reconstruction(str(tmp_path))
     assert model.num_images() == 4 and model.num_points3D() == 50 and model.num_cameras() == 2
     images = {image.name: image for image in model.images.values()}

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 
 def disc(
-    height: int = 96, width: int = 128, centre: tuple[int, int] = (50, 70), radius: int = 22, seed: int = 0
+    height: int = 96, width: int = 128, center: tuple[int, int] = (50, 70), radius: int = 22, seed: int = 0
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """(picture (H, W, 3), truth (H, W)): an orange disc on a noisy blue ground; centre is (row, column)."""
+    """(picture (H, W, 3), truth (H, W)): an orange disc on a noisy blue ground; center is (row, column)."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width]
-    truth = (y - centre[0]) ** 2 + (x - centre[1]) ** 2 <= radius**2
+    truth = (y - center[0]) ** 2 + (x - center[1]) ** 2 <= radius**2
     picture = np.where(truth[..., None], (230, 120, 20), (40, 70, 160)) + rng.normal(0, 8, (height, width, 3))
     return picture.clip(0, 255).astype(np.uint8), truth
 
@@ -23,28 +23,20 @@ def iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
-def box_of(truth: NDArray[np.bool_], margin: int = 3) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom as shares of the picture, ``margin`` pixels around what is true."""
-    h, w = truth.shape
-    rows, columns = np.flatnonzero(truth.any(1)), np.flatnonzero(truth.any(0))
-    left, top = columns[0] - margin, rows[0] - margin
-    right, bottom = columns[-1] + 1 + margin, rows[-1] + 1 + margin
-    return max(left / w, 0.0), max(top / h, 0.0), min(right / w, 1.0), min(bottom / h, 1.0)
-
-
 def save_orange_detector(
-    path: Path, kinds: int = 3, side: int = 64, transposed: bool = False, masks: bool = False
+    path: Path, kinds: int = 3, side: int = 64, transposed: bool = False, masks: bool = True
 ) -> Path:
     """An ONNX with a YOLO head's output: one cell a pixel of an 8 x 8 grid, of which those on orange score,
-    with boxes of 40 pixels around them. masks: of a segmentation model, orange at a quarter of the side."""
+    with boxes of 40 pixels around them. masks: of a segmentation model, orange at a quarter of the side;
+    False: a detection model without them."""
     from onnx import helper
 
     from tests.edge_server.embed.graphs import save
 
     grid = 8
     step = side // grid
-    centres = (np.arange(grid) + 0.5) * step
-    x, y = np.meshgrid(centres, centres)
+    centers = (np.arange(grid) + 0.5) * step
+    x, y = np.meshgrid(centers, centers)
     boxes = np.stack([x.ravel(), y.ravel(), np.full(grid * grid, 40.0), np.full(grid * grid, 40.0)])
     # Orange: much red, little blue. Score of kind 1; the others get none.
     weight = np.array([1.0, 0.0, -1.0], np.float32).reshape(1, 3, 1, 1)
@@ -82,17 +74,6 @@ def save_orange_detector(
     return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta, further=further)
 
 
-def save_segmenter(path: Path) -> Path:
-    """An ONNX that maps red minus blue to a share of foreground: no YOLO head."""
-    from onnx import helper
-
-    from tests.edge_server.embed.graphs import save
-
-    weight = np.array([1.0, 0.0, -1.0], np.float32).reshape(1, 3, 1, 1)
-    nodes = [helper.make_node("Conv", ["images", "weight"], ["map"])]
-    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), {"weight": weight}, opset=13)
-
-
 def save_memory_bomb(path: Path, kind: str) -> Path:
     """A segmentation ONNX with one tensor of 400 TB. kind: Expand, Tile, ConstantOfShape, Range or Conv."""
     from onnx import helper
@@ -120,8 +101,10 @@ def save_memory_bomb(path: Path, kind: str) -> Path:
         helper.make_node("ReduceMax", ["floats"], ["most"], keepdims=0),
         helper.make_node("Mul", ["images", "most"], ["lit"]),
         helper.make_node("Conv", ["lit", "weight"], ["map"]),
+        helper.make_node("AveragePool", ["images"], ["masks"], kernel_shape=[4, 4], strides=[4, 4]),
     ]
-    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), constants, opset=13)
+    further = (("masks", [1, 3, 16, 16]),)
+    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), constants, opset=13, further=further)
 
 
 def save_endless_loop(path: Path) -> Path:

@@ -1,8 +1,6 @@
-"""The shipped detector of the tile, on views it was not trained on: near, cut off, far away, and none."""
+"""The shipped segmentation model of the tile, on views it was not trained on: near, cut off, far away, and none."""
 
 from __future__ import annotations
-
-import logging
 
 import numpy as np
 import pytest
@@ -22,8 +20,9 @@ for module in ("onnx", "onnxruntime"):
 WIDE, NARROW = 75.0, 40.0
 
 
-def cut(confidence: float = 0.25) -> Foreground:
-    return make_foreground(ForegroundConfig(detector="tile", confidence=confidence))
+@pytest.fixture(scope="module")
+def tile() -> Foreground:
+    return make_foreground(ForegroundConfig("tile"))
 
 
 def seen(
@@ -42,64 +41,54 @@ def seen(
 
 
 def mask_of(foreground: Foreground, image) -> np.ndarray:
-    rgba = foreground.apply("hand", image)[0]
+    rgba = foreground.apply("hand", image)
     assert rgba.shape[2] == 4, foreground.counts
     return rgba[..., 3] == 255
 
 
 @pytest.mark.parametrize("bench", [False, True], ids=["cell", "scan"])
-def test_the_tile_is_cut_out_as_a_hand_sees_it(bench):
+def test_the_tile_is_cut_out_as_a_hand_sees_it(tile, bench):
     found = []
     for elevation in (30, 52, 75):
         for azimuth in (-165, -45, 75):
             image, truth = seen(0.34, azimuth, elevation, WIDE, bench)
-            found.append(iou(mask_of(cut(), image), truth))
+            found.append(iou(mask_of(tile, image), truth))
     assert np.mean(found) > (0.85 if bench else 0.94) and min(found) > (0.75 if bench else 0.9), found
 
 
-def test_the_tile_is_cut_out_of_its_own_scene():
-    scene, foreground, found = make_scene("tile", {"count": 7}), cut(), []
+def test_the_tile_is_cut_out_of_its_own_scene(tile):
+    scene, found = make_scene("tile", {"count": 7}), []
     for name, (lens, pose) in scene.cameras.items():
-        found.append(iou(mask_of(foreground, scene.render(name, 0.0)), scene.object_mask(lens, pose)))
+        found.append(iou(mask_of(tile, scene.render(name, 0.0)), scene.object_mask(lens, pose)))
     assert np.mean(found) > 0.9 and min(found) > 0.8, found
 
 
-def test_larger_pictures_of_another_shape_are_cut_too():
+def test_larger_pictures_of_another_shape_are_cut_too(tile):
     image, truth = seen(0.8, 30, 45, 60.0, size=(320, 200))
-    assert iou(mask_of(cut(), image), truth) > 0.8
+    assert iou(mask_of(tile, image), truth) > 0.8
 
 
 @pytest.mark.parametrize("aim", [(0.30, 0.0, 0.03), (0.0, 0.26, 0.0), (-0.25, -0.2, 0.0)])
-def test_a_tile_that_the_edge_of_the_picture_cuts_off_is_found(aim):
+def test_a_tile_that_the_edge_of_the_picture_cuts_off_is_found(tile, aim):
     image, truth = seen(0.55, 20, 50, NARROW, aim=aim)
     assert truth[[0, -1]].any() or truth[:, [0, -1]].any()
-    assert iou(mask_of(cut(), image), truth) > 0.75
+    assert iou(mask_of(tile, image), truth) > 0.75
 
 
 @pytest.mark.parametrize("azimuth", [-60, 10, 100])
-def test_a_tile_far_away_is_found(azimuth):
+def test_a_tile_far_away_is_found(tile, azimuth):
     image, truth = seen(2.0, azimuth, 45, 60.0)
     assert truth.mean() < 0.04
     # Some 30 pixels wide, with a mask at half of that: where it is, not its outline.
-    assert iou(mask_of(cut(), image), truth) > 0.25
+    assert iou(mask_of(tile, image), truth) > 0.25
 
 
-def test_a_picture_without_the_tile_is_used_whole_and_this_is_said_once(caplog):
+def test_a_picture_without_the_tile_is_used_whole():
     scene = make_scene("tile", {"count": 1, "bench": True})
     parts = scene.world.static_parts[scene.object_parts :]
     empty = scene.with_world(type(scene.world)(parts, (), scene.world.light, scene.world.background))
-    foreground = cut(read_config(load("scan")).foreground.confidence)
-    with caplog.at_level(logging.WARNING):
-        for azimuth in (-30, 60, 150):
-            image = empty.view(Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)).image(0)
-            out, weight = foreground.apply("hand", image)
-            assert out is image and weight is None, "nothing is lost"
+    foreground = make_foreground(read_config(load("scan")).foreground)
+    for azimuth in (-30, 60, 150):
+        image = empty.view(Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)).image(0)
+        assert foreground.apply("hand", image) is image, "nothing is lost"
     assert foreground.counts.not_detected == 3 == sum(vars(foreground.counts).values())
-    (said,) = [record.getMessage() for record in caplog.records]
-    assert said == "camera hand: an image is used whole: nothing was found in it (further ones: edge.json)"
-
-
-def test_the_shipped_scenario_cuts_every_picture_without_a_box_by_hand():
-    config = read_config(load("scan")).foreground
-    assert config.detector == "tile" and config.box is None and not config.boxes
-    assert set(make_foreground(config)._boxes._detector.kinds.values()) == {"tile"}

@@ -1,4 +1,4 @@
-"""Marching cubes over blocks: the right surface, closed where asked, without seams between slabs or dirt."""
+"""Marching cubes over blocks: the right surface, closed where asked, without dirt."""
 
 from __future__ import annotations
 
@@ -38,13 +38,11 @@ def test_a_ball_comes_out_as_a_ball(ball):
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
 
 
-def test_slabs_leave_no_seam(ball, monkeypatch):
-    whole = extract_mesh(ball, watertight=True)
-    monkeypatch.setattr(mesh_module, "SLAB_CELLS", 1)
-    slabs = extract_mesh(ball, watertight=True)
-    assert whole.watertight and slabs.watertight
-    assert len(whole.faces) == len(slabs.faces) and len(whole.vertices) == len(slabs.vertices)
-    assert np.allclose(np.sort(whole.vertices, axis=0), np.sort(slabs.vertices, axis=0), atol=1e-7)
+def test_a_mesh_beyond_memory_says_what_would_do(ball, monkeypatch):
+    assert mesh_module.MOST_VOXELS == 1 << 27
+    monkeypatch.setattr(mesh_module, "MOST_VOXELS", 50_000)
+    with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
+        extract_mesh(ball)
 
 
 def test_what_nobody_saw_stays_open_or_is_closed():

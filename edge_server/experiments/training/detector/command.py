@@ -127,11 +127,10 @@ def folder(args: argparse.Namespace) -> Path:
 
 
 def _masks(fp32: Path, int8: Path, sets: dict[str, Any]) -> dict[str, Any]:
-    """Quality of the masks of both files, and of GrabCut in the boxes of the int8 file."""
+    """Quality of the masks of both files."""
     from edge_server.experiments.training.detector.mask_quality import measure_masks
 
-    ways = ((fp32.stem, fp32, None), (int8.stem, int8, None), (f"{int8.stem}, grabcut", int8, "grabcut"))
-    return {name: {where: measure_masks(path, p, segment) for where, p in sets.items()} for name, path, segment in ways}
+    return {path.stem: {where: measure_masks(path, p) for where, p in sets.items()} for path in (fp32, int8)}
 
 
 def _agreement(fp32: Path, int8: Path, images: Any) -> dict[str, float]:

