@@ -1,0 +1,181 @@
+"""Keys of results: hashes of everything that determines a result."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import hashlib
+import json
+import platform
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import camera_node
+import channel_emu
+import edge_server
+import freshfield
+from edge_server.report.machine import versions
+
+_PACKAGES = {str(package.__name__): package for package in (freshfield, camera_node, channel_emu, edge_server)}
+_KEY_LENGTH = 40
+
+
+def result_key(work: Callable[..., Any], inputs: Any, files: Iterable[Path | None] = ()) -> str:
+    """The key of ``work(inputs)`` (hex). What a ``functools.partial`` binds is left out.
+
+    inputs: a dataclass or JSON value; the order of names in mappings does not matter.
+    files: files and folders whose contents the result depends on; None is skipped.
+    Raises TypeError for inputs that JSON cannot hold, OSError for a file that cannot be read.
+    """
+    while isinstance(work, partial):
+        work = work.func
+    parts = {
+        "work": f"{work.__module__}.{work.__qualname__}",
+        "code": code_digest(work.__module__),
+        "versions": _versions(),
+        "processor": processor(),
+        "inputs": inputs,
+        "files": [content_digest(path) for path in files if path is not None],
+    }
+    text = json.dumps(parts, sort_keys=True, default=plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
+
+
+def plain(value: Any) -> Any:
+    """``value`` as JSON has it, for ``json.dumps(default=...)``: dataclasses, paths and NumPy's numbers. Raises
+    TypeError for anything else."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is no JSON value: inputs and results of repeated work must be")
+
+
+_versions = cache(versions)
+
+
+@cache
+def processor() -> str:
+    """The kind of processor that kernels are compiled for."""
+    import llvmlite.binding as llvm  # what numba compiles with
+
+    return f"{platform.machine()} {llvm.get_host_cpu_name()}"
+
+
+# --- files -------------------------------------------------------------------------------------------------
+
+
+def content_digest(path: Path) -> str:
+    """Digest of a file's contents, or of a folder's files with their names. Raises OSError."""
+    if not path.is_dir():
+        return _file_digest(path, *_state(path))
+    digest = hashlib.sha256()
+    for file in sorted(file for file in path.rglob("*") if file.is_file()):
+        digest.update(f"{file.relative_to(path).as_posix()}\0{_file_digest(file, *_state(file))}\n".encode())
+    return digest.hexdigest()
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """Size and time of the last change: a file that keeps both is read once a process."""
+    stat = path.stat()
+    return stat.st_size, stat.st_mtime_ns
+
+
+@cache
+def _file_digest(path: Path, size: int, changed_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- code --------------------------------------------------------------------------------------------------
+
+
+@cache
+def code_digest(module: str) -> str:
+    """Digest of the code that a module runs: the syntax trees of the module and of all modules of this project
+    that it imports, directly or not, at the top of a file or in a function. Docstrings and formatting do not count.
+
+    A module that imports others by a computed name (a registry) counts with everything below its folder.
+    """
+    digest = hashlib.sha256()
+    for name in sorted(_closure(module)):
+        digest.update(f"{name}\0{_facts(name).tree}\n".encode())
+    return digest.hexdigest()
+
+
+def _closure(module: str) -> set[str]:
+    found, waiting = set[str](), [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found and _source(name) is not None:
+            found.add(name)
+            waiting += _facts(name).imports
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Facts:
+    """Of one module: a digest of its syntax tree, and the names of what it imports, of which some are no modules."""
+
+    tree: str
+    imports: tuple[str, ...]
+
+
+@cache
+def _facts(module: str) -> _Facts:
+    path = _source(module)
+    assert path is not None
+    tree = ast.parse(path.read_bytes())
+    _drop_docstrings(tree)
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+    return _Facts(digest, tuple(dict.fromkeys(_imports(tree, module, package))))
+
+
+def _imports(tree: ast.Module, module: str, package: str) -> Iterator[str]:
+    if parent := module.rpartition(".")[0]:  # importing a module runs its packages first
+        yield parent
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and "import_module" in (vars(node.func).get("attr"), vars(node.func).get("id")):
+            yield from _below(package)
+
+
+def _below(package: str) -> Iterator[str]:
+    """The modules of a package and of those within it."""
+    path = _source(package)
+    for file in sorted(path.parent.rglob("*.py")) if path is not None else ():
+        inner = file.relative_to(path.parent).with_suffix("").parts  # type: ignore[union-attr]
+        yield ".".join((package, *inner)).removesuffix(".__init__")
+
+
+def _drop_docstrings(tree: ast.Module) -> None:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [
+                s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
+            ] or [ast.Pass()]
+
+
+@cache
+def _source(module: str) -> Path | None:
+    """The file of a module of this project, or of one that does not belong to a package and is loaded already (a
+    test's or a user's own); None: there is none, or it is somebody else's."""
+    root, *inner = module.split(".")
+    package = _PACKAGES.get(root)
+    if package is None:
+        loaded = getattr(sys.modules.get(module), "__file__", None)
+        if loaded is None or "site-packages" in loaded or loaded.startswith(sys.base_prefix):
+            return None
+        return Path(loaded)
+    path = Path(str(package.__file__)).parent.joinpath(*inner)
+    return next((p for p in (path.with_suffix(".py") if inner else path, path / "__init__.py") if p.is_file()), None)

@@ -1,0 +1,218 @@
+"""Runs a function over many inputs: here, in processes or on a Ray cluster, through joblib."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+
+from edge_server.experiments.engine.content_key import plain, processor, result_key
+from edge_server.experiments.engine.result_store import ResultStore
+from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
+from freshfield.machine_load import usable_cores
+
+Input = TypeVar("Input")
+# Inputs of one group in a task: enough to share images, few enough that Ctrl-C loses little work.
+_BATCH = 6
+_ROUND = 4  # tasks a core of a cluster between two lots of results
+_PARENT_EVERY_S = 0.5
+
+
+class EngineError(RuntimeError):
+    """Work that cannot be run as asked; the message says what to change."""
+
+
+@dataclass
+class Engine:
+    """Computes results and keeps them; see the package's docstring.
+
+    file: the JSON lines that keep the results; None keeps them in memory.
+    jobs: number of processes; 1 computes in this one.
+    ray: address of a Ray cluster (``auto``, ``local`` or HOST:PORT) to use instead of processes.
+    threads: number of threads of each process; None: an equal share of the cores.
+    say: called with each line of progress.
+    """
+
+    file: Path | None = None
+    jobs: int = 1
+    ray: str | None = None
+    threads: int | None = None
+    say: Callable[[str], None] = print
+    _store: ResultStore | None = None
+
+    def run(
+        self,
+        work: Callable[[Input], Any],
+        inputs: Sequence[Input],
+        name: str = "work",
+        *,
+        files: Callable[[Input], Iterable[Path | None]] | None = None,
+        group: Callable[[Input], Hashable] | None = None,
+        batch: int = _BATCH,
+        describe: Callable[[Input, Any], str] | None = None,
+    ) -> list[Any]:
+        """The result of ``work`` for each of ``inputs``, in their order; known ones are not computed again.
+
+        name: what progress is reported of.
+        files: the files and folders that the result of an input depends on.
+        group: what inputs share; those of equal value are computed in one process, in turn.
+        batch: most inputs of a task.
+        describe: text of one result, for progress.
+        Raises EngineError, and whatever ``work`` raises. After KeyboardInterrupt the file has what was finished.
+        """
+        store = self._store = self._store or ResultStore(self.file)
+        keys = [result_key(work, one, files(one) if files else ()) for one in inputs]
+        wanted = {key: one for key, one in zip(keys, inputs) if key not in store.results}
+        total, done, began = len(wanted), 0, time.monotonic()
+        if total:
+            self.say(f"{name}: {total} to compute, {len(set(keys)) - total} known")
+        for task, results in self._results(work, _tasks(wanted, group, batch)):
+            for (key, one), result in zip(task, results):
+                store.put(key, one, result)
+                done += 1
+                if describe is not None:
+                    self.say(f"[{done}/{total}] {describe(one, result)}")
+            spent_s = time.monotonic() - began
+            self.say(f"{name}: {done}/{total}, {spent_s:.0f} s, {spent_s / done * (total - done):.0f} s left")
+        return [store.results[key] for key in keys]
+
+    def close(self) -> None:
+        """Close the file of results."""
+        if self._store is not None:
+            self._store.close()
+            self._store = None
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _results(self, work: Callable[[Input], Any], tasks: list[_Task[Input]]) -> Iterator[tuple[Any, list[Any]]]:
+        """Each task with its results, as they come."""
+        if self.ray is not None and tasks:
+            yield from _on_ray(self.ray, work, tasks)
+        elif self.jobs > 1 and len(tasks) > 1:
+            yield from _in_processes(min(self.jobs, len(tasks)), self.threads, work, tasks)
+        else:
+            if self.threads is not None and tasks:
+                limit_threads(self.threads)
+            for task in tasks:
+                yield task, _compute(work, task, 0)[1]
+
+
+_Task = list[tuple[str, Input]]
+"""Keys and inputs that one process computes in turn."""
+
+
+def _tasks(
+    wanted: dict[str, Input], group: Callable[[Input], Hashable] | None, batch: int
+) -> list[list[tuple[str, Input]]]:
+    groups: dict[Hashable, list[tuple[str, Input]]] = {}
+    for key, one in wanted.items():
+        groups.setdefault(key if group is None else ("group", group(one)), []).append((key, one))
+    return [of[i : i + batch] for of in groups.values() for i in range(0, len(of), batch)]
+
+
+def _compute(work: Callable[[Any], Any], task: Any, number: int, kind: str | None = None) -> tuple[int, list[Any]]:
+    """The number of a task and its results, as they come back from a file. Every backend runs this function.
+
+    kind: the kind of processor that results are kept for; None: this one. Raises EngineError on another kind.
+    """
+    if kind is not None and kind != processor():
+        raise EngineError(f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor")
+    return number, [json.loads(json.dumps(work(one), default=plain)) for _, one in task]
+
+
+def _in_processes(
+    jobs: int, threads: int | None, work: Callable[[Any], Any], tasks: Sequence[Any]
+) -> Iterator[tuple[Any, list[Any]]]:
+    import joblib
+
+    start = threads or max(1, usable_cores() // jobs), threads is not None
+    # New processes inherit the mask: Ctrl-C is for this one, which then ends them.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with joblib.parallel_config("loky", initializer=_init_worker, initargs=start):
+            parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
+            computed = parallel(joblib.delayed(_compute)(work, task, k) for k, task in enumerate(tasks))
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        for number, results in computed:
+            yield tasks[number], results
+    finally:
+        computed.close()  # after an error or Ctrl-C it ends the processes at once
+
+
+def _on_ray(where: str, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[Any, list[Any]]]:
+    """In rounds, because joblib's backend for Ray returns results all at once."""
+    import joblib
+
+    size = _ROUND * join_cluster(where)
+    remote = {"runtime_env": {"env_vars": {THREADS_VARIABLE: "1"}}}
+    with joblib.parallel_config("ray", ray_remote_args=remote), joblib.Parallel(-1, batch_size=1) as parallel:
+        for first in range(0, len(tasks), size):
+            part = tasks[first : first + size]
+            sent = (joblib.delayed(_compute)(work, task, k, processor()) for k, task in enumerate(part))
+            for number, results in parallel(sent):
+                yield part[number], results
+
+
+def limit_threads(threads: int) -> None:
+    """Set the number of threads of OpenCV, of torch and, up to ``MOST_USEFUL``, of our kernels in this process. The
+    number of threads that share a convolution of torch changes its last bits."""
+    import torch
+
+    _share_cores(threads)
+    torch.set_num_threads(threads)
+
+
+def _share_cores(threads: int) -> None:
+    os.environ[THREADS_VARIABLE] = str(min(threads, MOST_USEFUL))
+    cv2.setNumThreads(threads)
+
+
+def _init_worker(threads: int, exact: bool) -> None:
+    """Initializer of a process: give it its threads, and end it when its parent ends, however that happens.
+
+    exact: results depend on the number of threads.
+    """
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # torch reads it when it is imported
+    (limit_threads if exact else _share_cores)(threads)
+    threading.Thread(target=_end_with, args=(os.getppid(),), name="parent", daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_PARENT_EVERY_S)
+    os._exit(1)  # at once: nobody waits for half a result
+
+
+def join_cluster(where: str) -> int:
+    """Join the cluster at an address, or start one here ("local"); returns its number of cores. Raises EngineError."""
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError:
+        raise EngineError("--ray needs Ray: pip install 'freshfield[cluster]'") from None
+    register_ray()
+    attempts = 2 if where == "local" else 1  # the first start on a cold disk may exceed Ray's 30 seconds
+    for left in reversed(range(attempts)):
+        try:
+            if not ray.is_initialized():
+                ray.init(address=None if where == "local" else where, log_to_driver=False, include_dashboard=False)
+            break
+        except Exception as error:  # Ray raises this very class where a node starts too slowly
+            ray.shutdown()
+            if not left:
+                raise EngineError(f"--ray {where}: no cluster can be reached: {error}") from None
+    return int(ray.cluster_resources()["CPU"])

@@ -1,0 +1,145 @@
+"""Repeated work: the same results whoever computes them, none twice, and none of other code, data or inputs."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from edge_server.experiments.engine import Engine, EngineError
+from edge_server.experiments.engine.engine import _compute
+from tests.edge_server.experiments.engine.jobs import Point, fail, measure, note
+from tests.waiting import wait_until
+
+POINTS = [Point(seed, scene=scene) for scene in ("room", "tower") for seed in range(4)]
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+def run(engine: Engine, work=measure, points=POINTS, **how):
+    engine.say = quiet
+    with engine:
+        return engine.run(work, points, **how)
+
+
+@pytest.fixture(scope="module")
+def serial() -> list:
+    return run(Engine())
+
+
+def test_results_come_in_the_order_of_the_inputs_as_they_come_back_from_a_file(serial, tmp_path):
+    assert [round(row["mean"], 6) for row in serial[:2]] == [0.081097, -0.073612]
+    assert isinstance(serial[0]["ends"], list)
+    backwards = run(Engine(tmp_path / "r.jsonl"), points=POINTS[::-1])
+    assert repr(backwards[::-1]) == repr(serial)
+    again = run(Engine(tmp_path / "r.jsonl"), work=measure)
+    assert repr(again) == repr(serial)
+
+
+def test_processes_compute_the_same_bit_for_bit(serial):
+    assert repr(run(Engine(jobs=2), group=lambda p: p.scene, batch=3)) == repr(serial)
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_a_ray_cluster_computes_the_same_bit_for_bit(serial):
+    ray = pytest.importorskip("ray", reason="needs Ray: pip install 'freshfield[cluster]'")
+    try:
+        assert repr(run(Engine(ray="local"), group=lambda p: p.scene)) == repr(serial)
+    finally:
+        ray.shutdown()
+
+
+def test_a_cluster_of_another_kind_of_processor_is_refused():
+    with pytest.raises(EngineError, match="one kind of processor"):
+        _compute(measure, [("key", POINTS[0])], 0, "x86_64 haswell")
+
+
+def test_what_is_known_is_not_computed_again_and_one_key_is_computed_once(tmp_path):
+    engine, work = Engine(tmp_path / "r.jsonl", say=quiet), partial(note, folder=tmp_path)
+    assert len(set(engine.run(work, [*POINTS, *POINTS]))) == 1
+    assert engine.run(partial(note, folder=tmp_path / "elsewhere"), POINTS[:2]) == [os.getpid()] * 2
+    assert len(list(tmp_path.glob("*.call"))) == len(POINTS)
+    line = json.loads((tmp_path / "r.jsonl").read_text().splitlines()[0])
+    assert line["inputs"] == {"seed": 0, "size": 100, "scene": "room"} and line["result"] == os.getpid()
+
+
+def test_a_group_stays_in_one_process_in_turn(tmp_path):
+    processes = run(Engine(jobs=2), partial(note, folder=tmp_path), group=lambda p: p.scene, batch=4)
+    assert len(set(processes[:4])) == len(set(processes[4:])) == 1
+    order = [path.stem.split("-")[1:] for path in sorted(tmp_path.iterdir())]
+    for scene in ("room", "tower"):
+        assert [seed for where, seed in order if where == scene] == ["0", "1", "2", "3"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_after_an_error_the_file_has_what_was_finished(jobs, tmp_path):
+    engine = Engine(tmp_path / "r.jsonl", jobs=jobs)
+    with pytest.raises(ValueError, match="seed 3 cannot be computed"):
+        run(engine, fail, [Point(seed) for seed in range(4)])
+    kept = [json.loads(line)["result"] for line in (tmp_path / "r.jsonl").read_text().splitlines()]
+    assert set(kept) <= {0, 1, 2} and (jobs == 2 or kept == [0, 1, 2])
+
+
+def test_progress_names_what_is_left_and_what_each_result_is(tmp_path):
+    lines: list[str] = []
+    engine = Engine(tmp_path / "r.jsonl", say=lines.append)
+    engine.run(measure, POINTS[:1], "points")
+    engine.run(measure, POINTS[:3], "points", describe=lambda p, row: f"seed {p.seed}: {row['mean']:.3f}")
+    assert lines[0] == "points: 1 to compute, 0 known" and lines[2] == "points: 2 to compute, 1 known"
+    assert lines[3] == "[1/2] seed 1: -0.074"
+
+
+PARENT = """
+import sys
+from functools import partial
+from pathlib import Path
+from edge_server.experiments.engine import Engine
+from tests.edge_server.experiments.engine.jobs import Point, sleep
+
+folder = Path(sys.argv[1])
+Engine(folder / "r.jsonl", jobs=2).run(partial(sleep, folder=folder), [Point(seed) for seed in range(3)])
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_however_it_ends_its_processes_end_too_and_what_was_finished_is_kept(how, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    parent = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+    def workers() -> list[int]:
+        return [int(path.name.split("-")[2]) for path in tmp_path.glob("started-[12]-*")]
+
+    wait_until(lambda: len(workers()) == 2, "its processes do not start", 120.0)
+    wait_until((tmp_path / "r.jsonl").read_text, "the first result is not kept", 60.0)
+    if how == signal.SIGINT:
+        os.killpg(parent.pid, how)  # as a terminal does: to all of them
+    else:
+        parent.send_signal(how)
+    errors = parent.communicate(timeout=30.0)[1]
+    assert errors.count("Traceback") == (how == signal.SIGINT), errors
+    until = time.monotonic() + 20.0
+    while any(_alive(pid) for pid in workers()):
+        assert time.monotonic() < until, "a process goes on without its parent"
+        time.sleep(0.05)
+    assert [json.loads(line)["result"] for line in (tmp_path / "r.jsonl").read_text().splitlines()] == [0]
+
+
+def _alive(pid: int) -> bool:
+    """A process that has ended may wait for whoever adopted it to notice."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
