@@ -21,7 +21,6 @@ from freshfield.session import SessionError
 from freshfield.transport import TransportError
 
 if TYPE_CHECKING:
-    from edge_server.config import EdgeConfig, LearnConfig
     from edge_server.live.server import OpenPage
     from edge_server.live.state import EdgeState
 
@@ -143,19 +142,6 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
     run.add_argument(
-        "--learn",
-        nargs="?",
-        const="",
-        metavar="REWARD[:moving]",
-        help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
-        "[edge.learn, else as trained]",
-    )
-    run.add_argument(
-        "--fallback",
-        metavar="NAME[:VALUE]",
-        help="policy that takes over if the learning one does worse [edge.learn, else the best fixed one]",
-    )
-    run.add_argument(
         "--lpips",
         type=Path,
         metavar="DIR",
@@ -195,7 +181,6 @@ def _run(args: argparse.Namespace) -> int:
             config = replace(config, policy=PolicyConfig(*parse_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
-    config = replace(config, learn=_learn(args, config))
     secure = transport.from_arguments(args)
     open_page = partial(_open_page, args.page_host, args.page_port, secure)
     options = ServerOptions(
@@ -236,23 +221,6 @@ def _open_page(host: str, port: int, secure: transport.Transport, state: EdgeSta
         return start_page(state, host, port, secure)
     except PageError as error:
         raise TransportError(str(error)) from None
-
-
-def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:
-    """How the policy goes on learning; None: it does not, e.g. if --policy replaces it by a fixed one."""
-    from edge_server.config import LearnConfig
-    from edge_server.scheduler import BANDIT
-
-    asked = config.learn
-    if args.policy and not args.policy.startswith(BANDIT):
-        asked = None
-    if args.learn is not None:
-        asked = LearnConfig(args.learn or (asked.reward if asked else ""), asked.fallback if asked else "")
-    if args.fallback is None:
-        return asked
-    if asked is None:
-        raise ScenarioError("--fallback: nothing learns beside it: give --policy bandit:FILE and --learn")
-    return LearnConfig(asked.reward, args.fallback)
 
 
 def _add_report(commands: argparse._SubParsersAction) -> None:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from edge_server.embed.embedder import Embedder
 
 
+LEAST_UPDATE_MS = 10.0
+"""Shortest fitting time of an update: a shorter one is not worth the decoding of its views."""
+
+
 @dataclass(frozen=True)
 class PolicyConfig:
     """Which views an update uses.
@@ -32,41 +36,25 @@ class PolicyConfig:
 
 
 @dataclass(frozen=True)
-class LearnConfig:
-    """How a learned policy goes on learning while it is used (``edge-server run`` only, not in virtual time).
-
-    reward: NAME or NAME:moving of edge_server.scheduler.learned.rewards; empty: the one it was trained with.
-    fallback: the fixed policy beside it, NAME or NAME:VALUE; empty: the best one of its training.
-    """
-
-    reward: str = ""
-    fallback: str = ""
-
-
-@dataclass(frozen=True)
 class ComputeConfig:
     """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server costs``
     measures what a machine takes.
 
     ms_per_step: for each optimizer step. ms_per_update: for each update.
-    ms_per_treated_view: for each view that a policy's treatment takes.
     ms_per_view: for each frame that has arrived since the last update.
     """
 
     ms_per_step: float = 0.0
     ms_per_update: float = 0.0
-    ms_per_treated_view: float = 0.0
     ms_per_view: float = 0.0
 
     def __post_init__(self) -> None:
         if not all(0.0 <= ms < 1e9 for ms in dataclasses.astuple(self)):
             raise ValueError("compute: milliseconds must be finite and not negative")
 
-    def charge_ns(self, steps: int, treated: int = 0, arrivals: int = 0) -> int:
-        """Nanoseconds of an update of ``steps`` optimizer steps, ``treated`` treated views and ``arrivals``
-        new frames."""
-        views_ms = self.ms_per_treated_view * treated + self.ms_per_view * arrivals
-        return round((self.ms_per_update + self.ms_per_step * steps + views_ms) * 1e6)
+    def charge_ns(self, steps: int, arrivals: int = 0) -> int:
+        """Nanoseconds of an update of ``steps`` optimizer steps and ``arrivals`` new frames."""
+        return round((self.ms_per_update + self.ms_per_step * steps + self.ms_per_view * arrivals) * 1e6)
 
 
 @dataclass(frozen=True)
@@ -115,10 +103,8 @@ class EdgeConfig:
     updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame
     has arrived since.
     update_ms: fitting time of an update.
-    deadline_ms: time from decision to publication, instead of ``update_ms``. The setting that spends it best
-    is looked up in ``frontier``, and the fitting time follows how busy the machine is.
-    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; page and report draw it,
-    too. None: the shipped one.
+    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario, which page and report
+    draw. None: the shipped one.
     steps: optimizer steps of an update in virtual time.
     compute: what an update costs in virtual time: ``zero``, the milliseconds of ``ComputeConfig``, or a file
     of ``edge-server costs``, relative to the scenario.
@@ -131,7 +117,6 @@ class EdgeConfig:
     embedding: an edge_server.embed.EmbeddingConfig, for policies that look at what cameras see.
     keyframes: earlier viewpoints of moving cameras go on supervising.
     foreground: an edge_server.foreground.ForegroundConfig, cuts the background out of every view.
-    learn: a policy bandit:FILE goes on learning from the held-out cameras.
     export: what deploy/up.py makes of the field when the run ends.
     What a scenario does not name is neither imported nor computed.
     """
@@ -141,7 +126,6 @@ class EdgeConfig:
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     updates: str = "cycle"
     update_ms: float = 800.0
-    deadline_ms: float | None = None
     frontier: str | None = None
     steps: int = 100
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
@@ -152,14 +136,13 @@ class EdgeConfig:
     embedding: Any = None  # its type would import its module whether a scenario asks for it or not
     keyframes: KeyframesConfig | None = None
     foreground: Any = None  # as embedding
-    learn: LearnConfig | None = None
     export: ExportConfig | None = None
     scores: Any = None
 
     def __post_init__(self) -> None:
-        for name, least in (("update_ms", 10.0), ("deadline_ms", 20.0), ("grace_ms", 0.0)):
+        for name, least in (("update_ms", LEAST_UPDATE_MS), ("grace_ms", 0.0)):
             value = getattr(self, name)
-            if value is not None and not least <= value <= LONGEST_MS:
+            if not least <= value <= LONGEST_MS:
                 raise ValueError(f"{name}: expected {least:g} to {LONGEST_MS:.0f}, got {value:g}")
         if self.updates not in ("cycle", "arrivals"):
             raise ValueError(f"updates: expected cycle or arrivals, got {self.updates!r}")

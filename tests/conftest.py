@@ -58,7 +58,6 @@ _SIDE_BY_SIDE = (
     "edge_server/report",
     "edge_server/scheduler",
     "edge_server/surface",
-    "edge_server/treatments",
     "edge_server/viewpoints",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
     "fuzz",

@@ -1,7 +1,7 @@
 """Starts every process of a scenario on this machine, supervises them, and writes the report at the end.
 
     freshfield-up SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
-                           [--policy NAME[:VALUE]] [--learn [REWARD]]
+                           [--policy NAME[:VALUE]]
 
 In a checkout: ``python deploy/up.py SCENARIO``. It starts the three commands that otherwise run by hand on
 separate machines: camera-node, channel-emu and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of
@@ -73,9 +73,8 @@ def _is_inside(policy: str | None, out: Path) -> bool:
 
 
 def _edge_options(args: argparse.Namespace) -> tuple[str, ...]:
-    """Arguments for the edge server, which checks them. One argument each, because a value may be empty."""
-    given = (("policy", args.policy), ("learn", args.learn), ("fallback", args.fallback))
-    return tuple(f"--{name}={value}" for name, value in given if value is not None)
+    """Arguments for the edge server, which checks them."""
+    return () if args.policy is None else (f"--policy={args.policy}",)
 
 
 def _refuse(message: str) -> int:
@@ -109,19 +108,6 @@ def _parser() -> argparse.ArgumentParser:
         "--policy",
         metavar="NAME[:VALUE]",
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
-    )
-    add(
-        "--learn",
-        nargs="?",
-        const="",
-        metavar="REWARD[:moving]",
-        help="train bandit:FILE further; REWARD: set, corrected, thesis; :moving: PSNR of moving pixels only "
-        "[edge.learn, else as trained]",
-    )
-    add(
-        "--fallback",
-        metavar="NAME[:VALUE]",
-        help="policy that takes over if the learning one does worse [edge.learn, else the best fixed one]",
     )
     add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
     add("--no-table", action="store_true", help="print plain lines instead of a live table, even on a terminal")

@@ -62,8 +62,7 @@ def open_source(path: Path) -> Source:
 
 
 def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
-    """The options a field was made with, without threads and device. The state's own come first, because a
-    deadline may have chosen them."""
+    """The options a field was made with, without threads and device. The state's own come first."""
     try:
         settings = json.loads(str(state["meta"]))["settings"]
     except (KeyError, ValueError, TypeError):

@@ -22,8 +22,7 @@ _AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared
 class FrameBuffer:
     """The newest frame of each training camera. Thread-safe.
 
-    Memory is one encoded frame a camera, whatever arrives; two with ``keep_earlier``, MOST_UNSELECTED more
-    with ``keep_every_frame``.
+    Memory is one encoded frame a camera, whatever arrives; MOST_UNSELECTED more with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
     held_back: newest frames that the last ``take`` had no room for.
     shed: frames left out for lack of time since the first ``take``, with ``keep_every_frame``.
@@ -32,8 +31,6 @@ class FrameBuffer:
     def __init__(self, cameras: Sequence[str]) -> None:
         self.cameras = tuple(cameras)
         self._newest: dict[str, BufferedFrame] = {}
-        self._earlier: dict[str, BufferedFrame] = {}
-        self._keep_earlier = False
         self._arrived = threading.Condition()
         self.arrivals = 0
         self.stale_on_arrival = 0
@@ -55,34 +52,14 @@ class FrameBuffer:
             impossible = known is not None and known.generated_ns > received_ns + MAX_CAPTURE_AHEAD_NS
             if known is not None and not impossible and known.generated_ns >= item.generated_ns:
                 self.stale_on_arrival += 1
-                self._put_earlier(known, item)
             else:
                 self._newest[frame.camera] = item
-                if impossible:  # its capture time is unknown
-                    self._earlier.pop(frame.camera, None)
-                elif known is not None:
-                    self._put_earlier(item, known)
             if self._unselected is not None:
                 waiting = self._unselected[frame.camera]
                 self.shed += len(waiting) == MOST_UNSELECTED and self._takes > 0
                 waiting.append(item)
             self.arrivals += 1
             self._arrived.notify_all()
-
-    def _put_earlier(self, newest: BufferedFrame, before: BufferedFrame) -> None:
-        """Keep the newest frame before a camera's newest, whichever of the two arrived first."""
-        known = self._earlier.get(before.frame.camera)
-        older = before.generated_ns < newest.generated_ns
-        if self._keep_earlier and older and (known is None or known.generated_ns < before.generated_ns):
-            self._earlier[before.frame.camera] = before
-
-    def keep_earlier(self, wanted: bool) -> None:
-        """Whether to keep, from now on, the frame before each camera's newest as well. Policies that treat
-        stale views compare the two."""
-        with self._arrived:
-            self._keep_earlier = wanted
-            if not wanted:
-                self._earlier.clear()
 
     def keep_every_frame(self, wanted: bool) -> None:
         """Whether to keep, from now on, every frame until ``take``."""
@@ -145,11 +122,6 @@ class FrameBuffer:
         left_out = {id(item) for item in left}
         used = tuple(item for item in selected if id(item) not in left_out)
         return used, tuple(sorted(others, key=lambda item: item.received_ns))
-
-    def newest_and_earlier(self) -> tuple[dict[str, BufferedFrame], dict[str, BufferedFrame]]:
-        """``newest`` and, at the same instant, the frames before them by camera (see ``keep_earlier``)."""
-        with self._arrived:
-            return self.newest(), dict(self._earlier)
 
     def newest(self) -> dict[str, BufferedFrame]:
         """Omega(t): the newest frame of every camera that has reported, in the order of ``cameras``."""

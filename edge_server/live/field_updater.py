@@ -6,7 +6,6 @@ the instant at which an update is published: fitting ages the scene as much as t
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -40,7 +39,6 @@ class Selection:
 
     now_ns: instant of the selection.
     items: selected frames, without the new ones that the field has no time for.
-    earlier: the frame before each selected one, where there is one and the policy treats views.
     others: other frames that these cameras delivered since the last selection, where the field wants every
     frame and has time for them.
     arrivals: number of frames since the last selection, of all cameras; where the field wants every frame, of
@@ -50,21 +48,8 @@ class Selection:
     plan: SelectionWindow
     now_ns: int
     items: tuple[BufferedFrame, ...]
-    earlier: tuple[BufferedFrame, ...] = ()
     others: tuple[BufferedFrame, ...] = ()
     arrivals: int = 0
-
-
-@dataclass
-class TreatmentCost:
-    """Number of views treated so far, and the wall seconds it took (measured, never part of a decision)."""
-
-    views: int = 0
-    seconds: float = 0.0
-
-    @property
-    def ms_per_view(self) -> float | None:
-        return 1e3 * self.seconds / self.views if self.views else None
 
 
 class FieldUpdater:
@@ -106,7 +91,6 @@ class FieldUpdater:
         self.policy = policy
         self.field = field
         self.keyframes = keyframes
-        self.treatment_cost = TreatmentCost()
         self.start_ns = start_ns
         self.number = 0
         self._follow_field()
@@ -123,14 +107,9 @@ class FieldUpdater:
 
     @policy.setter
     def policy(self, policy: Policy) -> None:
-        """Takes effect with the next decision. Frames before the newest are kept only for policies that treat
-        views. ValueError as ``check``."""
+        """Takes effect with the next decision. ValueError as ``check``."""
         self.check(policy)
         self._policy = policy
-        treats = policy.treatment is not None
-        self.buffer.keep_earlier(treats)
-        if not treats:
-            self.decoder.forget_earlier()
 
     def check(self, policy: Policy) -> None:
         """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or
@@ -182,18 +161,17 @@ class FieldUpdater:
         if now_ns < plan.wait_until_ns or (self.on_arrivals and nothing_new):
             return None
         self._follow_field()
-        newest, earlier = self.buffer.newest_and_earlier()
+        newest = self.buffer.newest()
         cameras = self.policy.select(self._epoch(newest, now_ns), plan)
         if not cameras:
             return None
         self._selected_of += arrivals
         items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, most_new))
-        before = tuple(earlier[c] for i in items if (c := i.frame.camera) in earlier)
         if self.field.frame_s is not None:
             own = {item.frame.camera: item for item in items}
             arrivals = len(others) + sum(self._selected.get(c) is not item for c, item in own.items())
             self._selected |= own
-        return Selection(plan, now_ns, items, before, others, arrivals)
+        return Selection(plan, now_ns, items, others, arrivals)
 
     def _most_new(self, budget: Budget | None, most_new: int | None) -> int | None:
         """Number of new frames that a field that wants every frame has time for; None: all."""
@@ -202,24 +180,18 @@ class FieldUpdater:
             return None if frame_s is None else most_new
         return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
 
-    def fit(
-        self, selection: Selection, budget: Budget, publishes_ns: int | None = None
-    ) -> tuple[list[View], FitReport] | None:
-        """Decode the selected views, treat them where the policy says so, and train on them.
+    def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
+        """Decode the selected views and train on them.
 
-        publishes_ns: expected instant of publication, the present that stale views are treated for; None: the
-        instant of the selection.
         Returns the views as they were delivered, and the field's report; None where no view can be decoded.
         """
-        earlier = self.decoder.earlier(selection.earlier)
         views = self.decoder.views(selection.items)
         if not views:
             return None
         others = self.decoder.others(selection.others)
-        treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
         if self.keyframes is None:
-            return views, self.field.fit([*others, *treated], budget)
-        supervision = self.keyframes.with_earlier(treated)
+            return views, self.field.fit([*others, *views], budget)
+        supervision = self.keyframes.with_earlier(views)
         if self.keyframes.should_restart(len(supervision)):
             self.field.reset()
         report = self.field.fit([*others, *supervision], budget)
@@ -227,26 +199,11 @@ class FieldUpdater:
         current = {view.camera for view in views}
         return views, replace(report, refused=tuple(c for c in report.refused if c in current))
 
-    def use_field(self, field: Field) -> None:
-        """Continue with another field, which learns the scene anew."""
-        self.field = field
-        self.reset()
-
     def reset(self) -> None:
         """Forget the scene."""
         self.field.reset()
         if self.keyframes is not None:
             self.keyframes.clear()
-
-    def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
-        treatment = self.policy.treatment
-        if treatment is None:
-            return views
-        start_s = time.perf_counter()
-        treated = treatment.treat(views, earlier, now_ns)
-        self.treatment_cost.views += len(views)
-        self.treatment_cost.seconds += time.perf_counter() - start_s
-        return treated
 
     def publication(
         self, selection: Selection, views: Sequence[View], fit: FitReport, published_ns: int

@@ -9,10 +9,9 @@ from concurrent.futures import Future
 from pathlib import Path
 from queue import Empty, Queue
 
-from edge_server.fields import Budget, Field, FitReport, Snapshot, View
+from edge_server.fields import Budget, FitReport, Snapshot, View
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Publication
-from edge_server.live.update_budget import UpdateBudget
 from edge_server.scheduler import Policy
 from freshfield.clock import Clock
 
@@ -33,16 +32,15 @@ class UpdateLoop:
     on_published(publication, renderer, views): called after each update, on the loop's thread.
     on_status(line): says what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
-    budget: fitting time of the updates to come; other threads may replace it.
-    Other threads may also change the policy or the field, pause, or reset: it takes effect with the next
-    decision.
+    update_ms: fitting time of an update, however long the rest of it takes.
+    Other threads may change the policy, pause, or reset: it takes effect with the next decision.
     """
 
     def __init__(
         self,
         updater: FieldUpdater,
         clock: Clock,
-        budget: UpdateBudget,
+        update_ms: float,
         grace_ms: float,
         on_published: Callable[[Publication, Snapshot, list[View]], None],
         on_status: Callable[[str], None],
@@ -50,7 +48,7 @@ class UpdateLoop:
     ) -> None:
         self._updater = updater
         self._clock = clock
-        self.budget = budget
+        self._update_ms = update_ms
         self._grace_ns = round(grace_ms * 1e6)
         self._on_published = on_published
         self._on_status = on_status
@@ -59,9 +57,7 @@ class UpdateLoop:
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._next_policy: Policy | None = None
-        self._next_field: Field | None = None
         self._reset = False
-        self._last_update_ms = 0.0
         self._without_steps = 0  # updates in a row
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.paused = False
@@ -85,11 +81,6 @@ class UpdateLoop:
     def use_policy(self, policy: Policy) -> None:
         with self._lock:
             self._next_policy = policy
-
-    def use_field(self, field: Field) -> None:
-        """Replace the field by ``field``, which starts untrained."""
-        with self._lock:
-            self._next_field = field
 
     def request_reset(self) -> None:
         with self._lock:
@@ -133,14 +124,12 @@ class UpdateLoop:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
-        budget = self.budget.next()
+        budget = Budget(seconds=self._update_ms / 1e3)
         selection = self._select(budget)
         if selection is None:
             return
         self._on_status(f"fitting {len(selection.items)} views")
-        # Expected instant of publication: an update takes about as long as the last one.
-        publishes_ns = self._clock.now_ns() + round(self._last_update_ms * 1e6)
-        fitted = self._updater.fit(selection, budget, publishes_ns)
+        fitted = self._updater.fit(selection, budget)
         if fitted is None:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
             return
@@ -149,21 +138,14 @@ class UpdateLoop:
         self._warn_of_shed()
         renderer = self._updater.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updater.publication(selection, views, report, self._clock.now_ns())
-        self._last_update_ms = publication.update_ms
-        self.budget.record(budget, publication.update_ms)
         self._on_published(publication, renderer, views)
 
     def _apply_controls(self) -> None:
         with self._lock:
             policy, self._next_policy = self._next_policy, None
-            field, self._next_field = self._next_field, None
             reset, self._reset = self._reset, False
         if policy is not None:
             self._updater.policy = policy
-        if field is not None:
-            self._on_status("compiling the field's kernels")
-            field.warm_up()
-            self._updater.use_field(field)
         if reset:
             self._updater.reset()
             log.info("the field was reset")
@@ -175,7 +157,7 @@ class UpdateLoop:
         if self._without_steps == _TOO_SHORT:
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Give "
-                "updates more (edge.update_ms or edge.deadline_ms), or take a field that needs less of it",
+                "updates more (edge.update_ms), or take a field that needs less of it",
                 report.seconds * 1e3,
             )
 
@@ -219,7 +201,7 @@ class UpdateLoop:
             selection = self._updater.select(plan, now_ns, budget)
             if selection is not None:
                 return selection
-            asked = self._reset or self._next_policy or self._next_field or not self._checkpoints.empty()
+            asked = self._reset or self._next_policy or not self._checkpoints.empty()
             if self.paused or asked:
                 return None
             left_s = (plan.wait_until_ns - now_ns) / 1e9

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
-from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -24,8 +23,9 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
-from edge_server.fields.registry import efforts_of, make_field
+from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import open_updater
+from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, RollingPercentiles
 from edge_server.live.loop import STOP_S, UpdateLoop
@@ -34,7 +34,6 @@ from edge_server.live.output.journal import Journal
 from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.live.update_budget import open_budget, open_frontier, options_for
 from edge_server.scheduler import short_name
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson, write_json
@@ -109,24 +108,14 @@ class EdgeServer:
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
         self._without_step, self._refused = 0, Counter[str]()
-        self._with_deadline = self._within_deadline = 0  # updates since the deadline was set
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
         self.frontier = open_frontier(scenario, config)
-        self._field_options = options_for(self.frontier, config)
-        self._options_of = WeakKeyDictionary[Field, dict[str, Any]]()
         resumed_updates = 0
-        if options.resume is None:
-            field = self._make_field()
-        else:
+        field = self._make_field()
+        if options.resume is not None:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
-            # An operator may have changed the effort during the run that wrote the checkpoint.
-            saved = about.get("options")
-            effort = str(saved.get("effort", "medium")) if isinstance(saved, dict) else None
-            if effort in efforts_of(config.field):
-                self._field_options = {**self._field_options, "effort": effort}
-            field = self._make_field()
             field.load_state(state)
             # Numbers continue, so that a snapshot does not take the name of an earlier one.
             resumed_updates = max(0, int(about.get("updates", 0)))
@@ -139,10 +128,10 @@ class EdgeServer:
         scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)
         try:
-            self.policies = ServerPolicies(scenario, config, self.lpips_missing, options.out)
+            self.policies = ServerPolicies(scenario, config)
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
-        self.trainer, policy = self.policies.trainer, self.policies.first
+        policy = self.policies.first
         self.updater = open_updater(scenario, config, policy, field, self.start_ns, resumed=options.resume is not None)
         self.updater.number = resumed_updates
         self.buffer = self.updater.buffer
@@ -165,7 +154,7 @@ class EdgeServer:
         self.loop = UpdateLoop(
             self.updater,
             self.clock,
-            open_budget(self.frontier, config, config.deadline_ms),
+            config.update_ms,
             config.grace_ms,
             self._published,
             self._set_status_line,
@@ -175,9 +164,7 @@ class EdgeServer:
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
-            controls=Controls(
-                policy.name, policy.value, self._field_options.get("effort", "medium"), config.deadline_ms
-            ),
+            controls=Controls(policy.name, policy.value),
             cameras=self._cameras,
             start_ns=self.start_ns,
             now_ns=self.clock.now_ns,
@@ -186,13 +173,9 @@ class EdgeServer:
             channel=ReplacedJson((options.emulator_out or options.out) / "channel.json").read,
             scores=config.scores,
             frontier=self.frontier,
-            efforts=() if self._field_options.get("layers") else tuple(efforts_of(config.field)),
-            set_effort=self._set_effort,
-            set_deadline=self._set_deadline,
             field_name=config.field,
             decision=lambda: self.updater.policy.last_decision,
             embed=None if embedder is None else embedder.embed,
-            learning=lambda: self.policies.learning_line(self.state.controls.policy),
         )
         write_json(options.out / "frontier.json", asdict(self.frontier))
         self.journal = Journal(options.out, self.status)
@@ -219,16 +202,12 @@ class EdgeServer:
                     self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
                 )
             self.scoring.start()
-            if self.trainer is not None:
-                self.trainer.start()
             self.loop.start()
             self._watch()
         finally:
             self._stopping.set()
             self.loop.stop()
             self.scoring.stop()
-            if self.trainer is not None:
-                self.trainer.stop()
             if page is not None:
                 page.stop()
             grpc.join()
@@ -276,9 +255,6 @@ class EdgeServer:
             self._first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
         self._without_step += publication.steps == 0
-        deadline_ms = self.state.controls.deadline_ms or 0.0
-        self._with_deadline += deadline_ms > 0.0
-        self._within_deadline += publication.update_ms <= deadline_ms
         self._refused.update(publication.refused)
         if self.state.bounds is None:
             self.state.bounds = getattr(self.updater.field, "bounds", None)
@@ -293,8 +269,6 @@ class EdgeServer:
     def _scored(self, publication: Publication, comparison: Comparison | None, final: bool) -> None:
         self.state.scored(publication, comparison)
         self.journal.scored(publication, final)
-        if self.trainer is not None and final:
-            self.trainer.add_score(publication.number, publication)
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
 
@@ -311,26 +285,9 @@ class EdgeServer:
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
 
-    def _set_deadline(self, deadline_ms: float | None) -> None:
-        controls = self.state.controls
-        effort = controls.effort if self.state.efforts else None
-        self.loop.budget = open_budget(self.frontier, self.config, deadline_ms, effort)
-        controls.deadline_ms = deadline_ms
-        self._with_deadline = self._within_deadline = 0
-
-    def _set_effort(self, effort: str) -> None:
-        if effort not in self.state.efforts:
-            raise ValueError(f"effort: expected one of {', '.join(self.state.efforts)}, got {effort!r}")
-        self._field_options = {**self._field_options, "effort": effort}
-        self.loop.use_field(self._make_field())
-        self.state.controls.effort = effort
-        self._set_deadline(self.state.controls.deadline_ms)
-
     def _make_field(self) -> Field:
-        options = {"nice": SERVER_NICE, **self._field_options}
-        field = make_field(self.config.field, options, seed=self.scenario.seed)
-        self._options_of[field] = self._field_options
-        return field
+        options = {"nice": SERVER_NICE, **self.config.field_options}
+        return make_field(self.config.field, options, seed=self.scenario.seed)
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:
@@ -350,8 +307,7 @@ class EdgeServer:
     def _write_checkpoint(self, path: Path) -> None:
         about = {
             "field": self.config.field,
-            # Options of the field in use: another field may be about to replace it.
-            "options": self._options_of[self.updater.field],
+            "options": self.config.field_options,
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,
@@ -402,18 +358,13 @@ class EdgeServer:
                 "ms_p50": self._update_ms.percentile(50),
                 "ms_p95": self._update_ms.percentile(95),
                 "first_ms": self._first_ms,
-                "deadline_ms": self.state.controls.deadline_ms,
-                "with_deadline": self._with_deadline,
-                "within_deadline": self._within_deadline,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
                 "shed": self.buffer.shed,
                 "without_step": self._without_step,
                 "refused": dict(self._refused),
             },
-            "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
             "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
-            "learning": None if self.trainer is None else self.trainer.policy.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),
@@ -433,8 +384,6 @@ class EdgeServer:
             if (comparison := self.state.comparison) is not None:
                 for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-            if self.trainer is not None:
-                self.trainer.close()
             path = self.options.out / "field.npz"
             if self.loop.alive:
                 log.error("%s: not written: the last update did not end within %g s", path, STOP_S)

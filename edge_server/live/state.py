@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
-from edge_server.live.update_budget import Frontier
+from edge_server.live.frontier import Frontier
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
@@ -116,8 +116,6 @@ class Controls:
 
     policy: str
     value: float | None
-    effort: str = ""
-    deadline_ms: float | None = None
     paused: bool = False
     reset_requested: bool = False
 
@@ -132,10 +130,6 @@ class EdgeState:
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     frontier: what accuracy costs in time, as measured.
-    efforts: levels that ``set_effort`` takes; none where the field has none.
-    set_deadline: sets the milliseconds from decision to publication, None for no deadline. The attribute
-    itself is None where no deadline can be set.
-    learning: one line on a policy that learns while it is used; empty where none does.
     bounds: world box (2, 3) in meters of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
@@ -154,11 +148,7 @@ class EdgeState:
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
     scores: dict[str, Any] | None = None
     frontier: Frontier | None = None
-    efforts: tuple[str, ...] = ()
-    set_effort: Callable[[str], None] | None = None
-    set_deadline: Callable[[float | None], None] | None = None
     field_name: str = ""
-    learning: Callable[[], str] = lambda: ""
     started: bool = False
     bounds: NDArray[np.float64] | None = None
     status_line: str = ""

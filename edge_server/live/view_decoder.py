@@ -32,7 +32,6 @@ class ViewDecoder:
         self.foreground = foreground
         self.most_pixels = most_pixels
         self._views: dict[str, tuple[Frame, View | None]] = {}
-        self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
 
     def take_at_most(self, pixels: int | None) -> None:
@@ -40,7 +39,6 @@ class ViewDecoder:
         if pixels != self.most_pixels:
             self.most_pixels = pixels
             self._views.clear()
-            self._earlier.clear()
 
     def views(self, selected: Iterable[BufferedFrame]) -> list[View]:
         """Views of the selected frames in their order, without those that cannot be decoded."""
@@ -60,26 +58,6 @@ class ViewDecoder:
         """Views of frames that are not their cameras' newest and are used once, without those that cannot be
         decoded."""
         return [view for item in items if (view := self._decode(item)) is not None]
-
-    def earlier(self, items: Iterable[BufferedFrame]) -> dict[str, View]:
-        """Views of the frames before the newest, by camera, without those that cannot be decoded.
-
-        Call it before ``views``: a frame that was the newest one then needs no second decoding.
-        """
-        found = {}
-        for item in items:
-            camera = item.frame.camera
-            cached = (self._earlier.get(camera), self._views.get(camera))
-            known = next((c for c in cached if c is not None and c[0] is item.frame), None)
-            self._earlier[camera] = known or (item.frame, self._decode(item))
-            view = self._earlier[camera][1]
-            if view is not None:
-                found[camera] = view
-        return found
-
-    def forget_earlier(self) -> None:
-        """Free the views of ``earlier``."""
-        self._earlier.clear()
 
     def _decode(self, item: BufferedFrame) -> View | None:
         halvings = self._halvings(item.frame.intrinsics)

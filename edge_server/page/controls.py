@@ -1,4 +1,4 @@
-"""The operator's controls: policy and its value, effort and deadline, pause, reset, snapshot.
+"""The operator's controls: policy and its value, pause, reset, snapshot.
 
 A refused change becomes a notification for its sender. Everybody sees the values in force.
 """
@@ -43,26 +43,6 @@ class ControlPanel:
         )
         self.value: Any = gui.add_number("value", _finite_or_zero(state.controls.value), min=0.0, step=1.0)
         self.help = gui.add_html("")
-        # A field in layers has no effort levels: effort sizes its static field, which delays no update.
-        self.effort: Any = None
-        if state.efforts:
-            self.effort = gui.add_dropdown(
-                "effort",
-                state.efforts,
-                initial_value=state.controls.effort,
-                hint="How fine the field is, and what a step takes. A change begins the scene anew.",
-            )
-            self.effort.on_update(lambda event: self._effort_chosen(event))
-        self.deadline: Any = None
-        if state.set_deadline is not None:
-            self.deadline = gui.add_number(
-                "deadline, ms",
-                _finite_or_zero(state.controls.deadline_ms),
-                min=0.0,
-                step=10.0,
-                hint="An update's time from decision to publication; 0: none, the scenario's update_ms.",
-            )
-            self.deadline.on_update(lambda event: self._deadline_entered(event))
         self.frontier = gui.add_html("", visible=state.frontier is not None)
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
         self.view = gui.add_dropdown(
@@ -89,16 +69,9 @@ class ControlPanel:
             self.value.label = _label(parameter)
             if self.value.value != _finite_or_zero(controls.value):
                 self.value.value = _finite_or_zero(controls.value)
-            if self.effort is not None and self.effort.value != controls.effort:
-                self.effort.value = controls.effort
-            deadline_ms = _finite_or_zero(controls.deadline_ms)
-            if self.deadline is not None and self.deadline.value != deadline_ms:
-                self.deadline.value = deadline_ms
             if self._state.frontier is not None:
-                present = self._state.present()
-                self.frontier.content = frontier(self._state.frontier, controls.effort, present)
-            learning = self._state.learning()
-            self.help.content = _help(controls.policy) + (note(learning) if learning else "")
+                self.frontier.content = frontier(self._state.frontier, self._state.present())
+            self.help.content = _help(controls.policy)
             if self._paused != controls.paused:
                 self._paused = controls.paused
                 self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")
@@ -118,20 +91,6 @@ class ControlPanel:
             return
         # The value comes from a browser: an empty input must end as a notification too.
         self._attempt(event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered)))
-
-    def _effort_chosen(self, event: Any) -> None:
-        effort, choose = event.target.value, self._state.set_effort
-        if event.client is None or choose is None or effort == self._state.controls.effort:
-            return
-        self.updates_at_reset = next((p.number + 1 for p in reversed(self._state.publications())), 0)
-        self._attempt(event.client, f"effort {effort}", lambda: choose(effort))
-
-    def _deadline_entered(self, event: Any) -> None:
-        entered, choose = event.target.value, self._state.set_deadline
-        if event.client is None or choose is None:
-            return
-        if entered != _finite_or_zero(self._state.controls.deadline_ms):
-            self._attempt(event.client, f"deadline {entered} ms", lambda: choose(float(entered) or None))
 
     async def _pressed(self, event: Any) -> None:
         # A coroutine runs before the next click is handled, so the group still holds this click's value.

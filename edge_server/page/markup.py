@@ -11,8 +11,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from edge_server.fidelity.scorer import SELECTED
+from edge_server.live.frontier import Frontier, best_point
 from edge_server.live.state import CameraView
-from edge_server.live.update_budget import Frontier
 from edge_server.page.colors import AGAINST, FOR, FRESH_MS, HELD_OUT, RGB, STALE_MS, age_color, css, scale_color
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -98,9 +98,10 @@ def _age_parts(parts_ms: Mapping[str, float]) -> str:
     )
 
 
-def frontier(found: Frontier, effort: str, present: tuple[float, float, float | None] | None) -> str:
-    """What accuracy costs in time: PSNR against the time of an update, the curves of ``effort`` bold, and the
-    run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure them."""
+def frontier(found: Frontier, present: tuple[float, float, float | None] | None) -> str:
+    """What accuracy costs in time: PSNR against the time of an update, the curves of the best setting bold,
+    and the run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure
+    them."""
     if not found.points:
         return note(f"What accuracy costs in time is not measured for this field. {found.about}")
     now = [(present[0], db) for db in present[1:] if db is not None] if present is not None else []
@@ -113,10 +114,10 @@ def frontier(found: Frontier, effort: str, present: tuple[float, float, float | 
         x = 30.0 + 280.0 * (math.log(max(ms, 1.0)) - left) / wide
         return f"{x:.1f},{8.0 + 84.0 * (1.0 - (db - low) / high):.1f}"
 
-    lines = ""
+    lines, best = "", best_point(found.points, found.speed_m_per_s)
     for name in dict.fromkeys(p.effort for p in found.points):
         mine = sorted((p for p in found.points if p.effort == name), key=lambda p: p.update_ms)
-        bold = name == effort or len({p.effort for p in found.points}) == 1
+        bold = name == best.effort
         for key, dash in (("psnr_db", ""), ("psnr_moving_db", "4 3")):
             path = " ".join(at(p.update_ms, getattr(p, key)) for p in mine)
             lines += (

@@ -181,14 +181,11 @@ def _updates_line(report: Report) -> str:
     if not u["count"]:
         return "<p>The field was never updated.</p>"
     first = None if u["first_ms"] is None else u["first_ms"] / 1e3
-    met = ""
-    if u.get("met_share") is not None:
-        met = f" ({100 * u['met_share']:.1f} % within the deadline of {_n(u['deadline_ms'], 0)} ms)"
     idle = f"; without time for a step: {u['without_step']}" if u.get("without_step") else ""
     damaged = f"; frames that could not be decoded: {u['undecodable']}" if u["undecodable"] else ""
     shed = f"; frames left out for lack of time: {u['shed']}" if u.get("shed") else ""
     return (
-        f"<p>{u['count']} updates, median {_n(u['ms_p50'], 0)} ms, 95 % within {_n(u['ms_p95'], 0)} ms{met}; "
+        f"<p>{u['count']} updates, median {_n(u['ms_p50'], 0)} ms, 95 % within {_n(u['ms_p95'], 0)} ms; "
         f"the first {_n(first, 1)} s after the edge started{idle}{damaged}{shed}.</p>"
     )
 

@@ -100,15 +100,13 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     edge: the edge's own counts.
     Returns {count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
     undecodable, shed: frames left out for lack of time, without_step: updates without time for an optimizer
-    step, refused: {camera: how often the field left its image out}}. Where the scenario sets a deadline, also
-    deadline_ms and met_share: the share of updates within it.
+    step, refused: {camera: how often the field left its image out}}.
     """
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
-    deadline_ms = _number(edge.get("deadline_ms"))
     without_step = sum(row.get("steps") == 0 for row in series)
     refused = Counter(c for row in series for c in row.get("refused") or ())
-    result = {
+    return {
         "count": max(len(series), int(_number(edge.get("count")) or 0)),
         **{
             name: edge.get(name) or (float(np.percentile(spent, share)) if spent else None)
@@ -120,13 +118,6 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "without_step": max(without_step, int(_number(edge.get("without_step")) or 0)),
         "refused": dict(sorted((refused | Counter(edge.get("refused") or {})).items())),
     }
-    if deadline_ms is not None:
-        met = _mean(float(ms <= deadline_ms) for ms in spent)
-        if edge.get("count") and (within := _number(edge.get("within_deadline"))) is not None:
-            ended = _number(edge.get("with_deadline", edge["count"])) or 0.0
-            met = within / ended if ended else None
-        result |= {"deadline_ms": deadline_ms, "met_share": met}
-    return result
 
 
 def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]:

@@ -22,9 +22,6 @@ class _Updates(TypedDict, total=False):
     ms_p50: Number | None
     ms_p95: Number | None
     first_ms: Number | None
-    deadline_ms: Number | None
-    with_deadline: Number | None
-    within_deadline: Number | None
     undecodable: Number | None
     shed: Number | None
     without_step: Number | None

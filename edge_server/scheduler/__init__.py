@@ -1,7 +1,7 @@
 """Policies: which of the newest views an update uses, and how long to wait for younger ones.
 
 ``policy`` says what a policy is, ``registry`` makes one by name; ``fixed`` and ``wait`` hold the fixed ones.
-``learned`` trains policies and runs them, ``online`` keeps a learned policy learning while it is used.
+``learned`` trains policies and runs them.
 """
 
 from edge_server.scheduler.policy import STATE_PARTS, Epoch, Policy, SelectionWindow
@@ -9,7 +9,6 @@ from edge_server.scheduler.registry import (
     BANDIT,
     OFFERED,
     POLICIES,
-    TREATMENTS,
     make_live_policy,
     make_policy,
     parse_policy,
@@ -23,7 +22,6 @@ __all__ = [
     "OFFERED",
     "POLICIES",
     "STATE_PARTS",
-    "TREATMENTS",
     "Epoch",
     "Policy",
     "SelectionWindow",

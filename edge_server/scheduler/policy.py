@@ -18,7 +18,6 @@ from freshfield.limits import LONGEST_MS
 
 if TYPE_CHECKING:  # loaded only by the policies that need them
     from edge_server.scheduler.learned.decision import Decision
-    from edge_server.treatments import Treatment
 
 
 class Observer(Protocol):
@@ -73,7 +72,6 @@ class Policy:
     parameter: name and unit of the one value a user may set, such as ``omega_ms`` or the count ``k``; None if
     there is none.
     value: that value.
-    treatment: applied to the selected views before they supervise the field; None: no treatment.
     embedding: width of the embeddings it decides by (0: it needs none; None: any) and the name of their
     embedder (empty: any).
     """
@@ -81,7 +79,6 @@ class Policy:
     name: str
     parameter: str | None = None
     value: float | None = None
-    treatment: Treatment | None = None
     embedding: tuple[int | None, str] = (0, "")
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:

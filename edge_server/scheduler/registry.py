@@ -1,14 +1,11 @@
-"""Policies by name, as people write them: ``threshold:120``, ``wait+freshen``, ``bandit:FILE``.
+"""Policies by name, as people write them: ``threshold:120``, ``wait``, ``bandit:FILE``.
 
-Adding a policy takes a class and a line in ``POLICIES``. A policy's name may be followed by a treatment of
-the selected views, as in ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a
-treatment's name alone stands for ``all`` with that treatment. ``bandit:FILE`` is a learned policy
+Adding a policy takes a class and a line in ``POLICIES``. ``bandit:FILE`` is a learned policy
 (``edge_server.scheduler.learned``).
 """
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
 import numpy as np
@@ -34,30 +31,19 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "wait-flush": (WaitFlush, "as wait, but abort the transmissions under way at the decision (6.5)"),
 }
 
-
-# name -> (module, class, one line of help)
-TREATMENTS: dict[str, tuple[str, str, str]] = {
-    "mask": ("motion_mask", "MotionMask", "pixels of stale views that were moving count for less"),
-    "freshen": ("flow_warp", "FlowWarp", "stale views are warped to the present by their optical flow"),
-}
-
 # Prefix of a learned policy: the path of a learner's checkpoint follows.
 BANDIT = "bandit:"
 
 # A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
 VIRTUAL_ONLY = ("wait-flush",)
-# The choices shown to people; any other combination may be typed.
-OFFERED: tuple[str, ...] = (
-    *(policy for policy in POLICIES if policy not in VIRTUAL_ONLY),
-    *TREATMENTS,
-    *(f"{policy}+{treatment}" for policy in ("threshold", "wait", "freshest-k") for treatment in TREATMENTS),
-)
+# The choices shown to people.
+OFFERED: tuple[str, ...] = tuple(policy for policy in POLICIES if policy not in VIRTUAL_ONLY)
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
-    """The named policy; modules of treatments and of learned policies are imported only now.
+    """The named policy; modules of learned policies are imported only now.
 
-    name: as in ``POLICIES``, or POLICY+TREATMENT, TREATMENT, bandit:FILE.
+    name: as in ``POLICIES``, or bandit:FILE.
     value: value of its parameter; None takes the default.
     rng: for policies that draw.
     Raises ValueError for an unknown name (the message lists the known ones), a value out of range, or a file
@@ -69,29 +55,16 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
         from edge_server.scheduler.learned.bandit import BanditPolicy
 
         return BanditPolicy.from_file(name.removeprefix(BANDIT), rng)
-    base, treatment = _split(name)
-    if base not in POLICIES or name.endswith("+"):
-        wrong = name if base in POLICIES else base
+    if name not in POLICIES:
         raise ValueError(
-            f"policy {wrong!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
-            "or join a policy and a treatment, as in threshold+freshen; a learned one is bandit:FILE"
+            f"policy {name!r} is not known; choose one of {', '.join(POLICIES)}; a learned one is bandit:FILE"
         )
-    policy = POLICIES[base][0](value, rng)
-    if not treatment:
-        return policy
-    if treatment not in TREATMENTS:
-        raise ValueError(
-            f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of {', '.join(TREATMENTS)}"
-        )
-    module, cls, _ = TREATMENTS[treatment]
-    policy.name = name
-    policy.treatment = getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)()
-    return policy
+    return POLICIES[name][0](value, rng)
 
 
 def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
     """``make_policy`` for a live edge. Raises ValueError also for what only virtual time can do."""
-    if _split(name)[0] in VIRTUAL_ONLY:
+    if name in VIRTUAL_ONLY:
         raise ValueError(
             f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
             "virtual time only (edge-server simulate, edge-server study); live, use wait"
@@ -134,20 +107,4 @@ def policy_help(name: str) -> str:
     """One line on a policy; empty for an unknown one."""
     if name.startswith(BANDIT):
         return "a learned policy (edge-server train-scheduler)"
-    base, treatment = _split(name)
-    if base not in POLICIES or (treatment and treatment not in TREATMENTS):
-        return ""
-    line = POLICIES[base][1]
-    if not treatment:
-        return line
-    what, _, parameter = line.partition("; value:")
-    both = TREATMENTS[treatment][2] if name in TREATMENTS else f"{what}; {TREATMENTS[treatment][2]}"
-    return f"{both}; value:{parameter}" if parameter else both
-
-
-def _split(name: str) -> tuple[str, str]:
-    """Policy and treatment (empty: none) that ``name`` asks for."""
-    if name in TREATMENTS:
-        return "all", name
-    base, _, treatment = name.partition("+")
-    return base, treatment
+    return POLICIES[name][1] if name in POLICIES else ""

@@ -227,8 +227,7 @@ def test_a_run_does_not_delete_the_policy_that_it_loads(tmp_path: Path) -> None:
     (out := tmp_path / "run").mkdir()
     (out / "run.json").write_text("{}")
     (learned := out / "learned.npz").write_bytes(b"weights")
-    policy = ("--policy", f"bandit:{learned}", "--learn")
-    words = ("room", "--out", str(out), "--port", str(free_port()), *policy)
+    words = ("room", "--out", str(out), "--port", str(free_port()), "--policy", f"bandit:{learned}")
     assert "is emptied first; choose another --out" in refusal(*words)
     assert learned.read_bytes() == b"weights"
 
@@ -245,15 +244,7 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     assert script.seconds(text) == seconds
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ([], []),
-        (["--policy", "threshold:120"], ["--policy=threshold:120"]),
-        (["--policy", "bandit:a.npz", "--learn"], ["--policy=bandit:a.npz", "--learn="]),
-        (["--learn", "set", "--fallback", "all"], ["--learn=set", "--fallback=all"]),
-    ],
-)
+@pytest.mark.parametrize(("words", "expected"), [([], []), (["--policy", "threshold:120"], ["--policy=threshold:120"])])
 def test_policy_options_are_passed_on_to_the_edge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], expected: list[str]
 ) -> None:
@@ -264,6 +255,6 @@ def test_policy_options_are_passed_on_to_the_edge(
     monkeypatch.setattr(commands, "program", lambda name: name)
     asked = script._edge_options(script._parser().parse_args(["room", *words]))
     found = commands.process_set(load("room"), tmp_path, 8080, edge_options=asked)
-    assert [w for w in found.edge.command if w.startswith(("--policy", "--learn", "--fallback"))] == expected
+    assert [w for w in found.edge.command if w.startswith("--policy")] == expected
     others = [word for child in (found.emulator, *found.nodes) for word in child.command]
     assert not set(expected) & set(others)

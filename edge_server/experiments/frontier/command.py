@@ -20,7 +20,7 @@ from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
 from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
 from edge_server.experiments.frontier import effort_sweep, update_time
-from edge_server.experiments.frontier.output import write_output
+from edge_server.experiments.frontier.output import recommendation, write_output
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
 from edge_server.fidelity.lpips import Lpips
@@ -46,8 +46,8 @@ Fidelity against time, in two figures.
    long an update should take at each speed, judged by what is shown at random instants. One curve is splat in
    layers, updated on arrivals: there the time is that from one update to the next.
 
-A scenario with a deadline_ms chooses the effort and the duration of its updates from figure 2: from the file
-that it names (frontier: OUT/frontier.json), else from the shipped measurement.
+The last line says which edge.update_ms figure 2 recommends. The page and the report of a scenario that names
+the file (frontier: OUT/frontier.json) draw it, with the run's own point.
 
 Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command continues where it stopped;
 with other settings, points are measured anew.
@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
     add_lpips(parser)
-    add("--points", type=out_file, metavar="FILE", help="also write the points of figure 2, for deadline_ms, to FILE")
+    add("--points", type=out_file, metavar="FILE", help="also write the points of figure 2 to FILE")
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
     return parser
 
@@ -253,6 +253,7 @@ class Frontier:
             about = {k: self.file.data[k] for k in ("scene", "policy", "channel", "machine")}
             write_json(self.points, {**about, "updates": [*self._other_points(), *updates]})
         print(f"{self.file.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
+        print(recommendation(updates), flush=True)
 
     def _other_points(self) -> list[Row]:
         """Points in the FILE of --points of representations and efforts that are not measured now."""

@@ -8,8 +8,10 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
+from edge_server.config import LEAST_UPDATE_MS
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.frontier.update_time import best
+from edge_server.live.frontier import best_point, points_of
 from edge_server.report.style import CYCLE, INK, figure
 from freshfield.files import write_csv
 
@@ -60,6 +62,14 @@ def updates_table(rows: Sequence[Row]) -> str:
     head = "field, effort|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
     about = "shown: at random instants, the newest publication carried on; age: of its views then"
     return f"{markdown_table(head.split('|'), cells)}\n{about}"
+
+
+def recommendation(rows: Sequence[Row]) -> str:
+    """The line that says which ``edge.update_ms`` the rows of figure 2 recommend at a person's speed; without
+    rows nothing moves, and an update may take any time."""
+    points = points_of(rows)
+    update_ms = max(round(best_point(points).update_ms), round(LEAST_UPDATE_MS)) if points else "any"
+    return f"for this scene: update_ms: {update_ms}"
 
 
 def conclusion(rows: Sequence[Row]) -> str:

@@ -152,9 +152,9 @@ def _timed(scenario: Scenario, steps: int, seconds: float, data: Path | None) ->
     updates, fit = deployment.updates, deployment.updates.fit
     rows: list[tuple[float, float, float]] = []
 
-    def timed(selection: Any, budget: Any, publishes_ns: int | None = None) -> Any:
+    def timed(selection: Any, budget: Any) -> Any:
         before_s, began_s = beside_s(updates.field), time.perf_counter()
-        done = fit(selection, budget, publishes_ns)
+        done = fit(selection, budget)
         spent_s = time.perf_counter() - began_s - (beside_s(updates.field) - before_s)
         if done is not None:
             rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))

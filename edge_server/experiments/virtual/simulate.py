@@ -77,14 +77,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         deployment = build_deployment(scenario, settings, scorer=scorer, data=folders.data, on_published=published)
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
-        if config.deadline_ms is not None:
-            print(
-                f"  edge.deadline_ms: virtual time counts steps; an update is {settings.steps} of them, with "
-                "the field's options as they stand",
-                file=sys.stderr,
-            )
-        if config.learn is not None:
-            print("  edge.learn: in virtual time nobody learns, the policy stays as it is", file=sys.stderr)
         _run(deployment, args.seconds, quiet=args.json)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
@@ -120,7 +112,6 @@ def summary(scenario: Scenario, settings: RunSettings, deployment: VirtualDeploy
         "shown": {name: mean_or_none([getattr(s, name) for s in shown]) for name in SHOWN},
         "views": mean_or_none([float(len(p.selected)) for p in publications]),
         "update_ms": mean_or_none([p.update_ms for p in publications]),
-        "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
         "digest": digest(deployment),
         "processor": processor(),
         "versions": versions(),

@@ -399,15 +399,13 @@ class VirtualDeployment:
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if settings.scratch:
                 updates.field.reset()
-            treated = len(selection.items) if updates.policy.treatment is not None else 0
-            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(steps, treated, selection.arrivals)
-            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps), publishes_ns)
+            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps))
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
             steps = 0
-            charged_ns = settings.compute.charge_ns(report.steps, treated, selection.arrivals)
+            charged_ns = settings.compute.charge_ns(report.steps, selection.arrivals)
             yield WakeCondition(self.clock.now_ns() + charged_ns)
             published_ns = self.clock.now_ns()
             self._publish(updates.publication(selection, views, report, published_ns))
@@ -428,13 +426,8 @@ class VirtualDeployment:
 
     def _selection_with_images(self, selection: Selection) -> Selection:
         """The selection with images."""
-        # Earlier frames first: of a camera's frames, the one made last is kept longest.
-        earlier = self.with_images(selection.earlier)
         return dataclasses.replace(
-            selection,
-            others=self.with_images(selection.others),
-            earlier=earlier,
-            items=self.with_images(selection.items),
+            selection, others=self.with_images(selection.others), items=self.with_images(selection.items)
         )
 
     def _publish(self, publication: Publication) -> None:

@@ -311,7 +311,7 @@ class Learner:
         if "seed" not in about:
             raise checkpoint.CheckpointError(
                 f"{path}: holds only a policy, and learning cannot resume from it: take the policy.npz of "
-                "edge-server train-scheduler, or the learnt.npz of a run with --learn"
+                "edge-server train-scheduler"
             )
         try:
             learner = Learner(spec, int(about["seed"]))

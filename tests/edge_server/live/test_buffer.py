@@ -51,41 +51,6 @@ def test_memory_is_one_frame_a_camera():
     assert buffer.newest()["cam01"].frame.sequence == 999
 
 
-def test_the_frame_before_is_kept_only_where_it_is_asked_for():
-    buffer = FrameBuffer(["cam01", "cam02"])
-    buffer.put(frame(sequence=0, generated_ns=0), 0)
-    buffer.put(frame(sequence=1, generated_ns=30 * MS), 40 * MS)
-    assert buffer.newest_and_earlier() == (buffer.newest(), {})
-    buffer.keep_earlier(True)
-    assert buffer.newest_and_earlier()[1] == {}, "what was not kept is gone"
-    for i in range(2, 500):
-        buffer.put(frame(sequence=i, generated_ns=30 * i * MS), 30 * i * MS)
-    newest, earlier = buffer.newest_and_earlier()
-    assert newest["cam01"].frame.sequence == 499 and earlier["cam01"].frame.sequence == 498
-    assert len(earlier) == 1
-    buffer.keep_earlier(False)
-    assert buffer.newest_and_earlier()[1] == {}
-
-
-def test_a_frame_that_was_overtaken_is_the_one_before():
-    buffer = FrameBuffer(["cam01"])
-    buffer.keep_earlier(True)
-    for sequence, generated_ms in ((1, 30), (3, 90), (2, 60), (0, 0), (2, 60), (3, 90)):
-        buffer.put(frame(sequence=sequence, generated_ns=generated_ms * MS), 100 * MS)
-    newest, earlier = buffer.newest_and_earlier()
-    assert (newest["cam01"].frame.sequence, earlier["cam01"].frame.sequence) == (3, 2)
-
-
-def test_a_frame_from_the_future_is_no_frame_before():
-    buffer = FrameBuffer(["cam01"])
-    buffer.keep_earlier(True)
-    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
-    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest_and_earlier()[1] == {}
-    buffer.put(frame(sequence=3, generated_ns=150 * MS), 180 * MS)
-    assert buffer.newest_and_earlier()[1]["cam01"].frame.sequence == 2
-
-
 def test_order_is_the_cameras_not_the_arrivals():
     buffer = FrameBuffer(["b", "a"])
     buffer.put(frame("a"), 0)

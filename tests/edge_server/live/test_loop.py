@@ -12,7 +12,6 @@ from edge_server.fields import Budget
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
-from edge_server.live.update_budget import UpdateBudget
 from edge_server.scheduler import make_policy
 from freshfield.clock import WallClock
 from tests.edge_server.fields_for_tests import tiny_field
@@ -48,33 +47,6 @@ def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qua
     assert u.select(plan, 160 * MS) is None  # the horizon is over, but nothing was generated in it
     u.buffer.put(frame("cam01", sequence=1, generated_ns=170 * MS), 180 * MS)
     assert [i.frame.sequence for i in u.select(plan, 180 * MS).items] == [1]
-
-
-def test_a_treatment_sees_the_frame_before_and_what_was_delivered_is_handed_on():
-    u = updates("freshen")
-    for k in range(2):
-        for camera in ("cam01", "cam02"):
-            image = frame(camera, sequence=5 * k, generated_ns=(60 * k + 1) * MS)
-            u.buffer.put(image, (60 * k + 10) * MS)
-    fed = []
-    fit = u.field.fit
-    u.field.fit = lambda views, budget: fed.extend(views) or fit(views, budget)
-    views, _ = u.fit(u.select(u.plan(120 * MS), 120 * MS), Budget(steps=1))
-    assert [v.carried_to_ns for v in views] == [None, None] and all(v.weight is None for v in views)
-    assert [v.carried_to_ns for v in fed] == [120 * MS, 120 * MS]
-    assert u.treatment_cost.views == 2 and u.treatment_cost.ms_per_view > 0
-
-
-def test_a_policy_without_treatment_frees_the_memory():
-    u = updates("all")
-    u.policy = make_policy("mask", None, np.random.default_rng(0))
-    for k in range(3):
-        u.buffer.put(frame("cam01", sequence=k, generated_ns=30 * k * MS), 30 * k * MS)
-        u.fit(u.select(u.plan(99 * MS), 99 * MS), Budget(steps=1))
-    assert u.buffer.newest_and_earlier()[1] and u.decoder._earlier
-    u.policy = make_policy("all", None, np.random.default_rng(0))
-    assert not u.buffer.newest_and_earlier()[1] and not u.decoder._earlier
-    assert u.select(u.plan(99 * MS), 99 * MS).earlier == ()
 
 
 def test_an_empty_buffer_selects_nothing():
@@ -139,13 +111,13 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, budget=None) -> None:
+    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0) -> None:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
         self.loop = UpdateLoop(
             u,
             self.clock,
-            budget or UpdateBudget(100.0),
+            100.0,
             grace_ms,
             lambda p, r, v: self.published.append((p, r)),
             self.lines.append,
@@ -203,22 +175,12 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
 
 
 def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(running, caplog):
-    class Changing:
-        """No time at all, then some, then none again."""
-
-        def __init__(self):
-            self.updates = 0
-
-        def next(self):
-            return Budget(steps=1) if self.updates == 4 else Budget(seconds=1e-6)
-
-        def record(self, budget, update_ms):
-            self.updates += 1
-
     u = updates()
+    fit = u.fit  # no time at all, then some, then none again
+    u.fit = lambda selection, _: fit(selection, Budget(steps=1) if u.number == 4 else Budget(seconds=1e-6))
     now = WallClock().now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
-    run = running(u, budget=Changing())
+    run = running(u)
     run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
     assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]

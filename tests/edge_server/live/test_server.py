@@ -16,7 +16,6 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
-from edge_server.fields.registry import field_names
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.policies import ServerPolicies
 from edge_server.live.server import EdgeServer, ServerOptions
@@ -184,17 +183,6 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
     asked = edge_pb2.SetPolicyRequest
     # Gone, although there was no garbage collection.
     until(lambda: not any(isinstance(o, asked) and len(o.name) > 1000 for o in gc.get_objects()))
-    before, field = server.state.newest().number, server.updater.field
-    server.state.set_deadline(150.0)
-    server.state.set_effort("low")
-    until(lambda: server.state.newest().number > before and server.updater.field is not field)
-    until(lambda: server.status()["updates"]["with_deadline"] > 0)
-    assert server.status()["updates"]["deadline_ms"] == 150.0 and server.state.controls.effort == "low"
-    with pytest.raises(ValueError, match="effort: expected one of low"):
-        server.state.set_effort("best")
-    with pytest.raises(ValueError, match="deadline_ms"):
-        server.state.set_deadline(5.0)
-    assert server.state.controls.deadline_ms == 150.0, "what is refused changes nothing"
     path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
     assert checkpoint.load(path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())
@@ -206,32 +194,6 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
     decisions.cancel()
     feed.stop()
     channel.close()
-
-
-@pytest.mark.parametrize("name", field_names())
-def test_a_run_goes_on_with_the_effort_that_an_operator_chose(serve, tmp_path, name):
-    """Two checkpoints: one of the new field, and the last one, of the field that was in use when another
-    effort was chosen and the server ended."""
-    made = tiny_scenario(tmp_path, field=name, field_options={})
-    server, port, thread = serve(made)
-    feed = Feed(port, made.cameras, made.held_out)
-    feed.start()
-    until(lambda: server.state.started)
-    first = server.updater.field
-    server.state.set_effort("low")
-    until(lambda: server.updater.field is not first and server.updater.field.step > 0)
-    saved = server.state.save_snapshot()
-    server.state.controls.paused = True
-    until(lambda: server.state.status_line == "paused")
-    feed.stop()
-    server.loop.stop()
-    server.state.set_effort("high")
-    server.stop()
-    thread.join(20)
-    for path in (saved, tmp_path / "out" / "field.npz"):
-        again = EdgeServer(made, read_config(made), ServerOptions("127.0.0.1:0", tmp_path / "2", resume=path))
-        assert again.state.controls.effort == "low" and again.updater.field.step > 0
-        again.ledger.close(0)
 
 
 def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
@@ -303,7 +265,7 @@ def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeyp
 
 def test_a_name_of_eight_megabytes_is_no_policy(tmp_path):
     made = tiny_scenario(tmp_path)
-    policies = ServerPolicies(made, read_config(made), None, tmp_path)
+    policies = ServerPolicies(made, read_config(made))
 
     def ask():
         with pytest.raises(ValueError, match="8000000 characters"):

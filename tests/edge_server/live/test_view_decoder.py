@@ -33,29 +33,6 @@ def test_memory_is_one_view_a_camera():
     assert len(decoder._views) == 1
 
 
-def test_what_was_newest_is_not_decoded_again_as_the_one_before():
-    decoder = ViewDecoder()
-    items = [BufferedFrame(frame(sequence=i, generated_ns=i), i, i) for i in range(3)]
-    (first,) = decoder.views([items[0]])
-    assert decoder.earlier([items[0]])["cam01"] is first
-    (second,) = decoder.views([items[1]])
-    assert decoder.earlier([items[0]])["cam01"] is first, "used again"
-    assert decoder.earlier([items[1]])["cam01"] is second
-    assert decoder.earlier([items[2]])["cam01"].generated_ns == 2, "one that never was the newest"
-    assert len(decoder._earlier) == len(decoder._views) == 1
-    decoder.forget_earlier()
-    assert not decoder._earlier
-
-
-def test_a_damaged_frame_before_is_counted_once_and_is_missing():
-    decoder = ViewDecoder()
-    cut = BufferedFrame(damaged_frame("cam01"), 0, 0)
-    whole = BufferedFrame(frame("cam02"), 0, 0)
-    for _ in range(2):
-        assert list(decoder.earlier([cut, whole])) == ["cam02"]
-    assert decoder.undecodable == 1
-
-
 def test_another_size_is_decoded_anew():
     decoder, item = ViewDecoder(), BufferedFrame(frame(), 0, 0)
     assert decoder.view(item).image.shape == (24, 32, 3)

@@ -17,7 +17,6 @@ import pytest
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.live.update_budget import Frontier, FrontierPoint
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
@@ -143,27 +142,6 @@ def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
     state.controls.policy = path
     panel.refresh()
     assert panel.policy.value == "bandit:p.npz"
-
-
-def test_effort_and_deadline_are_controls_where_the_field_has_them():
-    asked = []
-    frontier = Frontier((FrontierPoint("low", {}, 1.0, 50.0, 20.0, 16.0),), 1.0, "f.json")
-    state = replace(
-        bare_state(), frontier=frontier, efforts=("low", "high"), set_effort=asked.append, set_deadline=asked.append
-    )
-    state.controls.effort = "low"
-    gui = MagicMock()
-    for kind in (gui.add_number, gui.add_html):
-        kind.side_effect = lambda *words, **more: MagicMock()
-    panel = ControlPanel(MagicMock(gui=gui), state)
-    panel._effort_chosen(MagicMock(target=MagicMock(value="high")))
-    panel._deadline_entered(MagicMock(target=MagicMock(value=120.0)))
-    state.controls.deadline_ms = 120.0
-    panel._deadline_entered(MagicMock(target=MagicMock(value=0.0)))
-    assert asked == ["high", 120.0, None]
-    assert panel.deadline.value == 120.0 and "<polyline" in panel.frontier.content
-    layered = ControlPanel(MagicMock(), bare_state())
-    assert layered.effort is None and layered.deadline is None
 
 
 def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():

@@ -342,16 +342,6 @@ def test_scores_on_selected_views_are_called_that(tmp_path):
     assert "No camera is held out" in (tmp_path / "report.html").read_text()
 
 
-def test_a_deadline_is_reported_with_the_share_of_updates_that_met_it():
-    series = [{"t_s": float(i), "update_ms": ms} for i, ms in enumerate((80.0, 90.0, 100.0, 130.0))]
-    found = updates(series, {"deadline_ms": 100.0})
-    assert (found["deadline_ms"], found["met_share"]) == (100.0, 0.75)
-    assert "deadline_ms" not in updates(series, {})
-    counted = {"deadline_ms": 100.0, "count": 8, "within_deadline": 7, "ms_p50": 85.0, "ms_p95": 120.0}
-    found = updates(series, counted)  # not all updates have a row
-    assert (found["met_share"], found["ms_p50"], found["ms_p95"], found["count"]) == (0.875, 85.0, 120.0, 8)
-
-
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     from edge_server.report.figures import draw_frontier
 

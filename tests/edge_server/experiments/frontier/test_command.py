@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import command, effort_sweep
-from edge_server.experiments.frontier.output import conclusion
+from edge_server.experiments.frontier.output import conclusion, recommendation
 from edge_server.experiments.frontier.update_time import (
     MovingScene,
     WarmStart,
@@ -22,7 +22,7 @@ from edge_server.experiments.frontier.update_time import (
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
 from edge_server.fields.tensorf import settings
-from edge_server.live.update_budget import read_frontier
+from edge_server.live.frontier import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
 TINY = MovingScene(cameras=4, size=32)
@@ -138,6 +138,24 @@ def test_the_conclusion_names_the_best_time_of_each_speed():
     assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
 
 
+def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
+    def row(speed, update_s, whole, moving):
+        return {
+            "field": "ngp",
+            "effort": "low",
+            "options": {},
+            "speed_m_per_s": speed,
+            "update_s": update_s,
+            "shown_psnr_db": whole,
+            "shown_psnr_moving_db": moving,
+        }
+
+    rows = [row(1.0, 0.1, 20, 18), row(1.0, 0.4, 22, 17), row(1.0, 2.0, 23, 15), row(3.0, 0.05, 30, 30)]
+    assert recommendation(rows) == "for this scene: update_ms: 400"
+    assert recommendation([row(1.0, 0.004, 20, 18)]) == "for this scene: update_ms: 10", "the shortest there is"
+    assert recommendation([]) == "for this scene: update_ms: any"
+
+
 @pytest.fixture
 def tiny_sweep(monkeypatch):
     sweep = replace(
@@ -160,6 +178,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     assert edge_server(words) == 0
     first = capsys.readouterr().out
     assert "(known)" not in first and "Best time to spend on an update: at 1 m/s" in first
+    assert first.splitlines()[-1].startswith("for this scene: update_ms: ")
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())
@@ -200,7 +219,7 @@ def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch
 
 
 def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():
-    """By several seeds, and from below the shortest deadline worth setting."""
+    """By several seeds, and from short updates on."""
     sweep, still = command.SHIPPED, synthetic_still("room", size=command.SHIPPED.size)
     assert len(still.training) == sweep.moving.cameras - len(still.held_out)
     assert still.training[0].image.shape[:2] == (sweep.moving.size, sweep.moving.size)
@@ -211,7 +230,8 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
     write_photos(tmp_path / "set", 5)
     words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
     assert edge_server([*words, *SMALL_WORDS]) == 0
-    assert "figure 2 left out" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "figure 2 left out" in said and said.endswith("for this scene: update_ms: any\n")
     assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()
 
 

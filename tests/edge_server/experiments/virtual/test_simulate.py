@@ -61,11 +61,6 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert run(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
 
 
-def test_a_deadline_is_said_to_choose_nothing_where_steps_are_counted(tmp_path: Path, capsys):
-    assert main([str(write(tmp_path, deadline_ms=300.0)), "--seconds", "0.5"]) == 0
-    assert "edge.deadline_ms: virtual time counts steps" in capsys.readouterr().err
-
-
 def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
     Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
     out, file = tmp_path / "out", write(tmp_path, learn={})
@@ -121,7 +116,7 @@ def test_the_scenario_says_zero_or_milliseconds():
             config(wrong)
 
 
-@pytest.mark.parametrize("name", ["grace_ms", "update_ms", "deadline_ms"])
+@pytest.mark.parametrize("name", ["grace_ms", "update_ms"])
 @pytest.mark.parametrize("value", [-1.0, 1e308])
 def test_a_time_that_nobody_waits_is_refused(name: str, value: float):
     with pytest.raises(ScenarioError, match=f"x.yaml: edge: {name}: expected .* to 3600000, got"):

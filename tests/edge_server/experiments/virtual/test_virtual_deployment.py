@@ -80,33 +80,6 @@ def test_one_seed_gives_the_same_run_bit_for_bit(channel):
     assert [p.ages_ms for p in other.publications] != [p.ages_ms for p in first.publications]
 
 
-@pytest.mark.parametrize("policy", ["mask", "freshest-k+mask", "freshen", "wait+freshen"])
-@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
-def test_treated_views_are_the_same_in_every_run(policy, channel):
-    small = {"gaussians": 300, "start": 200, "seed_cells": 12}
-    edge = {"field": "splat", "field_options": small, "policy": {"name": policy}}
-    source = {
-        "kind": "world",
-        "scene": "room",
-        "width": 64,
-        "height": 64,
-        "fps": 15,
-        "speed_m_per_s": 3.0,
-        "params": {"supersample": 1},
-    }
-    first, second = (run(scenario(channel, edge=edge, source=source), seconds=1.5) for _ in range(2))
-    assert first.publications and first.publications == second.publications
-    a, b = (d.updates.field.state() for d in (first, second))
-    assert all(np.array_equal(a[name], b[name]) for name in a)
-    untreated = {**edge, "policy": {"name": "all" if policy in ("mask", "freshen") else policy.split("+")[0]}}
-    plain = run(scenario(channel, edge=untreated, source=source), seconds=1.5)
-    assert [p.selected for p in plain.publications] == [p.selected for p in first.publications]
-    assert [p.ages_ms for p in plain.publications] == [p.ages_ms for p in first.publications]
-    assert not np.array_equal(plain.updates.field.state()["params"], a["params"]), "they are treated"
-    assert first.updates.treatment_cost.views >= sum(len(p.selected) for p in first.publications)
-    assert plain.updates.treatment_cost.views == 0 and plain.updates.treatment_cost.ms_per_view is None
-
-
 def test_going_on_is_the_same_as_running_through():
     through = run(scenario(), seconds=1.2)
     parts = build_deployment(scenario(), SETTINGS)

@@ -38,7 +38,6 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import State, StateLayout
-from edge_server.scheduler.online.online_trainer import choose_reward
 from freshfield.files import write_csv
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
 from tests.edge_server.scheduler.learned.problems import collect
@@ -445,10 +444,7 @@ def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_p
     (row,) = read_log(out)
     assert row["term_perceptual"] == pytest.approx(-row["perceptual"])
     known = Learner.load(out / "policy.npz").reward_fields
-    by = choose_reward("select", "", out / "policy.npz", "no weights", known)
-    assert by == make_reward("set", distance_is="perceptual")
-    with pytest.raises(ValueError, match="its reward"):
-        choose_reward("select", "", out / "policy.npz", None, {"name": "set", "sweets": 1.0})
+    assert Reward(**known) == make_reward("set", distance_is="perceptual")
 
 
 def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: Path):

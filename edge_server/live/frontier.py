@@ -1,0 +1,145 @@
+"""What accuracy costs in time, as ``edge-server frontier`` measured it: for the page, the report, and the
+update time that it recommends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from edge_server.config import EdgeConfig
+from freshfield.scenario import Scenario
+from freshfield.untrusted import read_json
+
+# Assumed of a scene whose speed is not given: a person walking.
+USUAL_SPEED_M_PER_S = 1.0
+
+
+@dataclass(frozen=True)
+class FrontierPoint:
+    """A measured setting of updates, and the fidelity with it.
+
+    effort, options: name and field options of the setting.
+    speed_m_per_s: speed of what moves in the scene it was measured on.
+    update_ms: time from decision to publication; for a field in layers, from one update to the next.
+    psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
+    error_db: upper bound of the standard error of their mean; 0 with one seed.
+    measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
+    """
+
+    effort: str
+    options: dict[str, Any]
+    speed_m_per_s: float
+    update_ms: float
+    psnr_db: float
+    psnr_moving_db: float
+    error_db: float = 0.0
+    measured: str = "shown"
+
+    @property
+    def mean_db(self) -> float:
+        """Mean of both: the whole image of a mostly static scene alone would hide what age costs."""
+        return 0.5 * (self.psnr_db + self.psnr_moving_db)
+
+
+def read_frontier(path: Path | None, representation: str, layers: bool = False) -> list[FrontierPoint]:
+    """The points of one representation, measured on moving scenes.
+
+    path: a frontier.json of ``edge-server frontier``; None: the shipped one.
+    layers: whether to read the points of that representation in layers, or those without layers.
+    Where an earlier version did not measure what was shown, a point has the PSNR of what was published.
+    Raises ValueError for another kind of file, or one without such points.
+    """
+    source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
+    try:
+        data = read_json(source.read_text())
+        rows = [
+            row
+            for row in data["updates"]
+            if row["field"] == representation and bool(row["options"].get("layers")) == layers
+        ]
+        points = points_of(rows)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{source}: not a frontier that `edge-server frontier` wrote ({error})") from None
+    if not points:
+        named = f"{representation} in layers" if layers else representation
+        raise ValueError(
+            f"{source}: nothing was measured there for {named} on a moving scene; "
+            f"run `edge-server frontier --field {representation}` and name its frontier.json"
+        )
+    return points
+
+
+def points_of(rows: Sequence[Mapping[str, Any]]) -> list[FrontierPoint]:
+    """The points of a frontier.json's ``updates``, without those where nothing that moves was scored.
+    KeyError, TypeError or ValueError where a row is none of these."""
+    return [
+        FrontierPoint(
+            effort=row["effort"],
+            options=dict(row["options"]),
+            speed_m_per_s=float(row["speed_m_per_s"]),
+            update_ms=float(row["update_s"]) * 1e3,
+            psnr_db=float(row[f"{by}psnr_db"]),
+            psnr_moving_db=float(row[f"{by}psnr_moving_db"]),
+            error_db=0.5 * sum(row.get(f"{by}{k}_error") or 0.0 for k in ("psnr_db", "psnr_moving_db")),
+            measured="shown" if by else "published",
+        )
+        for row in rows
+        for by in ("shown_" if "shown_psnr_db" in row else "",)
+        if row[f"{by}psnr_moving_db"] is not None
+    ]
+
+
+def best_point(points: Sequence[FrontierPoint], speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> FrontierPoint:
+    """The best of the points measured at the speed nearest to ``speed_m_per_s``.
+
+    More time is not always better: what moves ages meanwhile. Of the points that are within the standard
+    error of the best, the fastest is taken.
+    """
+    candidates = _at_nearest_speed(points, speed_m_per_s)
+    best = max(candidates, key=lambda p: p.mean_db)
+    candidates = [p for p in candidates if best.mean_db - p.mean_db <= math.hypot(best.error_db, p.error_db)]
+    return min(candidates, key=lambda p: (p.update_ms, -p.mean_db))
+
+
+def _at_nearest_speed(points: Sequence[FrontierPoint], speed_m_per_s: float) -> list[FrontierPoint]:
+    """Those measured at the speed nearest in ratio."""
+
+    def distance(p: FrontierPoint) -> float:
+        return abs(math.log(max(p.speed_m_per_s, 1e-3) / max(speed_m_per_s, 1e-3)))
+
+    nearest = min(map(distance, points))
+    return [p for p in points if distance(p) == nearest]
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """What accuracy costs in time, as measured for the field of a run.
+
+    points: points at the measured speed nearest to ``speed_m_per_s``, the speed of the run's scene.
+    about: which file they come from, or why there are none.
+    """
+
+    points: tuple[FrontierPoint, ...]
+    speed_m_per_s: float
+    about: str
+
+
+def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
+    """The frontier that a scenario names, else the shipped one. Raises ValueError if the named one cannot be
+    read or has no points for the scenario's field."""
+    path = None if config.frontier is None else scenario.path.parent / config.frontier
+    speed = float(scenario.source.get("speed_m_per_s", USUAL_SPEED_M_PER_S))
+    try:
+        points = read_frontier(path, config.field, bool(config.field_options.get("layers")))
+    except ValueError as error:
+        if path is not None:
+            raise
+        return Frontier((), speed, str(error))
+    points = _at_nearest_speed(points, speed)
+    file = config.frontier or "the shipped frontier.json, of room"
+    first = points[0]
+    return Frontier(tuple(points), speed, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}")

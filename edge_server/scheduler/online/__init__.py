@@ -1,1 +1,0 @@
-"""Keeps a learned policy learning while it is used."""
