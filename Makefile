@@ -120,8 +120,20 @@ proto-check: .venv/.ok-test  ## fail where the generated code differs from its .
 	done
 	@echo "generated code matches the .proto files"
 
+# Wheels for Python 3.11 on Linux. edge: all but torch and what only torch needs, which its two locks have. torch keeps
+# its version, unless TORCH=torch==... names another. Indexes are uv's: UV_DEFAULT_INDEX, UV_FIND_LINKS.
+LOCK = ../../.venv/bin/uv pip compile -q --upgrade --generate-hashes --no-annotate --python-version 3.11 \
+  --only-binary :all: --custom-compile-command "make lock" $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 lock: .venv/.ok-venv  ## resolve the images' packages anew into deploy/locks; the CPU build of torch: TORCH_INDEX
-	TORCH_INDEX=$(TORCH_INDEX) $(PY) deploy/lock.py
+	$(INSTALL) uv
+	@echo 'torch; python_version < "3"' >.venv/without-torch.txt
+	cd deploy/locks && \
+	  $(LOCK) ../../pyproject.toml --extra edge --extra embed --override ../../.venv/without-torch.txt -o edge.txt && \
+	  $(LOCK) ../../pyproject.toml -c edge.txt -o camera.txt && \
+	  echo "$(TORCH)" | $(LOCK) - -c edge.txt -o torch-cuda.txt && \
+	  echo "$(subst ==,===,$(TORCH))+cpu" | $(LOCK) - -c edge.txt -o torch-cpu.txt && \
+	  ../../$(PY) -c 'import tomllib; print(*tomllib.load(open("../../pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
+	  $(LOCK) - -o build.txt
 
 images:  ## build both images on the base image's newest digest: ENGINE=docker, BUILD for more options
 	$(ENGINE) pull -q $(BASE)

@@ -10,7 +10,7 @@ ARG TORCH=cuda
 ARG TORCH_INDEX
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PIP_QUIET=1
 WORKDIR /src
-# Exactly the wheels whose hashes deploy/lock.py wrote down.
+# Exactly the wheels whose hashes `make lock` wrote down.
 COPY deploy/locks deploy/locks
 RUN python -m venv /venv && python -m venv /build \
  && /build/bin/pip install --no-deps --require-hashes -r deploy/locks/build.txt \

@@ -1,29 +1,24 @@
-"""What a fresh clone rests on: the Makefile's wiring, and bounds that fit the generated code."""
+"""What an installation rests on: locks that hold what is asked for, and bounds that fit the generated code."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.metadata
 import itertools
-import os
 import re
-import shutil
-import subprocess
 import tomllib
-from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-import lock
 from tests.conftest import ROOT
 
 DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, BUILD = DECLARED["project"], DECLARED["build-system"]["requires"]
 LOCKS = {
-    file.stem: dict(re.findall(r"^([\w.-]+)==(\S+)", file.read_text(), re.M))
+    file.stem: dict(re.findall(r"^([\w.-]+)={2,3}(\S+)", file.read_text(), re.M))
     for file in (ROOT / "deploy" / "locks").glob("*.txt")
 }
 GENERATED = ROOT / "proto" / "freshfield" / "v1"
@@ -61,40 +56,6 @@ def test_cameras_and_emulator_install_without_torch() -> None:
     assert not required & {"torch", "viser", "numba", "matplotlib"}
 
 
-def dry_run(*arguments: str, **variables: str) -> str:
-    if shutil.which("make") is None:
-        pytest.skip("make is not installed")
-    command = ["make", "-n", "-B", *arguments, *(f"{k}={v}" for k, v in variables.items())]
-    # Not the variables of the make that runs this test.
-    plain = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
-    done = subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, text=True, timeout=60, check=True)
-    return done.stdout
-
-
-def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() -> None:
-    plan = dry_run("demo")
-    (torch,) = re.finditer(r"install .*--no-deps +(torch==\S+)", plan)
-    rest = plan.index("-e '.[edge,embed,up]'")
-    assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
-    assert "deploy/up.py deploy/scenarios/card.yaml --for=60s" in plan
-    assert requirement("torch").specifier.contains(LOCKS["torch-cuda"]["torch"])
-    assert torch[1] == f"torch=={LOCKS['torch-cuda']['torch']}"
-    for early in re.findall(r"install .*'(numba\S+)' '(opencv\S+)'", plan)[0]:
-        assert requirement(Requirement(early).name).specifier == Requirement(early).specifier
-    assert "test,dev" not in plan
-
-
-def test_the_index_variable_reaches_torch_alone() -> None:
-    plan = dry_run("demo", TORCH_INDEX="file:///some/index")
-    assert plan.count("--index-url file:///some/index") == 1
-    assert "--index-url file:///some/index torch==" in plan
-
-
-def test_the_options_of_the_demo_reach_the_launcher() -> None:
-    plan = dry_run("demo", SCENARIO="s.yaml", FOR="5s", OUT="o", PORT="8181", DATA="d")
-    assert "deploy/up.py s.yaml --for=5s --out o --port 8181 --data d" in plan
-
-
 def in_the_environment_of_an_image(texts: list[str]) -> list[Requirement]:
     asked = {"python_version": "3.11", "sys_platform": "linux", "platform_system": "Linux", "extra": ""}
     found = [Requirement(text) for text in texts]
@@ -104,7 +65,8 @@ def in_the_environment_of_an_image(texts: list[str]) -> list[Requirement]:
 @pytest.mark.parametrize("locks", [("camera",), ("edge", "torch-cpu"), ("edge", "torch-cuda")])
 def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: tuple[str, ...]) -> None:
     locked = {name: Version(version) for lock in locks for name, version in LOCKS[lock].items()}
-    assert len(locked) == sum(len(LOCKS[lock]) for lock in locks), "a package is in two locks"
+    for lock in locks:  # a package in two of them has one version
+        assert LOCKS[lock].items() <= {name: str(version) for name, version in locked.items()}.items()
     extras = PROJECT["optional-dependencies"]
     asked = PROJECT["dependencies"] + (extras["edge"] + extras["embed"] if "edge" in locks else [])
     for name, version in locked.items():  # and what those ask for, as far as this machine has the same ones
@@ -115,15 +77,17 @@ def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: 
         version = locked.get(canonicalize_name(each.name))
         assert version is not None and each.specifier.contains(version), f"{each}: {version} is locked"
     if "edge" in locks:
-        assert {str(locked["torch"]).partition("+")[0]} == {lock.TORCH}
+        assert str(locked["torch"]).partition("+")[0] == "2.13.0"  # with which checkpoints and figures were made
         assert LOCKS["camera"].items() <= LOCKS["edge"].items()
     assert ("torch" in locked) == ("edge" in locks)
 
 
 def test_every_locked_wheel_has_its_hash() -> None:
     for file in (ROOT / "deploy" / "locks").glob("*.txt"):
-        for line in file.read_text().splitlines()[1:]:
-            assert re.fullmatch(r"[a-z0-9.-]+==[\w.+]+( --hash=sha256:[0-9a-f]{64})+", line), line
+        for line in file.read_text().replace("\\\n", "").splitlines():
+            if line.startswith("#"):
+                continue
+            assert re.fullmatch(r"[a-z0-9.-]+={2,3}[\w.+]+( +--hash=sha256:[0-9a-f]{64})+", line), line
     asked = {Requirement(text).name for text in BUILD}
     assert asked <= LOCKS["build"].keys()
 
@@ -140,30 +104,8 @@ def test_an_image_installs_locked_wheels_and_the_project_alone(image: str, locks
     assert "!deploy/locks" in (ROOT / ".dockerignore").read_text().splitlines()
 
 
-def test_a_release_builds_on_the_digest_of_the_base_image(tmp_path: Path) -> None:
-    engine = tmp_path / "engine"
-    engine.write_text('#!/bin/sh\n[ "$1" = image ] && echo base@sha256:12 || echo "$@"\n')
-    engine.chmod(0o755)
-    if shutil.which("make") is None:
-        pytest.skip("make is not installed")
-    command = ["make", "images", f"ENGINE={engine}", "BUILD=--build-arg TORCH=cpu"]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
-    assert "pull -q docker.io/library/python:3.11-slim-bookworm" in said and "on base@sha256:12" in said
-    built = re.findall(r"^build --build-arg BASE=base@sha256:12 .*TORCH=cpu -f (\S+)", said, re.M)
-    assert built == ["deploy/camera.Dockerfile", "deploy/edge.Dockerfile"]
-
-
 def test_no_package_index_is_written_down() -> None:
     files = ["Makefile", "pyproject.toml", ".ci/run", "deploy/camera.Dockerfile", "deploy/edge.Dockerfile"]
-    files += ["deploy/lock.py", *(f"deploy/locks/{name}.txt" for name in LOCKS)]
+    files += [f"deploy/locks/{name}.txt" for name in LOCKS]
     for name in files:
         assert "://" not in (ROOT / name).read_text(), f"{name} names a host"
-
-
-def test_a_second_set_up_has_nothing_to_do() -> None:
-    stamps = [ROOT / ".venv" / name for name in (".ok-venv", ".ok-test", ".ok-run")]
-    newest = (ROOT / "pyproject.toml").stat().st_mtime
-    if not all(s.exists() and s.stat().st_mtime >= newest for s in stamps):
-        pytest.skip("this environment was not made by `make test`")
-    done = subprocess.run(["make", "-q", ".venv/.ok-test", ".venv/.ok-run"], cwd=ROOT, timeout=60)
-    assert done.returncode == 0

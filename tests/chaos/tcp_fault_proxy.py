@@ -1,4 +1,4 @@
-"""A TCP relay on loopback between two processes, which can simulate network faults."""
+"""A TCP relay on loopback between two processes, with faults of a network on request."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FAULTS = ("black hole", "half-open", "corrupted bytes")
 _CHUNK = 1 << 16
 
 
-class Wire:
+class TcpFaultProxy:
     """Relays every connection at ``address`` to ``to`` (HOST:PORT), in its own thread until ``close``.
 
     ``fault`` starts one of FAULTS, ``mend`` ends it:
