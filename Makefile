@@ -97,7 +97,6 @@ bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, run
 	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all $(if $(DATA),peer) \
 	  --json $(if $(findstring --quick,$(BENCH)),runs/quick,docs/results)/field.json $(BENCH)
 	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
-	$(PY) docs/tables.py  # the tables of docs/ are made from these files
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
 	for name in $(FIGURES); do \
@@ -106,7 +105,6 @@ figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/th
 	done  # after Ctrl-C the same command goes on
 	@mkdir -p docs/results/thesis
 	cp $$(ls -d runs/figures/*.json runs/figures/*.csv runs/figures/*.png runs/figures/*-tables.md 2>/dev/null) docs/results/thesis
-	$(PY) docs/tables.py
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)

@@ -1,4 +1,4 @@
-"""The documentation: links resolve, commands and files exist, tables say what the measured files say."""
+"""The documentation: links resolve, commands and files exist."""
 
 from __future__ import annotations
 
@@ -101,16 +101,3 @@ def test_files_and_modules_that_are_named_exist(page: Path) -> None:
             spec = importlib.util.find_spec(parent)
             assert spec is not None, f"{name(page)}: {found}"
             assert importlib.util.find_spec(found) or hasattr(importlib.import_module(parent), last)
-
-
-def test_tables_say_what_the_measured_files_say() -> None:
-    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
-    assert spec is not None and spec.loader is not None
-    tables = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tables)
-    kept = {study["study"]: study["verdicts"] for study in tables.studies()}
-    for study, about, word in tables.VERDICTS:
-        found = [v for v in kept.get(study, ()) if v["about"] == about and word in v["claim"]]
-        assert found or study not in kept, f"docs/results/thesis/{study}.json: {about}, {word!r}: no verdict"
-    for page in (ROOT / "docs").rglob("*.md"):
-        assert tables.renewed(page.read_text()) == page.read_text(), f"{name(page)}: run `python docs/tables.py`"
