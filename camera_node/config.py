@@ -1,6 +1,6 @@
 """The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the dataclass in ``MODELS``, whose docstring ``camera-node sources`` prints. All keys are
+``kind`` chooses the struct in ``MODELS``, whose docstring and keys ``camera-node sources`` prints. All keys are
 checked here, with file and key in the message. Checks that need the data itself (does the folder hold this
 camera?) are made when the source opens.
 """
@@ -11,20 +11,17 @@ import contextlib
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from camera_node.bounds import Bounded, bounded, one_of
+from msgspec import Meta, field
+
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
-from freshfield.payload import CODECS
-from freshfield.scenario import Scenario, ScenarioError, read_section
+from freshfield.scenario import Scenario
+from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
-LOOPS = ("back-and-forth", "restart")
-REPLAYS = ("once", "restart")
-PAIRINGS = ("nearest", "interpolated")
-BACKGROUNDS = ("white", "black", "keep")
 ROBOTS = ("ur3e",)
+Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
 MAX_GAP_MS = 3.6e6
@@ -33,73 +30,63 @@ MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 
 
-@dataclass(frozen=True)
-class SourceConfig(Bounded):
-    """Keys of every kind.
-
-    fps: captures per second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
-    or zstd. quality: JPEG quality, 1 to 100; from 90 up, color is not subsampled. effects: name ->
+class SourceConfig(Settings, frozen=True, kw_only=True):
+    """Keys of every kind. fps: not given, it is the recording's own, 15 for a world, 10 for photos. effects: name ->
     parameters, or null (see ``camera-node effects``).
     """
 
     kind: str
-    fps: float | None = bounded(None, *FPS_RANGE)
-    codec: str = one_of("jpeg", CODECS)
-    quality: int = bounded(92, 1, 100)
+    fps: Annotated[float, within(*FPS_RANGE, "captures per second")] | None = None
+    codec: Literal["jpeg", "png", "zstd"] = "jpeg"
+    quality: Annotated[int, within(1, 100, "of JPEG; from 90 up, color is not subsampled")] = 92
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class PathConfig(Bounded):
+Elevation = Annotated[float, within(-89.0, 89.0, "elevations of the rings")]
+Roll = Annotated[float, within(-360.0, 360.0, "allowed rotations about the optical axis")]
+
+
+class PathConfig(Settings, frozen=True):
     """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
 
-    target_m: target in the world. radius_m: distance from camera to target. elevations_deg: elevations of
-    the rings. azimuths_deg: first and last azimuth of each ring (0 is on the target's -y side, 90 on its +x
-    side). step_deg: between viewpoints of a ring. rolls_deg: allowed rotations of the camera about its
-    optical axis; at each viewpoint, one that the arm reaches is used. speed_rad_s, acceleration_rad_s2:
-    limits of the fastest joint. floor_m: minimum height (world z) of the joint centers beyond the shoulder.
+    Azimuth 0 is on the target's -y side, 90 on its +x side. At each viewpoint the first rotation is used that the arm
+    reaches.
     """
 
-    target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    radius_m: float = bounded(0.35, 1e-3, math.inf)
-    elevations_deg: tuple[float, ...] = bounded((45.0, 65.0), -89.0, 89.0)
-    azimuths_deg: tuple[float, float] = (-90.0, 90.0)
-    step_deg: float = bounded(15.0, 1.0, 120.0)
-    rolls_deg: tuple[float, ...] = bounded((0.0, 90.0, 180.0, 270.0), -360.0, 360.0)
-    speed_rad_s: float = bounded(0.5, 1e-4, 3.14)
-    acceleration_rad_s2: float = bounded(1.0, 1e-4, 40.0)
-    floor_m: float = 0.05
+    target_m: Annotated[tuple[float, float, float], about("target in the world")] = (0.0, 0.0, 0.0)
+    radius_m: Annotated[float, within(1e-3, math.inf, "distance from camera to target")] = 0.35
+    elevations_deg: Annotated[tuple[Elevation, ...], Meta(min_length=1)] = (45.0, 65.0)
+    azimuths_deg: Annotated[tuple[float, float], about("first and last of each ring")] = (-90.0, 90.0)
+    step_deg: Annotated[float, within(1.0, 120.0, "between viewpoints of a ring")] = 15.0
+    rolls_deg: Annotated[tuple[Roll, ...], Meta(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
+    speed_rad_s: Annotated[float, within(1e-4, 3.14, "limit of the fastest joint")] = 0.5
+    acceleration_rad_s2: Annotated[float, within(1e-4, 40.0, "limit of the fastest joint")] = 1.0
+    floor_m: Annotated[float, about("least height (world z) of the joint centers beyond the shoulder")] = 0.05
 
 
-@dataclass(frozen=True)
-class ArmConfig(Bounded):
+class ArmConfig(Settings, frozen=True):
     """An arm whose joint states give cameras their poses (extra ``ur``).
 
-    host: the controller's address. robot: ur3e. cameras: camera -> its hand-eye calibration, a file written
-    by ``camera-node calibrate hand-eye``, relative to the scenario, or null before calibration (its poses are
-    then those of the hand, as that command needs them). calibration: the robot's own ``calibration.conf``,
-    relative to the scenario. base_m, base_yaw_deg: pose of the arm's base in the world. frequency_hz:
-    joint states per second, 10 to 500. pairing: nearest or interpolated. max_gap_ms: a frame farther than
-    this from a joint state is not sent. path: the tour of ``camera-node drive-arm``. simulated: deploy/up.py
-    starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and up) and drives
-    it. teleop: keys of ``camera_node.robot.teleop.settings.TeleopConfig``, for ``camera-node teleop``.
+    cameras: files of ``camera-node calibrate hand-eye``, relative to the scenario; null before calibration: poses are
+    then those of the flange, as that command needs them.
+    simulated: the launcher starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and
+    up) and drives it.
     """
 
-    host: str
-    cameras: dict[str, str | None]
-    robot: str = one_of("ur3e", ROBOTS)
-    calibration: str | None = None
-    base_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    base_yaw_deg: float = 0.0
-    frequency_hz: float = bounded(125.0, 10, 500)
-    pairing: str = one_of("interpolated", PAIRINGS)
-    max_gap_ms: float = bounded(20.0, 0, MAX_GAP_MS)
-    path: PathConfig | None = None
+    host: Annotated[str, about("the controller's address")]
+    cameras: Annotated[dict[str, str | None], about("camera -> its hand-eye calibration")]
+    robot: Literal["ur3e"] = "ur3e"
+    calibration: Annotated[str | None, about("the robot's own calibration.conf, relative to the scenario")] = None
+    base_m: Annotated[tuple[float, float, float], about("position of the arm's base in the world")] = (0.0, 0.0, 0.0)
+    base_yaw_deg: Annotated[float, about("rotation of the arm's base about the vertical")] = 0.0
+    frequency_hz: Annotated[float, within(10, 500, "joint states per second")] = 125.0
+    pairing: Literal["nearest", "interpolated"] = "interpolated"
+    max_gap_ms: Annotated[float, within(0, MAX_GAP_MS, "largest gap from frame to joint state")] = 20.0
+    path: Annotated[PathConfig | None, about("the tour of camera-node drive-arm")] = None
     simulated: bool = False
-    teleop: dict[str, Any] | None = None  # read by the command alone: a node that streams needs none of it
+    teleop: Annotated[dict[str, Any] | None, about("keys for camera-node teleop")] = None  # read by that command alone
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not self.cameras:
             raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
         # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
@@ -107,21 +94,19 @@ class ArmConfig(Bounded):
             raise ValueError(f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2")
 
 
-@dataclass(frozen=True)
-class WorldConfig(SourceConfig):
-    """A synthetic world. scene: ``room``, ``tile`` or ``tower``; width, height, horizontal_fov_deg: of its
-    cameras; speed_m_per_s: of its motion. motion_seed: draws another motion of the same scene (path, sense,
-    start, speed); not given: the scene's own. params: further parameters of the scene by name. arm: an arm
-    that carries the cameras that it lists; their images are rendered from the simulated arm's true pose."""
+class WorldConfig(SourceConfig, frozen=True, kw_only=True):
+    """A synthetic world. motion_seed: draws path, sense, start and speed; not given: the scene's own motion. arm:
+    images of its cameras are rendered from the simulated arm's true pose.
+    """
 
-    scene: str = "room"
-    width: int | None = None
-    height: int | None = None
-    horizontal_fov_deg: float | None = None
-    speed_m_per_s: float | None = None
-    motion_seed: int | None = None
-    params: dict[str, Any] = field(default_factory=dict)
-    arm: ArmConfig | None = None
+    scene: Annotated[str, about("room, tile or tower")] = "room"
+    width: Annotated[int | None, about("pixels")] = None
+    height: Annotated[int | None, about("pixels")] = None
+    horizontal_fov_deg: Annotated[float | None, about("of the cameras")] = None
+    speed_m_per_s: Annotated[float | None, about("of the scene's motion")] = None
+    motion_seed: Annotated[int | None, about("draws another motion of the scene")] = None
+    params: Annotated[dict[str, Any], about("further parameters of the scene, by name")] = field(default_factory=dict)
+    arm: Annotated[ArmConfig | None, about("carries the cameras that it lists")] = None
 
     def scene_parameters(self) -> dict[str, Any]:
         """Parameters of the scene by name: the fields above that were given, and ``params``."""
@@ -130,147 +115,134 @@ class WorldConfig(SourceConfig):
         return {**given, **self.params}
 
 
-@dataclass(frozen=True)
-class TrajectoryConfig(Bounded):
+class TrajectoryConfig(Settings, frozen=True):
     """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's.
 
-    files: camera -> file. pairing: nearest or interpolated. max_gap_ms: a frame further than this from its
-    pose sample is not sent. start_s: the trajectory's time at the clip's first frame. hand_eye: the files are
-    of the hand that holds the camera, and this one, of ``camera-node calibrate hand-eye --out``, says where.
+    max_gap_ms: a frame farther than this from its pose sample is not sent.
+    hand_eye: the files are of the flange that holds the camera, and this one, of ``camera-node calibrate hand-eye
+    --out``, says where.
     """
 
-    files: dict[str, str]
-    pairing: str = one_of("interpolated", PAIRINGS)
-    max_gap_ms: float = bounded(50.0, 0, MAX_GAP_MS)
-    start_s: float = bounded(0.0, -MAX_STAMP_S, MAX_STAMP_S)
+    files: Annotated[dict[str, str], about("camera -> file")]
+    pairing: Literal["nearest", "interpolated"] = "interpolated"
+    max_gap_ms: Annotated[float, within(0, MAX_GAP_MS, "largest gap from frame to pose sample")] = 50.0
+    start_s: Annotated[float, within(-MAX_STAMP_S, MAX_STAMP_S, "the trajectory's time at the clip's first frame")] = (
+        0.0
+    )
     hand_eye: str = ""
 
 
-@dataclass(frozen=True)
-class RecordedConfig(SourceConfig):
-    """Keys of all recorded data sets. data: folder or describing file, absolute or below the data folder.
-    scale: image sizes are divided by it. loop: clips go back and forth, or restart. assignment: scenario
-    camera -> the data set's camera, where the names differ."""
+class RecordedConfig(SourceConfig, frozen=True, kw_only=True):
+    """Keys of all recorded data sets. assignment: where the names differ."""
 
-    data: str = ""
-    scale: float = bounded(1.0, 1, math.inf)
-    loop: str = one_of("back-and-forth", LOOPS)
-    assignment: dict[str, str] = field(default_factory=dict)
+    data: Annotated[str, about("folder or file, absolute or below the data folder")] = ""
+    scale: Annotated[float, within(1, math.inf, "image sizes are divided by it")] = 1.0
+    loop: Literal["back-and-forth", "restart"] = "back-and-forth"
+    assignment: Annotated[dict[str, str], about("scenario camera -> the data's")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not self.data:
             raise ValueError("data: missing: the data set's folder or JSON file")
         if getattr(self, "background", None) == "keep" and self.codec != "png":
             raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
 
 
-@dataclass(frozen=True)
-class TransformsConfig(RecordedConfig):
+class TransformsConfig(RecordedConfig, frozen=True, kw_only=True):
     """nerfstudio, instant-ngp, NeRF-synthetic. background: color behind RGBA images;
     ``keep`` sends alpha and needs the codec png."""
 
-    background: str = one_of("white", BACKGROUNDS)
+    background: Background = "white"
 
 
-@dataclass(frozen=True)
-class VideoConfig(RecordedConfig):
-    """Video files with a calibration JSON. data: the JSON, or the folder that holds it. files: camera ->
-    video, relative to the JSON (default ``videos/<camera>.mp4`` or ``<camera>.mp4``)."""
+class VideoConfig(RecordedConfig, frozen=True, kw_only=True):
+    """Video files with a calibration JSON. data: the JSON, or the folder that holds it. files: not given, they
+    are ``videos/<camera>.mp4`` or ``<camera>.mp4``.
+    """
 
-    files: dict[str, str] = field(default_factory=dict)
-    trajectory: TrajectoryConfig | None = None
-
-
-@dataclass(frozen=True)
-class LiveConfig(SourceConfig):
-    """Keys of all kinds with real cameras. devices: camera -> its device (serial number; a number, path or
-    address for kind ``camera``); needed if there is more than one. width, height: requested pixels.
-    exposure_us: fixed exposure; not given: automatic. calibration: JSON of intrinsics and poses by camera, as
-    for videos, relative to the scenario; without it intrinsics are the device's own, if it has any, and poses
-    come from ``arm``. first_frame_s: seconds that a camera may take until its first frame."""
-
-    devices: dict[str, str] = field(default_factory=dict)
-    width: int = bounded(640, 8, MAX_IMAGE_SIDE_PX)
-    height: int = bounded(400, 8, MAX_IMAGE_SIDE_PX)
-    exposure_us: int | None = bounded(None, 1, 10**6)
-    calibration: str | None = None
-    arm: ArmConfig | None = None
-    first_frame_s: float = bounded(3.0, 0.1, 60)
+    files: Annotated[dict[str, str], about("camera -> video, relative to the JSON")] = field(default_factory=dict)
+    trajectory: Annotated[TrajectoryConfig | None, about("poses from files")] = None
 
 
-@dataclass(frozen=True)
-class CameraConfig(LiveConfig):
+class LiveConfig(SourceConfig, frozen=True, kw_only=True):
+    """Keys of all kinds with real cameras.
+
+    devices: serial numbers; for kind ``camera`` a number, path or address; needed if there is more than one.
+    calibration: relative to the scenario; not given: intrinsics are the device's own, if it has any, and poses come
+    from ``arm``.
+    """
+
+    devices: Annotated[dict[str, str], about("camera -> its device")] = field(default_factory=dict)
+    width: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "requested pixels")] = 640
+    height: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "requested pixels")] = 400
+    exposure_us: Annotated[int, within(1, 10**6, "fixed exposure; not given: automatic")] | None = None
+    calibration: Annotated[str | None, about("JSON of intrinsics and poses by camera, as for videos")] = None
+    arm: Annotated[ArmConfig | None, about("an arm that carries the cameras it lists")] = None
+    first_frame_s: Annotated[float, within(0.1, 60, "time that a camera may take until its first frame")] = 3.0
+
+
+class CameraConfig(LiveConfig, frozen=True, kw_only=True):
     """Any camera or stream that OpenCV opens: a USB camera by number or path (/dev/v4l/by-id/...), a network
-    camera by address (rtsp://...). It knows no intrinsics: ``calibration`` gives them. latency_ms: from
-    exposure to arrival at the host, for drivers without time stamps; subtracted from the time of arrival."""
+    camera by address (rtsp://...). It knows no intrinsics: ``calibration`` gives them. latency_ms: for drivers without
+    time stamps.
+    """
 
-    latency_ms: float = bounded(0.0, 0, MAX_LATENCY_MS)
-
-
-@dataclass(frozen=True)
-class OakConfig(LiveConfig):
-    """Luxonis OAK cameras through depthai 3 (extra ``oak``). socket: which of the device's cameras. iso: with
-    exposure_us. rectify: straighten the picture on the device; otherwise its lens goes with the frame, as
-    well as four coefficients describe it."""
-
-    socket: str = "CAM_A"
-    iso: int = bounded(400, 100, 1600)
-    rectify: bool = False
+    latency_ms: Annotated[float, within(0, MAX_LATENCY_MS, "from exposure to arrival at the host")] = 0.0
 
 
-@dataclass(frozen=True)
-class RealsenseConfig(LiveConfig):
+class OakConfig(LiveConfig, frozen=True, kw_only=True):
+    """Luxonis OAK cameras through depthai 3 (extra ``oak``). A picture that is not rectified carries its lens, as well
+    as four coefficients describe it.
+    """
+
+    socket: Annotated[str, about("which of the device's cameras")] = "CAM_A"
+    iso: Annotated[int, within(100, 1600, "with exposure_us")] = 400
+    rectify: Annotated[bool, about("straighten the picture on the device")] = False
+
+
+class RealsenseConfig(LiveConfig, frozen=True, kw_only=True):
     """Intel RealSense D400 cameras, their color stream (extra ``realsense``)."""
 
 
-@dataclass(frozen=True)
-class DynerfConfig(RecordedConfig):
+class DynerfConfig(RecordedConfig, frozen=True, kw_only=True):
     """DyNeRF (Neural 3D Video). data: the folder with ``cam*.mp4`` and ``poses_bounds.npy``."""
 
 
-@dataclass(frozen=True)
-class ZjuConfig(RecordedConfig):
-    """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. recorded_fps: of
-    the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
-    background: what goes behind the person."""
+class ZjuConfig(RecordedConfig, frozen=True, kw_only=True):
+    """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. background: what goes
+    behind the person."""
 
-    recorded_fps: float = bounded(50.0, *FPS_RANGE)
-    masks: str | None = None
-    background: str = one_of("black", BACKGROUNDS)
+    recorded_fps: Annotated[float, within(*FPS_RANGE, "of the recording, whose files do not tell")] = 50.0
+    masks: Annotated[str | None, about("a folder of masks (mask_cihp) that cut the person out")] = None
+    background: Background = "black"
 
 
-@dataclass(frozen=True)
-class EyefulConfig(RecordedConfig):
-    """Eyeful Tower. data: a scene's folder with ``cameras.json``. images: folder of images in it (default:
-    the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``, ``images-jpeg``). Cameras are called as their
-    folders: name them in cameras.ids, or in assignment."""
+class EyefulConfig(RecordedConfig, frozen=True, kw_only=True):
+    """Eyeful Tower. data: a scene's folder with ``cameras.json``. Cameras are called as their folders: name them
+    in cameras.ids, or in assignment. images: not given, it is the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``,
+    ``images-jpeg``.
+    """
 
-    images: str | None = None
-
-
-@dataclass(frozen=True)
-class ColmapConfig(RecordedConfig):
-    """A COLMAP model, text or binary. data: the folder that holds it, itself or in ``sparse/0``. images:
-    folder of images (default ``images``). background: what goes under transparent ones."""
-
-    images: str | None = None
-    background: str = one_of("white", BACKGROUNDS)
+    images: Annotated[str | None, about("folder of images")] = None
 
 
-@dataclass(frozen=True)
-class McapConfig(SourceConfig):
+class ColmapConfig(RecordedConfig, frozen=True, kw_only=True):
+    """A COLMAP model, text or binary. data: the folder that holds it, itself or in ``sparse/0``. background: what
+    goes under transparent images."""
+
+    images: Annotated[str | None, about("folder of images; not given: images")] = None
+    background: Background = "white"
+
+
+class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
-    poses, stamps shifted to now. file: the recording. loop: ``once`` from first to last, after which the
-    node ends, or ``restart`` over and over, in step with nodes elsewhere. assignment: scenario camera -> the
-    recording's, where the names differ. fps, codec and quality are the recording's own."""
+    poses, stamps shifted to now. loop: from first to last, after which the node ends, or over and over, in step
+    with nodes elsewhere. fps, codec and quality are the recording's own."""
 
-    file: str = ""
-    loop: str = one_of("once", REPLAYS)
-    assignment: dict[str, str] = field(default_factory=dict)
+    file: Annotated[str, about("the recording")] = ""
+    loop: Literal["once", "restart"] = "once"
+    assignment: Annotated[dict[str, str], about("scenario camera -> the recording's")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not self.file:
             raise ValueError("file: missing: the recording")
         if self.effects:
@@ -308,7 +280,7 @@ def source_config(scenario: Scenario) -> SourceConfig:
     kind = scenario.source.get("kind")
     if not isinstance(kind, str) or kind not in MODELS:
         raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
-    return read_section(MODELS[kind], scenario.source, where)
+    return read_settings(MODELS[kind], scenario.source, where)
 
 
 def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:

@@ -29,6 +29,7 @@ from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield import payload
 from freshfield.files import write_bytes
+from freshfield.settings import as_mapping
 
 # A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
 MAX_FRAMES = 3000
@@ -139,11 +140,11 @@ class FrameCache:
         camera, pose = self.scene.cameras[self.camera_id]
         what = {
             "scene": self.scene.name,
-            "params": dataclasses.asdict(self.scene.params),
+            "params": as_mapping(self.scene.params),
             "camera": dataclasses.asdict(camera),
             "pose": np.asarray(pose, dtype=np.float64).tolist(),
             "fps": str(self.fps),
-            "effects": [[name, dataclasses.asdict(p)] for name, p in self._effects.rendered],
+            "effects": [[name, as_mapping(p)] for name, p in self._effects.rendered],
             "codec": [self._stored_codec, self.quality if self._stored_codec == "jpeg" else None],
             "renderer": renderer_version(),
             "phase_ns": self.phase_ns,

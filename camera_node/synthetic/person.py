@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -26,7 +27,7 @@ _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
 # Bounds of a randomly drawn walk relative to the scene's own: shift of the center, factors of radii and
 # speed. Within them it stays clear of the furniture.
 _SHIFT_M, _RADIUS_FACTORS, _SPEED_FACTORS = 0.2, (0.75, 1.15), (0.7, 1.4)
-COURSES = ("loop", "stops", "reverses", "jumps")
+Course = Literal["loop", "stops", "reverses", "jumps"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Walk:
     still: the person stands still.
     direction: 1.0 is counterclockwise from above, -1.0 clockwise.
     start_s: time into the loop at instant 0.
-    course: one of ``COURSES``. loop: round and round; stops: a rest of PERIOD_UNIT_S after each
+    course: loop: round and round; stops: a rest of PERIOD_UNIT_S after each
         PERIOD_UNIT_S; reverses: half a loop and backwards again; jumps: half a loop, then a jump back to its
         start.
     """
@@ -50,7 +51,7 @@ class Walk:
     still: bool = False
     direction: float = 1.0
     start_s: float = 0.0
-    course: str = "loop"
+    course: Course = "loop"
 
     @property
     def repeats_s(self) -> float:

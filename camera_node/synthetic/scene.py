@@ -10,24 +10,23 @@ import importlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import Bounded, bounded
 from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
 from camera_node.synthetic.placement import place_static
 from camera_node.synthetic.render import CameraRenderer, Image, World, cast_rays
 from freshfield.geometry import Array, Pinhole, world_rays
 from freshfield.limits import MAX_IMAGE_SIDE_PX
-from freshfield.scenario import ScenarioError, read_section
+from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
 
 SCENES = ("room", "tile", "tower")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
-FOV_DEG = (5.0, 150.0)
+Fov = Annotated[float, within(5.0, 150.0, "horizontal field of view of the cameras")]
 # Parameters that do not change static parts.
 _MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "course", "people")
 # Number of renderers kept for scenes with the same static parts: enough for two sets of cameras.
@@ -39,34 +38,29 @@ class SceneError(ScenarioError):
     """A scene that cannot be made from its parameters; the message says what is valid."""
 
 
-@dataclass(frozen=True)
-class BaseParams(Bounded):
-    """Parameters every scene has.
+class BaseParams(Settings, frozen=True, kw_only=True):
+    """Parameters every scene has."""
 
-    count: cameras including the held-out one, 1 to 19. width, height: pixels. supersample: rays per
-    pixel side. distortion: OpenCV's (k1, k2, p1, p2) of every camera's lens.
-    """
-
-    count: int = bounded(13, 1, MAX_CAMERAS)
-    width: int = bounded(128, 8, MAX_IMAGE_SIDE_PX)
-    height: int = bounded(128, 8, MAX_IMAGE_SIDE_PX)
-    horizontal_fov_deg: float = bounded(60.0, *FOV_DEG)
-    supersample: int = bounded(2, 1, 8)
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    count: Annotated[int, within(1, MAX_CAMERAS, "cameras, with the held-out one")] = 13
+    width: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "pixels")] = 128
+    height: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "pixels")] = 128
+    horizontal_fov_deg: Fov = 60.0
+    supersample: Annotated[int, within(1, 8, "rays per pixel side")] = 2
+    distortion: Annotated[tuple[float, float, float, float], about("OpenCV's k1, k2, p1, p2 of every lens")] = (
+        0.0,
+    ) * 4
 
 
-@dataclass(frozen=True)
-class MovingParams(BaseParams):
-    """speed_m_per_s: mean speed of moving parts; 0 stands still. motion_seed: draws a path, direction, start
-    and speed (from 0.7 to 1.4 times the one given); None: the scene's own motion."""
+class MovingParams(BaseParams, frozen=True, kw_only=True):
+    """Parameters of scenes in which something moves. motion_seed: draws a path, direction, start and speed (from 0.7 to
+    1.4 times the one given); not given: the scene's own motion."""
 
-    speed_m_per_s: float = 1.0
-    motion_seed: int | None = bounded(None, 0, math.inf)
+    speed_m_per_s: Annotated[float, within(0.0, MAX_SPEED_M_PER_S, "mean speed of moving parts; 0 stands still")] = 1.0
+    motion_seed: Annotated[int, within(0, math.inf, "draws another motion")] | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= MAX_SPEED_M_PER_S:
-            raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
+        if 0.0 < self.speed_m_per_s < 0.05:
+            raise ValueError(f"speed_m_per_s must be 0 or at least 0.05, got {self.speed_m_per_s}")
 
 
 @dataclass(frozen=True)
@@ -152,23 +146,14 @@ def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
     if name not in SCENES:
         raise SceneError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
     module = importlib.import_module(f"camera_node.synthetic.scenes.{name}")
-    scene: Scene = module.build(_checked(name, module.Params, params or {}))
-    if getattr(scene.params, "motion_seed", None) is None:
-        return scene
-    still = {k: v for k, v in dataclasses.asdict(scene.params).items() if k not in _MOTION_PARAMETERS}
-    return dataclasses.replace(scene, static_key=repr((name, still)))
-
-
-def _checked(name: str, model: type[Any], given: Mapping[str, Any]) -> Any:
-    known = {f.name: f.default for f in dataclasses.fields(model)}
-    for key in given:
-        if key not in known:
-            valid = ", ".join(f"{k} ({v})" for k, v in known.items())
-            raise SceneError(f"scene {name}: unknown parameter {key!r}; valid (default): {valid}")
     try:
-        return read_section(model, dict(given), f"scene {name}")
+        scene: Scene = module.build(read_settings(module.Params, dict(params or {}), f"scene {name}"))
     except ScenarioError as error:
         raise SceneError(str(error)) from None
+    if getattr(scene.params, "motion_seed", None) is None:
+        return scene
+    still = {k: v for k, v in as_mapping(scene.params).items() if k not in _MOTION_PARAMETERS}
+    return dataclasses.replace(scene, static_key=repr((name, still)))
 
 
 def pinhole(params: BaseParams) -> Pinhole:

@@ -23,15 +23,16 @@ import types
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
 
 from freshfield.frame import valid_id
-from freshfield.limits import MAX_CAMERAS, MAX_ERROR_CHARS, MAX_IMAGE_SIDE_PX
+from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
+from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 from freshfield.untrusted import UntrustedError, read_yaml
 
-PHASES = ("locked", "spread")
 # Label of every fidelity of a run without held-out cameras: on page, report, console and in metrics.
 NOTHING_HELD_OUT = "training views, nothing is held out"
 T = TypeVar("T")
@@ -41,28 +42,17 @@ SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios
 """Folder of the shipped scenarios: in the checkout, else in the installed wheel."""
 
 
-class ScenarioError(ValueError):
-    """An invalid scenario. The message is one line (file, key, what was expected), truncated if too long."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message if len(message) <= MAX_ERROR_CHARS else f"{message[:MAX_ERROR_CHARS]} ...")
-
-
-@dataclass(frozen=True)
-class Cameras:
+class Cameras(Settings, frozen=True):
     """The section ``cameras``.
 
-    count: number of cameras, named cam00, cam01, ...
-    ids: names of the cameras, instead of ``count``.
-    held_out: names of the cameras that are never trained on.
     phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as in the thesis;
         ``spread``: each at its own seeded phase, like cameras without a common trigger.
     """
 
-    count: int = 0
-    ids: list[str] = field(default_factory=list)
-    held_out: list[str] = field(default_factory=list)
-    phase: str = "locked"
+    count: Annotated[int, within(0, MAX_CAMERAS, "number of cameras, named cam00, cam01, ...")] = 0
+    ids: Annotated[list[str], about("names of the cameras, instead of count")] = msgspec.field(default_factory=list)
+    held_out: Annotated[list[str], about("cameras that are never trained on")] = msgspec.field(default_factory=list)
+    phase: Literal["locked", "spread"] = "locked"
 
 
 @dataclass(frozen=True)
@@ -153,8 +143,8 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     for key in ("source", "channel", "edge"):
         if not isinstance(data.get(key, {}), dict):
             raise ScenarioError(f"{file}: {key}: expected a mapping")
-    found = read_section(Cameras, data.get("cameras", {}), f"{file}: cameras")
-    if bool(found.ids) == bool(found.count) or not 0 <= found.count <= MAX_CAMERAS:
+    found = read_settings(Cameras, data.get("cameras", {}), f"{file}: cameras")
+    if bool(found.ids) == bool(found.count):
         raise ScenarioError(f"{file}: cameras: expected either count (1 to {MAX_CAMERAS}) or ids")
     ids = tuple(found.ids or (f"cam{i:02d}" for i in range(found.count)))
     for name in (*ids, *found.held_out):
@@ -167,8 +157,6 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
             raise ScenarioError(f"{file}: cameras.held_out: {name!r} is not one of the cameras")
     if len(set(found.held_out)) == len(ids):
         raise ScenarioError(f"{file}: cameras.held_out: every camera is held out, none is left to train on")
-    if found.phase not in PHASES:
-        raise ScenarioError(f"{file}: cameras.phase: expected {' or '.join(PHASES)}, got {found.phase!r}")
     number = data.get("seed", 0) if seed is None else seed
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**63:
         raise ScenarioError(f"{file}: seed: expected a whole number from 0 to 2^63 - 1, got {number!r}")
@@ -195,6 +183,8 @@ def read_section(cls: type[T], mapping: Any, where: str) -> T:
     where: file and key, the beginning of every error.
     Raises ScenarioError, also for a ValueError of the dataclass's ``__post_init__``, which checks ranges.
     """
+    if issubclass(cls, Settings):
+        return read_settings(cls, mapping, where)
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
     hints = typing.get_type_hints(cls)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import typing
 
@@ -95,9 +94,8 @@ def numbers() -> list[tuple[str, str]]:
     """Every number among the parameters of every effect."""
     found = []
     for name in fx.NAMES:
-        model = fx.effect_class(name)
-        hints = typing.get_type_hints(model)
-        found += [(name, f.name) for f in dataclasses.fields(model) if hints[f.name] in (int, float)]
+        hints = typing.get_type_hints(fx.effect_class(name))
+        found += [(name, key) for key, kind in hints.items() if kind in (int, float)]
     return found
 
 

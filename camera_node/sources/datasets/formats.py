@@ -7,7 +7,6 @@ reader module here, named like the kind, and a dataclass there, whose fields are
 from __future__ import annotations
 
 import importlib
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -45,8 +44,8 @@ def reader(name: str) -> Reader:
 
 def open_configured(path: Path, config: RecordedConfig) -> Dataset | VideoRig:
     """Open the data set of a scenario's ``source:`` section. path: located ``data``. Raises DatasetError."""
-    shared = {*(each.name for each in fields(RecordedConfig)), "background", "trajectory"}
-    keys = {each.name: getattr(config, each.name) for each in fields(config) if each.name not in shared}
+    shared = {*RecordedConfig.__struct_fields__, "background", "trajectory"}
+    keys = {name: getattr(config, name) for name in config.__struct_fields__ if name not in shared}
     found = reader(config.kind)
     if isinstance(found, RigReader):
         return found.load_rig(path, **keys)

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from camera_node.config import BACKGROUNDS
+from camera_node.config import Background
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
@@ -33,8 +33,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
     Entries without an image file are counted as missing. Raises DatasetError.
     """
-    if options.background not in BACKGROUNDS:
-        raise DatasetError(f"background is {options.background!r}: expected one of {', '.join(BACKGROUNDS)}")
+    if options.background not in get_args(Background):
+        raise DatasetError(f"background is {options.background!r}: expected one of {', '.join(get_args(Background))}")
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
     tried = []

@@ -21,17 +21,16 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import Bounded
 from camera_node.synthetic.render import Image, Rows
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Pinhole, Pose
-from freshfield.scenario import ScenarioError, read_section
+from freshfield.settings import ScenarioError, Settings, about, read_settings
 
 NAMES = (
     "clock_drift",
@@ -55,11 +54,10 @@ class EffectError(ScenarioError):
     """An effect that cannot be applied as listed; the message says what is valid."""
 
 
-@dataclass(frozen=True)
-class EffectParameters(Bounded):
-    """Base of the effects' parameters. in_truth: whether the effect applies to held-out cameras as well."""
+class EffectParameters(Settings, frozen=True, kw_only=True):
+    """Base of the effects' parameters."""
 
-    in_truth: bool = field(default=False, kw_only=True)
+    in_truth: Annotated[bool, about("whether the effect applies to held-out cameras as well")] = False
 
     kind: ClassVar[str]
 
@@ -229,7 +227,7 @@ def load_effects(
     rendered: list[tuple[str, Any]] = []
     for name, given in listed.items():
         try:
-            effect = read_section(effect_class(name), dict(given or {}), f"effect {name}")
+            effect = read_settings(effect_class(name), dict(given or {}), f"effect {name}")
         except ScenarioError as error:
             raise EffectError(str(error)) from None
         if held_out and not effect.in_truth:

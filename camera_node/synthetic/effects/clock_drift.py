@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class ClockDrift(EffectParameters):
-    """node = true + offset + drift * (true - start), where start is the time of the first call.
+class ClockDrift(EffectParameters, frozen=True):
+    """node = true + offset + drift * (true - start), where start is the time of the first call."""
 
-    offset_ms, drift_ppm: of every camera's clock. offset_spread_ms, drift_spread_ppm: standard deviations
-    of what each camera adds to them, so that cameras disagree."""
+    offset_ms: Annotated[float, within(-1e10, 1e10, "offset of every camera's clock")] = 0.0
+    drift_ppm: Annotated[float, within(-1e5, 1e5, "drift of every camera's clock")] = 0.0
+    offset_spread_ms: Annotated[
+        float, within(0.0, 1e9, "standard deviation of what each camera adds to the offset")
+    ] = 0.0
+    drift_spread_ppm: Annotated[float, within(0.0, 1e4, "standard deviation of what each camera adds to the drift")] = (
+        0.0
+    )
 
-    offset_ms: float = bounded(0.0, -1e10, 1e10)  # four months
-    drift_ppm: float = bounded(0.0, -1e5, 1e5)
-    offset_spread_ms: float = bounded(0.0, 0.0, 1e9)
-    drift_spread_ppm: float = bounded(0.0, 0.0, 1e4)
-
-    kind = "clock"
+    kind: ClassVar[str] = "clock"
 
     def start(self, rng: np.random.Generator) -> DriftingClock:
         return DriftingClock(self, rng)

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import phase_of
 from camera_node.synthetic.render import Image
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class ExposureDrift(EffectParameters):
+class ExposureDrift(EffectParameters, frozen=True):
     """Values become value * 2^stops, clipped at white, with stops = offset + amplitude * sin(2 pi (t / period
-    + phase)). Displayed values are scaled, as everywhere in this world.
+    + phase)); each camera has a random phase. Displayed values are scaled, as everywhere in this world."""
 
-    amplitude_stops: amplitude of the exposure's sine; one stop doubles the exposure. period_s: of the
-    sine; each camera has a random phase. offset_spread_stops: standard deviation of each camera's constant
-    offset."""
+    amplitude_stops: Annotated[
+        float, within(0.0, 8.0, "amplitude of the exposure's sine; one stop doubles the exposure")
+    ] = 0.3
+    period_s: Annotated[float, within(0.01, 1e6, "of the sine")] = 20.0
+    offset_spread_stops: Annotated[float, within(0.0, 8.0, "standard deviation of each camera's constant offset")] = 0.1
 
-    amplitude_stops: float = bounded(0.3, 0.0, 8.0)
-    period_s: float = bounded(20.0, 0.01, 1e6)
-    offset_spread_stops: float = bounded(0.1, 0.0, 8.0)
-
-    kind = "image"
+    kind: ClassVar[str] = "image"
 
     def start(self, rng: np.random.Generator) -> DriftingExposure:
         return DriftingExposure(self, rng)

@@ -9,29 +9,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array
+from freshfield.settings import within
+
+Share = Annotated[float, within(0.0, 1.0, "color of the fog, RGB")]
 
 
-@dataclass(frozen=True)
-class Fog(EffectParameters):
-    """Rendered ahead; free while streaming. A scene's background is all fog.
+class Fog(EffectParameters, frozen=True):
+    """Rendered ahead; free while streaming. A scene's background is all fog."""
 
-    visibility_m: distance at which contrast falls to contrast_threshold (.02 is Koschmieder's, .05 the
-    WMO's). airlight: color of the fog, RGB in [0, 1]."""
+    visibility_m: Annotated[float, within(0.01, 1e6, "distance at which contrast falls to contrast_threshold")] = 20.0
+    contrast_threshold: Annotated[float, within(1e-6, 0.5, ".02 is Koschmieder's, .05 the WMO's")] = 0.02
+    airlight: tuple[Share, Share, Share] = (0.76, 0.78, 0.80)
 
-    visibility_m: float = bounded(20.0, 0.01, 1e6)
-    contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
-    airlight: tuple[float, float, float] = bounded((0.76, 0.78, 0.80), 0.0, 1.0)
-
-    kind = "world"
+    kind: ClassVar[str] = "world"
 
     @property
     def extinction_per_m(self) -> float:

@@ -6,31 +6,26 @@ pixel for one frame. With a color filter, one of a pixel's three values is hit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, frame_rng
 from camera_node.synthetic.render import Image
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class HotPixels(EffectParameters):
-    """Added values are exponentially distributed and clipped at white; hits are a Poisson process.
+class HotPixels(EffectParameters, frozen=True):
+    """Added values are exponentially distributed and clipped at white; hits are a Poisson process."""
 
-    hot_ppm: damaged pixels in a million at the start. growth_ppm_per_h: newly damaged ones in an hour.
-    hot_counts: mean value that one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
-    hit_counts: mean value that one adds."""
+    hot_ppm: Annotated[float, within(0.0, 1e6, "damaged pixels in a million at the start")] = 300.0
+    growth_ppm_per_h: Annotated[float, within(0.0, 1e6, "newly damaged pixels in an hour")] = 0.0
+    hot_counts: Annotated[float, within(0.0, 1e6, "mean value that a damaged pixel adds, of 255 counts")] = 100.0
+    hits_per_megapixel: Annotated[float, within(0.0, 1e6, "mean number of particles a frame")] = 50.0
+    hit_counts: Annotated[float, within(0.0, 1e6, "mean value that a particle adds")] = 150.0
 
-    hot_ppm: float = bounded(300.0, 0.0, 1e6)
-    growth_ppm_per_h: float = bounded(0.0, 0.0, 1e6)
-    hot_counts: float = bounded(100.0, 0.0, 1e6)
-    hits_per_megapixel: float = bounded(50.0, 0.0, 1e6)
-    hit_counts: float = bounded(150.0, 0.0, 1e6)
-
-    kind = "image"
+    kind: ClassVar[str] = "image"
 
     def start(self, rng: np.random.Generator) -> DamagedSensor:
         return DamagedSensor(self, rng)

@@ -7,28 +7,27 @@ others a lens without distortion.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectError, EffectParameters
 from freshfield.geometry import Pinhole, invertible
+from freshfield.settings import about, within
 
 
-@dataclass(frozen=True)
-class LensDistortion(EffectParameters):
-    """Rendered ahead at no extra cost; free while streaming. Raises EffectError if the distortion cannot be
-    inverted over the whole image, or if the scene's lenses have a distortion already.
+class LensDistortion(EffectParameters, frozen=True):
+    """OpenCV's model, without units. Rendered ahead at no extra cost; free while streaming.
 
-    k1, k2: radial, p1, p2: tangential, without unit, as in OpenCV's model. calibrated: whether frames
-    report the coefficients."""
+    Raises EffectError if the distortion cannot be inverted over the whole image, or if the scene's lenses have a
+    distortion already.
+    """
 
-    k1: float = bounded(-0.15, -10.0, 10.0)
-    k2: float = bounded(0.03, -10.0, 10.0)
-    p1: float = bounded(0.001, -1.0, 1.0)
-    p2: float = bounded(-0.0005, -1.0, 1.0)
-    calibrated: bool = True
+    k1: Annotated[float, within(-10.0, 10.0, "radial")] = -0.15
+    k2: Annotated[float, within(-10.0, 10.0, "radial")] = 0.03
+    p1: Annotated[float, within(-1.0, 1.0, "tangential")] = 0.001
+    p2: Annotated[float, within(-1.0, 1.0, "tangential")] = -0.0005
+    calibrated: Annotated[bool, about("whether frames report the coefficients")] = True
 
-    kind = "lens"
+    kind: ClassVar[str] = "lens"
 
     def rendered(self, camera: Pinhole) -> Pinhole:
         if camera.distorted:

@@ -8,29 +8,26 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.motion import PERIOD_UNIT_S, phase_of
 from camera_node.synthetic.scene import Scene
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class LightSwitch(EffectParameters):
-    """Rendered ahead, static parts twice; free while streaming.
+class LightSwitch(EffectParameters, frozen=True):
+    """Rendered ahead, static parts twice; free while streaming. The period is rounded to a multiple of the scene's; the
+    lamps go out halfway, but for one."""
 
-    period_s: from one time the lamps go on to the next, rounded to a multiple of the scene's period; they
-    go out halfway. share: of the light's points, those farthest to one side; one always stays on.
-    azimuth_deg: of that side, from the x axis."""
+    period_s: Annotated[float, within(0.6, 600.0, "from one time the lamps go on to the next")] = 6.0
+    share: Annotated[float, within(0.0, 1.0, "of the light's points, those farthest to one side")] = 0.5
+    azimuth_deg: Annotated[float, within(-360.0, 360.0, "of that side, from the x axis")] = 0.0
 
-    period_s: float = bounded(6.0, 0.6, 600.0)
-    share: float = bounded(0.5, 0.0, 1.0)
-    azimuth_deg: float = bounded(0.0, -360.0, 360.0)
-
-    kind = "world"
+    kind: ClassVar[str] = "world"
 
     def extend(self, scene: Scene) -> Scene:
         base = scene.period_s if scene.moving else PERIOD_UNIT_S

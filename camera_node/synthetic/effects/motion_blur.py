@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, Renderer
 from camera_node.synthetic.render import Image, Rows
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class MotionBlur(EffectParameters):
+class MotionBlur(EffectParameters, frozen=True):
     """The time stamp is the middle of the exposure, so that blur adds no age. Displayed values are averaged,
-    as everywhere in this world. Costs ``samples`` renderings a frame, ahead; free while streaming.
+    as everywhere in this world. Costs ``samples`` renderings a frame, ahead; free while streaming."""
 
-    exposure_ms: time for which the shutter is open. samples: instants averaged within it."""
+    exposure_ms: Annotated[float, within(1e-6, 1000.0, "time for which the shutter is open")] = 20.0
+    samples: Annotated[int, within(1, 64, "instants averaged within it")] = 5
 
-    exposure_ms: float = bounded(20.0, 1e-6, 1000.0)
-    samples: int = bounded(5, 1, 64)
-
-    kind = "exposure"
+    kind: ClassVar[str] = "exposure"
 
     def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
         n = self.samples

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.motion import PERIOD_UNIT_S, bone_frames, phase_of
 from camera_node.synthetic.placement import MovingBody, Part
@@ -21,26 +20,25 @@ from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import capsule
 from camera_node.synthetic.textures import Stripes
 from freshfield.geometry import Array
+from freshfield.settings import within
 
 _JOINTS = 9  # of the arch
 
 
-@dataclass(frozen=True)
-class Occluder(EffectParameters):
+class Occluder(EffectParameters, frozen=True):
     """An arch over the target from the horizon to the zenith, which passes cameras at any height. Rendered
-    ahead (1 to 3 ms a frame); free while streaming.
+    ahead (1 to 3 ms a frame); free while streaming."""
 
-    period_s: one sweep there and back, rounded to a multiple of the scene's period. sweep_deg: angle to
-    either side. distance_share: distance from the target as a share of the cameras' (1 = at the cameras); as
-    far beyond the cameras if they look outward. thickness_share: diameter as a share of the cameras'
-    distance."""
+    period_s: Annotated[
+        float, within(0.6, 600.0, "one sweep there and back, rounded to a multiple of the scene's period")
+    ] = 6.0
+    sweep_deg: Annotated[float, within(0.0, 180.0, "angle to either side")] = 100.0
+    distance_share: Annotated[
+        float, within(0.05, 0.95, "distance from the target, of the cameras'; as far beyond them if they look outward")
+    ] = 0.7
+    thickness_share: Annotated[float, within(0.005, 0.3, "diameter, of the cameras' distance")] = 0.06
 
-    period_s: float = bounded(6.0, 0.6, 600.0)
-    sweep_deg: float = bounded(100.0, 0.0, 180.0)
-    distance_share: float = bounded(0.7, 0.05, 0.95)
-    thickness_share: float = bounded(0.06, 0.005, 0.3)
-
-    kind = "world"
+    kind: ClassVar[str] = "world"
 
     def extend(self, scene: Scene) -> Scene:
         target = np.asarray(scene.target, dtype=np.float64)

@@ -5,29 +5,25 @@ Images are taken from the true pose; only the reported pose is wrong.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, frame_rng
 from freshfield.geometry import Array, Pose, so3_exp
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class PoseNoise(EffectParameters):
-    """Rotations by a normal rotation vector in camera axes, translations in world axes. About .1 ms a frame.
+class PoseNoise(EffectParameters, frozen=True):
+    """Rotations by a normal rotation vector in camera axes, translations in world axes; standard deviations on each
+    axis. About .1 ms a frame."""
 
-    Standard deviations on each axis. translation_mm, rotation_deg: of the error of each frame, as of a
-    tracker or an arm. translation_bias_mm, rotation_bias_deg: of each camera's constant error, as of a
-    calibration."""
+    translation_mm: Annotated[float, within(0.0, 1e5, "error of each frame, as of a tracker or an arm")] = 5.0
+    rotation_deg: Annotated[float, within(0.0, 180.0, "the same of the rotation")] = 0.2
+    translation_bias_mm: Annotated[float, within(0.0, 1e5, "each camera's constant error, as of a calibration")] = 0.0
+    rotation_bias_deg: Annotated[float, within(0.0, 180.0, "the same of the rotation")] = 0.0
 
-    translation_mm: float = bounded(5.0, 0.0, 1e5)
-    rotation_deg: float = bounded(0.2, 0.0, 180.0)
-    translation_bias_mm: float = bounded(0.0, 0.0, 1e5)
-    rotation_bias_deg: float = bounded(0.0, 0.0, 180.0)
-
-    kind = "pose"
+    kind: ClassVar[str] = "pose"
 
     def start(self, rng: np.random.Generator) -> NoisyPose:
         return NoisyPose(self, rng)

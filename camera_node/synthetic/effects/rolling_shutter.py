@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, Renderer
 from camera_node.synthetic.render import Image, Rows
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class RollingShutter(EffectParameters):
+class RollingShutter(EffectParameters, frozen=True):
     """Row i of n is read ``(i / (n - 1) - stamped_share) * readout_ms`` after the time stamp. Costs a good
     part of a rendering for every row, ahead; free while streaming. To use it with motion_blur, list it after
-    motion_blur: each row is then blurred around its own instant.
+    motion_blur: each row is then blurred around its own instant. Errors of several rows at once are up to
+    readout_ms * rows_at_once / (2 * height)."""
 
-    readout_ms: from the top row to the bottom one. stamped_share: row that the time stamp belongs to, from
-    0 at the top to 1 at the bottom. rows_at_once: rows rendered at one instant, that of their middle; more is
-    faster, with errors up to readout_ms * rows_at_once / (2 * height)."""
+    readout_ms: Annotated[float, within(0.0, 1000.0, "from the top row to the bottom one")] = 20.0
+    stamped_share: Annotated[float, within(0.0, 1.0, "row that the time stamp belongs to; 0: top, 1: bottom")] = 0.5
+    rows_at_once: Annotated[int, within(1, 4096, "rows rendered at the instant of their middle; more is faster")] = 1
 
-    readout_ms: float = bounded(20.0, 0.0, 1000.0)
-    stamped_share: float = bounded(0.5, 0.0, 1.0)
-    rows_at_once: int = bounded(1, 1, 4096)
-
-    kind = "exposure"
+    kind: ClassVar[str] = "exposure"
 
     def row_offset_s(self, row: float, height: int) -> float:
         """Time from the time stamp to the reading of a row."""

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, frame_rng
 from camera_node.synthetic.render import Image
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class SensorNoise(EffectParameters):
+class SensorNoise(EffectParameters, frozen=True):
     """sigma^2 = read^2 + signal * 255 / full_well, in counts: the Gaussian limit of photon counting, good
-    above about ten electrons. About .6 ms for 128 x 128.
+    above about ten electrons. About .6 ms for 128 x 128."""
 
-    read_noise_counts: standard deviation in black, of 255 counts. full_well_electrons: charge at 255
-    counts, where the shot noise is 255 / sqrt(full_well_electrons); 0: no shot noise."""
+    read_noise_counts: Annotated[float, within(0.0, 1e4, "standard deviation in black, of 255 counts")] = 1.5
+    full_well_electrons: Annotated[
+        float, within(0.0, 1e12, "charge at 255 counts, where shot noise is 255 / sqrt(charge); 0: no shot noise")
+    ] = 4000.0
 
-    read_noise_counts: float = bounded(1.5, 0.0, 1e4)
-    full_well_electrons: float = bounded(4000.0, 0.0, 1e12)
-
-    kind = "image"
+    kind: ClassVar[str] = "image"
 
     def start(self, rng: np.random.Generator) -> NoisySensor:
         return NoisySensor(self, rng)

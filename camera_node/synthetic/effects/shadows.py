@@ -8,33 +8,33 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.lighting import Light, SpecularReflection, SurfacePoints, direct_light
 from camera_node.synthetic.placement import PlacedParts, place_parts
 from camera_node.synthetic.render import blocked
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class Shadows(EffectParameters):
+class Shadows(EffectParameters, frozen=True):
     """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
-    shadows.
+    shadows."""
 
-    opacity: share of the light that a moving part holds back; 1 is solid. light_points: points of the
-    scene's light that are traced, each standing for an equal share of all; 0 traces all. Fewer are faster and
-    make penumbrae coarser."""
+    opacity: Annotated[float, within(0.0, 1.0, "share of the light that a moving part holds back")] = 1.0
+    light_points: Annotated[
+        int,
+        within(
+            0, 1000, "points of the scene's light that are traced; fewer are faster, their penumbrae coarser; 0: all"
+        ),
+    ] = 0
 
-    opacity: float = bounded(1.0, 0.0, 1.0)
-    light_points: int = bounded(0, 0, 1000)
-
-    kind = "world"
+    kind: ClassVar[str] = "world"
 
     def extend(self, scene: Scene) -> Scene:
         return scene.with_world(dataclasses.replace(scene.world, shadows=self))

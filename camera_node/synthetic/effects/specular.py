@@ -9,29 +9,29 @@ masking-shadowing function", JCGT 2014, equation 99).
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters
 from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import normalize
 from freshfield.geometry import Array
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class Specular(EffectParameters):
+class Specular(EffectParameters, frozen=True):
     """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
-    highlights.
+    highlights."""
 
-    refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: width of the
-    GGX distribution, from .02 (polished) to 1 (matte)."""
+    refractive_index: Annotated[
+        float, within(1.0, 50.0, "of the coat; 1 reflects nothing, 1.5 is varnish or plastic")
+    ] = 1.5
+    roughness: Annotated[
+        float, within(0.02, 1.0, "width of the GGX distribution, from .02 (polished) to 1 (matte)")
+    ] = 0.2
 
-    refractive_index: float = bounded(1.5, 1.0, 50.0)
-    roughness: float = bounded(0.2, 0.02, 1.0)
-
-    kind = "world"
+    kind: ClassVar[str] = "world"
 
     def extend(self, scene: Scene) -> Scene:
         return scene.with_world(dataclasses.replace(scene.world, specular=self))

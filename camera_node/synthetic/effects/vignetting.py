@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.bounds import bounded
 from camera_node.synthetic.effects import EffectParameters, Renderer
 from camera_node.synthetic.render import Image, Rows
 from freshfield.geometry import Pinhole
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class Vignetting(EffectParameters):
+class Vignetting(EffectParameters, frozen=True):
     """Multiplies every pixel by cos(angle)^exponent, with the angle at which the lens, distorted or not, sees
-    it. Displayed values are scaled, as everywhere in this world. Rendered ahead; free while streaming.
+    it. Displayed values are scaled, as everywhere in this world. Rendered ahead; free while streaming."""
 
-    exponent: of the cosine of a ray's angle to the optical axis; 4: thin lens, 0: no vignetting."""
+    exponent: Annotated[
+        float, within(0.0, 64.0, "of the cosine of a ray's angle to the optical axis; 4: thin lens, 0: none")
+    ] = 4.0
 
-    exponent: float = bounded(4.0, 0.0, 64.0)
-
-    kind = "exposure"
+    kind: ClassVar[str] = "exposure"
 
     def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
         first, stop = (0, renderer.camera.height) if rows is None else rows

@@ -6,20 +6,21 @@ and more than 15 degrees from every other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
-from camera_node.bounds import bounded, one_of
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.person import COURSES, make_walk, walking_person
+from camera_node.synthetic.person import Course, make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import FOV_DEG, MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
+from freshfield.settings import within
 
 _TARGET = (0.0, 0.75, 0.90)
 _RADIUS_M = 3.2
@@ -33,14 +34,12 @@ _ANGLES_DEG = [(0.0, 20.0)] + [
 _LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 
-@dataclass(frozen=True)
-class Params(MovingParams):
-    """speed_m_per_s: mean speed of the person's parts; 0 stands still. course: loop, stops, reverses or
-    jumps, how the person walks it. people: 0 to 4, evenly along the loop."""
+class Params(MovingParams, frozen=True, kw_only=True):
+    """speed_m_per_s: of the person's parts. course: how the person walks the loop (``person.Walk``)."""
 
-    horizontal_fov_deg: float = bounded(64.0, *FOV_DEG)
-    course: str = one_of("loop", COURSES)
-    people: int = bounded(1, 0, 4)
+    horizontal_fov_deg: Fov = 64.0
+    course: Course = "loop"
+    people: Annotated[int, within(0, 4, "evenly along the loop")] = 1
 
 
 def build(params: Params) -> Scene:

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.bounds import bounded
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import Part, at, facing
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import FOV_DEG, BaseParams, Scene, pinhole
+from camera_node.synthetic.scene import BaseParams, Fov, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, Sphere
 from freshfield.geometry import Array
 
@@ -43,11 +42,10 @@ _ANGLES_DEG = (
 )
 
 
-@dataclass(frozen=True)
-class Params(BaseParams):
+class Params(BaseParams, frozen=True, kw_only=True):
     """bench: the tile lies on a workbench before a wall, with tools, boxes and scrap around it."""
 
-    horizontal_fov_deg: float = bounded(40.0, *FOV_DEG)
+    horizontal_fov_deg: Fov = 40.0
     bench: bool = False
 
 

@@ -8,18 +8,17 @@ and more than 15 degrees from every other.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from camera_node.bounds import bounded, one_of
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import FOV_DEG, MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere, capsule
 from freshfield.geometry import Array
@@ -46,14 +45,13 @@ _MOVERS_STREAM = 5  # random stream that draws which bodies there are
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
-@dataclass(frozen=True)
-class Params(MovingParams):
+class Params(MovingParams, frozen=True, kw_only=True):
     """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, only
     ``one`` of them, or ``person``, alone on one of four sides; motion_seed draws which. Camera positions then
     do not tell where something moves, but images do."""
 
-    horizontal_fov_deg: float = bounded(90.0, *FOV_DEG)
-    movers: str = one_of("both", ("both", "one", "person"))
+    horizontal_fov_deg: Fov = 90.0
+    movers: Literal["both", "one", "person"] = "both"
 
 
 def build(params: Params) -> Scene:

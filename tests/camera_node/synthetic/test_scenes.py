@@ -139,7 +139,7 @@ def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
     both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.moving_bodies[0]
     like = [body for body in both.world.moving_bodies if len(body.parts) == len(alone.parts)]
     assert [np.allclose(body.matrices(0.7), alone.matrices(0.7)) for body in like] == [True]
-    with pytest.raises(ValueError, match=r"movers is .none., expected one of both, one, person"):
+    with pytest.raises(ValueError, match=r"movers: expected .*one of both, one, person"):
         make_scene("tower", {"movers": "none"})
 
 
@@ -198,15 +198,15 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
     ("name", "params", "message"),
     [
         ("rooom", {}, "valid scenes: room, tile, tower"),
-        ("room", {"speed": 1.0}, "valid .default.: count .13., width"),
-        ("tile", {"speed_m_per_s": 1.0}, "unknown parameter 'speed_m_per_s'"),
-        ("room", {"count": 20}, "count is 20, expected 1 to 19"),
-        ("room", {"count": 0}, "count is 0, expected 1 to 19"),
-        ("tower", {"horizontal_fov_deg": 160}, "horizontal_fov_deg is 160, expected 5 to 150"),
+        ("room", {"speed": 1.0}, "unknown key; expected one of"),
+        ("tile", {"speed_m_per_s": 1.0}, "speed_m_per_s: unknown key"),
+        ("room", {"count": 20}, "count: expected .*1 to 19"),
+        ("room", {"count": 0}, "count: expected .*1 to 19"),
+        ("tower", {"horizontal_fov_deg": 160}, "horizontal_fov_deg: expected .*5 to 150"),
         ("room", {"width": 12.5}, "whole number"),
-        ("room", {"width": 5000}, "width is 5000, expected 8 to"),
-        ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s must be 0 or within"),
-        ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s must be 0 or within"),
+        ("room", {"width": 5000}, "width: expected .*8 to"),
+        ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s: expected .*0 to 8"),
+        ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s: expected .*0 to 8"),
         ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
         ("room", {"distortion": [0.0]}, "4 values"),
     ],
@@ -241,7 +241,7 @@ def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
         assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
     still = seen(speed_m_per_s=0.0)
     assert np.array_equal(seen(speed_m_per_s=0.0, motion_seed=4), still)
-    with pytest.raises(SceneError, match="motion_seed is -1, expected 0"):
+    with pytest.raises(SceneError, match=r"motion_seed: expected .*0"):
         seen(motion_seed=-1)
 
 
@@ -274,8 +274,8 @@ def test_a_walk_may_stop_reverse_or_jump_and_two_may_walk_it():
     assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
     assert same(seen(0.4, people=0), seen(0.9, people=0)) and not make_scene("room", {"people": 0}).moving
     for params, message in (
-        ({"course": "hops"}, "course is 'hops', expected one of loop"),
-        ({"people": 5}, "people is 5, expected 0 to 4"),
+        ({"course": "hops"}, "course: expected one of loop"),
+        ({"people": 5}, "people: expected .*0 to 4"),
     ):
         with pytest.raises(SceneError, match=message):
             make_scene("room", params)

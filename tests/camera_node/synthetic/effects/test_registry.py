@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pkgutil
 import subprocess
 import sys
@@ -112,7 +111,7 @@ def test_every_file_is_registered_and_follows_the_protocol():
     for name in fx.NAMES:
         cls = fx.effect_class(name)
         assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
-        assert dataclasses.is_dataclass(cls) and cls().in_truth is False
+        assert issubclass(cls, fx.EffectParameters) and cls().in_truth is False
 
 
 def test_the_held_out_camera_shows_the_truth_unless_in_truth():
@@ -139,26 +138,26 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
             "unknown effect 'smoke'; valid effects: clock_drift, exposure_drift, fog, hot_pixels, lens_dis",
         ),
         ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
-        ({"motion_blur": {"exposure_ms": 0}}, "effect motion_blur: exposure_ms is 0, expected 1e-06 to 1000"),
+        ({"motion_blur": {"exposure_ms": 0}}, "exposure_ms: expected .*1e-06 to 1000"),
         ({"motion_blur": {"samples": 2.5}}, "whole number"),
         ({"occluder": {"period_s": "6 s"}}, "expected a number"),
-        ({"clock_drift": {"drift_ppm": 1e9}}, "drift_ppm is 1000000000, expected -100000 to 100000"),
-        ({"sensor_noise": {"read_noise_counts": -1}}, "read_noise_counts is -1, expected 0 to 10000"),
-        ({"fog": {"visibility_m": 0}}, "effect fog: visibility_m is 0, expected 0.01 to 1000000"),
+        ({"clock_drift": {"drift_ppm": 1e9}}, "drift_ppm: expected .*-100000 to 100000"),
+        ({"sensor_noise": {"read_noise_counts": -1}}, "read_noise_counts: expected .*0 to 10000"),
+        ({"fog": {"visibility_m": 0}}, "visibility_m: expected .*0.01 to 1000000"),
         ({"fog": {"airlight": [0.5, 0.5]}}, "3 values"),
-        ({"fog": {"airlight": [0.5, 0.5, 1.5]}}, "airlight is 1.5, expected 0 to 1"),
-        ({"shadows": {"opacity": 1.5}}, "opacity is 1.5, expected 0 to 1"),
-        ({"specular": {"roughness": 0}}, "roughness is 0, expected 0.02 to 1"),
-        ({"specular": {"refractive_index": 0.9}}, "refractive_index is 0.9, expected 1 to 50"),
-        ({"rolling_shutter": {"rows_at_once": 0}}, "rows_at_once is 0, expected 1"),
-        ({"rolling_shutter": {"readout_ms": 5000}}, "readout_ms is 5000, expected 0 to 1000"),
-        ({"exposure_drift": {"period_s": 0}}, "period_s is 0, expected 0.01"),
+        ({"fog": {"airlight": [0.5, 0.5, 1.5]}}, "airlight.2.: expected .*0 to 1"),
+        ({"shadows": {"opacity": 1.5}}, "opacity: expected .*0 to 1"),
+        ({"specular": {"roughness": 0}}, "roughness: expected .*0.02 to 1"),
+        ({"specular": {"refractive_index": 0.9}}, "refractive_index: expected .*1 to 50"),
+        ({"rolling_shutter": {"rows_at_once": 0}}, "rows_at_once: expected .*1"),
+        ({"rolling_shutter": {"readout_ms": 5000}}, "readout_ms: expected .*0 to 1000"),
+        ({"exposure_drift": {"period_s": 0}}, "period_s: expected .*0.01"),
         ({"exposure_drift": {"amplitude_stops": float("inf")}}, "amplitude_stops"),
-        ({"vignetting": {"exponent": -1}}, "exponent is -1, expected 0 to 64"),
-        ({"lens_distortion": {"k1": 99}}, "k1 is 99, expected -10 to 10"),
+        ({"vignetting": {"exponent": -1}}, "exponent: expected .*0 to 64"),
+        ({"lens_distortion": {"k1": 99}}, "k1: expected .*-10 to 10"),
         ({"lens_distortion": {"calibrated": "no"}}, "lens_distortion.calibrated"),
-        ({"hot_pixels": {"hot_ppm": 2e6}}, "hot_ppm is 2000000, expected 0 to 1000000"),
-        ({"pose_noise": {"rotation_deg": 181}}, "rotation_deg is 181, expected 0 to 180"),
+        ({"hot_pixels": {"hot_ppm": 2e6}}, "hot_ppm: expected .*0 to 1000000"),
+        ({"pose_noise": {"rotation_deg": 181}}, "rotation_deg: expected .*0 to 180"),
         ({"pose_noise": {"translation_mm": float("nan")}}, "translation_mm"),
     ],
 )
