@@ -231,7 +231,7 @@ class Export:
         if not hasattr(snapshot, "gaussians"):
             raise ExportError(f"--splats: {self.source.name} has no Gaussians: use a run or fit of field splat")
         path.parent.mkdir(parents=True, exist_ok=True)
-        print(f"{path}: {write_splats(path, snapshot.shown, snapshot.box)} Gaussians", flush=True)
+        print(f"{path}: {write_splats(path, snapshot.gaussians, snapshot.box)} Gaussians", flush=True)
 
     def _colmap(self, folder: Path) -> None:
         from edge_server.export.colmap import write_model

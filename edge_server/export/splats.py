@@ -14,18 +14,9 @@ from numpy.typing import NDArray
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.kernels.project import (
-    BASE,
-    COLOR,
-    OPACITY,
-    POSITION,
-    QUATERNION,
-    SCALE,
-    SCALE_HIGH,
-    SCALE_LOW,
-    Gaussians,
-)
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
+from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW
 
 Y0 = 0.28209479177387814
 # Signs of harmonics 1 to 8: Kerbl et al. negate those of odd order.
@@ -54,7 +45,7 @@ def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
         "opacity": p[:, OPACITY],
         **_three(
             ("scale_0", "scale_1", "scale_2"),
-            np.clip(p[:, SCALE:QUATERNION], SCALE_LOW, SCALE_HIGH) + np.log(box.radius_m),
+            np.clip(p[:, SCALE:QUATERNION], LOG_SCALE_LOW, LOG_SCALE_HIGH) + np.log(box.radius_m),
         ),
     }
     turn = unit_quaternions(gaussians.params)

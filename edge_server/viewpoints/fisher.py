@@ -30,7 +30,7 @@ def information(
 
     Raises ViewpointError for view-dependent colors.
     """
-    gaussians = snapshot.shown
+    gaussians = snapshot.gaussians
     if gaussians.harmonics > 1:
         raise ViewpointError("Fisher information is known for splats with harmonics: 1 only")
     raster = RasterBuffers(snapshot.pool)

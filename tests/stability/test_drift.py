@@ -11,8 +11,8 @@ import pytest
 from edge_server.experiments.scenes.multiview_sequence import synthetic_sequence
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget
-from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.still_field import StillField
 
 UPDATES, FRESH_TIMES, NEAR_DB = 300, 15, 0.5
 LAST = range(UPDATES - 9, UPDATES + 1)
@@ -23,8 +23,8 @@ def test_three_hundred_updates_later_a_field_is_as_good_as_a_fresh_one() -> None
     """Of Gaussians: room is made for new ones at every update, and the rest of the scene must outlast it."""
     sequence, steps = synthetic_sequence("room", 13, 48, 15.0, speed_m_per_s=1.0), 20
 
-    def fresh(frame: int) -> SplatField:
-        field = SplatField(SplatSettings(gaussians=2048, start=1024))
+    def fresh(frame: int) -> StillField:
+        field = StillField(SplatSettings(gaussians=2048, start=1024))
         field.fit(sequence.training(frame), Budget(steps=FRESH_TIMES * steps))
         return field
 

@@ -31,10 +31,10 @@ from edge_server.fields.common.threads.thread_pool import Pool, cores
 from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.composite import SAVED, STRIP, STRIPS, SUMS
 from edge_server.fields.splat.kernels.project import BASE, HALF_HEIGHT, MEAN_Y, TILE
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.still_field import StillField
 from freshfield.machine_load import LoadMeter
 
 TABLES_MB = (1, 4, 64)
@@ -169,7 +169,7 @@ def _of_ngp(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) 
 
 
 def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
-    field = SplatField(SplatSettings(), pool)
+    field = StillField(SplatSettings(), pool)
     field.fit(views, Budget(steps=WARM_STEPS))  # until it has its largest size
     pool.seconds.clear()
     report = field.fit(views, Budget(steps=steps))
@@ -184,7 +184,7 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
     return _against(_floors_of_splat(gaussians, seen, pairs, strips, limits.around()), report, pool)
 
 
-def _counted(field: SplatField) -> tuple[int, int, int, int]:
+def _counted(field: StillField) -> tuple[int, int, int, int]:
     """Counts of a field's last step, on one image: Gaussians, visible Gaussians, pairs of a Gaussian and a
     tile, and strips reached by pairs that changed a pixel (the other pairs are hidden). Some of these strips
     may already have been opaque, so the floor is slightly too high if much is hidden."""

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import CAMERA, LENS, LIMITS, NEAR, ORIGIN, SIZE, TIME
+from edge_server.fields.common.kernels.camera import CAMERA, LENS, LIMITS, NEAR, ORIGIN, SIZE
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
 from freshfield.geometry import Pinhole
@@ -39,16 +39,10 @@ def ray_lengths(camera: Pinhole) -> NDArray[np.float32]:
     return (1.0 / np.maximum(camera.rays()[..., 2], 1e-6)).astype(np.float32)
 
 
-def camera_rows(
-    poses: Sequence[NDArray[np.float64]],
-    lenses: Sequence[Pinhole],
-    box: SceneBox,
-    times_s: Sequence[float] | None = None,
-) -> NDArray[np.float32]:
+def camera_rows(poses: Sequence[NDArray[np.float64]], lenses: Sequence[Pinhole], box: SceneBox) -> NDArray[np.float32]:
     """Cameras in scene units as the kernels read them, float32 (B, CAMERA).
 
     poses, lenses: camera-to-world (4, 4) in meters, and intrinsics, of each camera.
-    times_s: capture time of each image, seconds after the instant of the Gaussians' parameters; None: 0.
     """
     rows = np.zeros((len(poses), CAMERA), np.float32)
     for row, pose, lens in zip(rows, poses, lenses):
@@ -59,6 +53,4 @@ def camera_rows(
         row[LIMITS:NEAR] = _limits(lens)
         row[NEAR] = max(MIN_NEAR, box.near_m / box.radius_m)
         row[SIZE], row[SIZE + 1] = lens.width, lens.height
-    if times_s is not None:
-        rows[:, TIME] = times_s
     return rows

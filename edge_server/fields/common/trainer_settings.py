@@ -38,7 +38,6 @@ class FieldSettings:
     min_views: int = option(2, "no density where fewer cameras than this look (at most all of them)")
     rate_end: float = option(0.1, "share of the learning rate that is left at the end of a fit")
     epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
-    changed_share: float = option(0.25, "share of rays drawn from pixels that changed in the newest view")
     age_tau_ms: float = option(
         0.0, "age relative to the newest view, in ms, at which a view's weight is 1/e; 0: all weigh 1"
     )
@@ -62,7 +61,6 @@ class FieldSettings:
             ("rate_end", 1e-4, 1.0),
             # Adam divides by epsilon where there is no gradient to speak of.
             ("epsilon", 1e-10, 1e3),
-            ("changed_share", 0.0, 1.0),
             ("age_tau_ms", 0.0, 1e9),
             ("mask_stale_ms", 0.0, 1e9),
             ("mask_grow_px_s", 0.0, 1e6),
@@ -108,6 +106,7 @@ class TrainerSettings(FieldSettings):
     cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
     distortion: float = option(1e-2, "weight of the distortion loss, which concentrates density along rays")
+    changed_share: float = option(0.25, "share of rays drawn from pixels that changed in the newest view")
     depth_guide: float | None = option(
         None,
         "weight of the penalty on density away from the depth that a plane sweep of the images finds; 0: "
@@ -131,6 +130,7 @@ class TrainerSettings(FieldSettings):
             ("cells", 8, 256),
             ("rate_net", 0.0, 10.0),
             ("distortion", 0.0, 1e3),
+            ("changed_share", 0.0, 1.0),
             ("depth_guide", 0.0, 1e3),
             ("guide_steps", 1, 1 << 30),
             ("refine_m", 0.0, 1.0),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import SIZE
+from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
@@ -42,13 +43,14 @@ class RasterBuffers:
         self,
         cams: NDArray[np.float32],
         gaussians: Gaussians,
-        wanted: Sequence[NDArray[np.uint8] | None],
+        wanted: Sequence[NDArray[np.uint8] | None] | None = None,
         differentiate: bool = True,
     ) -> None:
         """Project the Gaussians into the cameras, and list them by tile.
 
         cams: float32 (B, CAMERA), see ``camera_rows``.
-        wanted: for each camera uint8 (tiles,), 1 for tiles to list, or None for all tiles.
+        wanted: for each camera uint8 (tiles,), 1 for tiles to list, or None for all tiles; None instead of
+            the list: all tiles of all cameras.
         differentiate: whether to make room for gradients.
         """
         count, slots = len(gaussians.params), len(cams)
@@ -56,8 +58,9 @@ class RasterBuffers:
         self.columns, self.rows = (-(-sizes[:, k] // TILE) for k in (0, 1))
         tiles = int((self.columns * self.rows).max())
         self._allocate(slots, count, tiles)
-        self._all_wanted = all(mask is None for mask in wanted)
-        for b, mask in enumerate(wanted):
+        masks = wanted if wanted is not None else [None] * slots
+        self._all_wanted = all(mask is None for mask in masks)
+        for b, mask in enumerate(masks):
             total = int(self.columns[b] * self.rows[b])
             self.lists.wanted[b, :total] = 1 if mask is None else mask
         self.pool.run(project, cams, gaussians, count, self.projected, self.tiles)
@@ -122,3 +125,22 @@ class RasterBuffers:
             begins=np.zeros((threads, room), np.int32),
             binned=np.zeros((threads, 2, pairs), np.int32),
         )
+
+
+def unweighted_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
+    """For each view the tiles with pixels of weight 0, uint8 (tiles,), or None where there are none."""
+    masks: list[NDArray[np.uint8] | None] = [None] * len(data.size)
+    if data.weight.size:
+        for k, ((w, h), first) in enumerate(zip(data.size, data.first)):
+            silent = data.weight[first : first + w * h].reshape(h, w) == 0
+            masks[k] = _tile_mask(silent) if silent.any() else None
+    return masks
+
+
+def _tile_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    h, w = mask.shape
+    rows, columns = -(-h // TILE), -(-w // TILE)
+    whole = np.zeros((rows * TILE, columns * TILE), np.uint8)
+    whole[:h, :w] = mask
+    tiles: NDArray[np.uint8] = whole.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).reshape(-1)
+    return tiles

@@ -15,7 +15,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
-from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.settings import ASPECT
 from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalize, quaternion_to_matrix
 
 STEEPEST = 0.1  # cosine between ray and normal below which a plane has no depth
@@ -51,21 +51,20 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def plane_depth(
-    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32], lens: Pinhole, slot: int = 0
+    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32], lens: Pinhole
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) along the rays, scene units, and opacity (H, W). Depth is 0 where the plane is seen at too
     flat an angle.
 
-    raster: buffers whose last ``project_and_bin`` had this camera at ``slot``.
+    raster: buffers whose last ``project_and_bin`` had this camera first.
     camera: float32 (CAMERA,), its row.
     """
     width, height = int(camera[SIZE]), int(camera[SIZE + 1])
     out = np.zeros((height, width, 5), np.float32)
     raster.pool.run(
         render_planes,
-        slot,
-        int(raster.columns[slot]),
-        int(raster.rows[slot]),
+        int(raster.columns[0]),
+        int(raster.rows[0]),
         width,
         height,
         raster.projected,
@@ -83,28 +82,25 @@ def plane_depth(
     return np.where(depth > 0, depth, 0.0).astype(np.float32), opacity.astype(np.float32)
 
 
-def flatten(cloud: GaussianCloud, settings: SplatSettings) -> None:
-    """One step of a loss that is linear in the logarithm of each Gaussian's smallest scale."""
+def flatten(cloud: GaussianCloud, by: float) -> None:
+    """Decrease the logarithm of each Gaussian's smallest scale by ``by``: a step of a loss that is linear in it."""
     scale = cloud.params[:, SCALE : SCALE + 3]
     rows, least = np.arange(len(scale)), np.argmin(scale, axis=1)
-    thinnest = scale.max(axis=1) - np.float32(np.log(settings.aspect))
-    scale[rows, least] = np.maximum(
-        scale[rows, least] - np.float32(settings.flatten), np.minimum(thinnest, scale[rows, least])
-    )
+    thinnest = scale.max(axis=1) - np.float32(np.log(ASPECT))
+    scale[rows, least] = np.maximum(scale[rows, least] - np.float32(by), np.minimum(thinnest, scale[rows, least]))
 
 
 def align(
-    cloud: GaussianCloud, settings: SplatSettings, raster: RasterBuffers, camera: NDArray[np.float32], lens: Pinhole
+    cloud: GaussianCloud, share: float, raster: RasterBuffers, camera: NDArray[np.float32], lens: Pinhole
 ) -> None:
-    """Turn the Gaussians that a camera sees towards the normals of the depth they render together. camera:
-    its row; ``raster`` has the whole image of it at slot 0."""
+    """Turn the Gaussians that a camera sees by ``share`` of the way to the normals of the depth that they render
+    together. camera: its row; ``raster`` has the whole image of it at slot 0."""
     gaussians = cloud.gaussians()
     depth, opacity = plane_depth(raster, gaussians, camera, lens)
     height, width = depth.shape
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     raster.pool.run(
         accumulate_normals,
-        0,
         int(raster.columns[0]),
         int(raster.rows[0]),
         width,
@@ -128,7 +124,7 @@ def align(
     normal = gaussian_normals(cloud.params[which])
     # A normal and its opposite are one plane.
     wanted *= np.where((wanted * normal).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
-    half_turn = 0.5 * settings.align * np.cross(normal, wanted)
+    half_turn = 0.5 * share * np.cross(normal, wanted)
     step = np.concatenate([np.ones((len(half_turn), 1)), half_turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
     cloud.params[which, part] = quaternion_normalize(quaternion_multiply(step, unit_quaternions(cloud.params[which])))

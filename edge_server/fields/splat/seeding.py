@@ -15,9 +15,7 @@ from edge_server.fields.common.supervision import pack_cameras, supervising_view
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.settings import SplatSettings
-
-_CANDIDATES = 4  # rays tried for each Gaussian: those that meet no surface are discarded
+from edge_server.fields.splat.settings import SEED_CANDIDATES, SEED_OPACITY, SEED_SCALE, SplatSettings
 
 
 def seed_gaussians(
@@ -44,18 +42,12 @@ def seed_gaussians(
     where = _candidate_pixels(settings, views, data, masks)
     if count <= 0 or where.size == 0:
         return np.zeros((0, width), np.float32)
-    drawn = rng.choice(where, min(_CANDIDATES * count, where.size), replace=False)
+    drawn = rng.choice(where, min(SEED_CANDIDATES * count, where.size), replace=False)
     view_of = np.searchsorted(data.first, drawn, side="right") - 1
     local = drawn - data.first[view_of]
-    if settings.seed_cells:
-        cells = max(settings.seed_cells, 8)
-        distance = sweep_depths(
-            pool, box, data, view_of, local, score_grid(settings, pool, box, views, moved, data, cells), cells
-        )
-    else:
-        middle = box.distance_m / box.radius_m
-        near = max(0.01, box.near_m / box.radius_m)
-        distance = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size)).astype(np.float32)
+    cells = settings.seed_cells
+    scores = score_grid(settings, pool, box, views, moved, data, cells)
+    distance = sweep_depths(pool, box, data, view_of, local, scores, cells)
     found = np.flatnonzero(distance > 0)[:count]
     params = np.zeros((found.size, width), np.float32)
     if found.size == 0:
@@ -70,11 +62,11 @@ def seed_gaussians(
         rays = lens.rays(np.stack([x + 0.5, y + 0.5], axis=-1)) @ data.rotation[v].T
         params[mine, :3] = data.origin[v] + rays * distance[mine, None]
         params[mine, COLOR : COLOR + 3] = views[v].image[y, x, :3] / 255.0
-        size = settings.seed_scale * spacing * distance[mine] / focal[v]
+        size = SEED_SCALE * spacing * distance[mine] / focal[v]
         params[mine, SCALE : SCALE + 3] = np.log(size)[:, None]
     params[:, QUATERNION] = 1.0
-    params[:, OPACITY] = np.log(settings.seed_opacity / (1.0 - settings.seed_opacity))
-    clamp_gaussians(params, *settings.scale_bounds)
+    params[:, OPACITY] = np.log(SEED_OPACITY / (1.0 - SEED_OPACITY))
+    clamp_gaussians(params)
     return params
 
 

@@ -1,113 +1,85 @@
-"""Settings of the Gaussian field: one dataclass whose texts become help."""
+"""Settings of the Gaussian field: options that a scenario may set, and the numbers that were tuned once.
+
+The texts of the options become help. Numbers of the layers stand in ``layers.settings``.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from edge_server.fields.common.trainer_settings import FieldSettings, option
+
+# Seeding: scale of new Gaussians in distances to their neighbors, their opacity, and pixels tried for each,
+# because those whose rays meet no surface are discarded.
+SEED_SCALE, SEED_OPACITY, SEED_CANDIDATES = 0.5, 0.3, 4
+
+# Learning rates at the start of a fit: positions in pixels; logarithms of scales; quaternions; opacities
+# before the sigmoid; colors, and further spherical harmonics.
+RATE_POSITION, RATE_SCALE, RATE_ROTATION, RATE_OPACITY = 0.4, 0.08, 0.02, 0.15
+RATE_COLOR, RATE_HARMONICS = 0.02, 0.002
+# A Gaussian trains at full rates for SETTLE_STEPS steps; then they fall as 1 / steps, down to RATE_SETTLED.
+SETTLE_STEPS, RATE_SETTLED = 300.0, 0.1
+
+# Density control: share of Gaussians that are split at once, those of largest gradient first; opacity below
+# which they are removed; share of an image's width above which they are split first.
+GROW_SHARE, PRUNE_OPACITY, WIDEST = 0.15, 0.02, 0.2
+SPLIT_SHRINK = 1.6  # divides the scales of both halves of a split Gaussian (Kerbl et al.)
+SHARP_PX = 1.0  # Gaussians about this wide in the image are cloned without shrinking
+
+# Bounds of parameters.
+POSITION_LIMIT = 100.0  # scene units
+LARGEST, ASPECT = 0.5, 20.0  # standard deviation, times the distance from the center; longest to shortest axis
+LOG_SCALE_LOW, LOG_SCALE_HIGH = -12.0, 4.0
+RAW_OPACITY_LIMIT = 9.0  # before the sigmoid: 1.2e-4 to .99988
+COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's color may leave [0, 1] a little: rendered ones are clamped
+GRADIENT_LIMIT = 1e6
+# Of what a Gaussian adds to one pixel. At most: no Gaussian hides everything, and an alpha that is clamped has
+# no gradient. At least: a Gaussian ends where its alpha is lower.
+ALPHA_MAX, ALPHA_MIN = 0.99, 1.0 / 255.0
+
+ALIGN_EVERY = 5  # steps between two alignments with the rendered normals
 
 
 @dataclass(frozen=True)
 class SplatSettings(FieldSettings):
-    """The options of a ``SplatField``. Lengths in meters; None means: found from the cameras."""
+    """The options of a Gaussian field. Lengths in meters; None means: found from the cameras."""
 
     name = "splat"
-    has_cuda = True
 
     gaussians: int = option(8192, "largest number of Gaussians")
     start: int = option(4096, "number of Gaussians at the start, at most ``gaussians``")
     harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
-    views_a_step: int = option(1, "number of views that a training step uses")
-    loss: str = option("mse", "color loss: mse (squared errors) or l1 (absolute errors)")
-    dssim: float = option(0.0, "weight of (1 - SSIM) / 2, tile by tile (Kerbl et al.: 0.2 beside l1)")
-    seed_cells: int = option(64, "cells a side of the grid that gives initial positions; 0: random ones")
-    seed_scale: float = option(0.5, "initial scale of Gaussians, in distances to their neighbors")
-    seed_opacity: float = option(0.3, "opacity of new Gaussians")
-    near_m: float | None = option(
-        None, "near plane, meters: nothing closer to a camera is rendered; None: found from the cameras"
-    )
-    min_views: int = option(2, "no Gaussian starts where fewer cameras than this look")
-    rate_position: float = option(0.4, "learning rate of positions at the start of a fit, in pixels")
-    rate_scale: float = option(0.08, "learning rate of the logarithms of scales")
-    rate_rotation: float = option(0.02, "learning rate of quaternions")
-    rate_opacity: float = option(0.15, "learning rate of opacities before the sigmoid")
-    rate_color: float = option(0.02, "learning rate of colors; a tenth of it for harmonics")
-    settle_after: float = option(300.0, "steps for which a Gaussian trains at full rates; then they fall as 1 / steps")
-    rate_settled: float = option(0.1, "minimum share of the full rates, reached after ``settle_after``")
+    seed_cells: int = option(64, "cells a side of the grid that gives initial positions")
     epsilon: float = option(1e-3, "Adam's epsilon, on gradients summed over pixels")
-    fade: float = option(0.0, "penalty on opacity: removes Gaussians that no view needs")
     densify_every: int = option(
         50, "minimum number of steps between densifications, and at least one pass over all views"
     )
-    grow: float = option(0.15, "share of Gaussians split by a densification, largest gradient first")
-    prune: float = option(0.02, "opacity below which Gaussians are removed")
-    opacity_reset: int = option(0, "steps after which opacities are lowered to a tenth; 0: never")
-    largest: float = option(0.5, "largest standard deviation in scene units (half the box's side is 1)")
-    widest: float = option(0.2, "share of an image's width above which Gaussians are split first")
-    aspect: float = option(20.0, "largest ratio of longest to shortest axis")
-    changed_share: float = option(0.25, "share of steps that train only on tiles that changed")
-    follow: int = option(8, "steps at the start of an update that track moving Gaussians; 0: none")
-    reseed: float = option(0.25, "largest share of ``gaussians`` that is seeded anew where something moved")
     flatten: float = option(0.0, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none")
     align: float = option(
         0.0, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3); 0: none"
     )
-    align_every: int = option(5, "steps between two alignments")
     layers: bool = option(
-        False, "plates, a static field and a moving set instead of one field, where cameras stand still"
+        False, "background plates, a still field and a moving set instead of one field, where cameras stand still"
     )
 
     def __post_init__(self) -> None:
         self._within(
             ("gaussians", 1, 1 << 20),
             ("start", 1, 1 << 20),
-            ("views_a_step", 1, 64),
-            ("seed_cells", 0, 256),
+            ("seed_cells", 8, 256),
             ("densify_every", 1, 1 << 30),
-            ("opacity_reset", 0, 1 << 30),
-            ("follow", 0, 1000),
-            ("settle_after", 1.0, 1e9),
-            ("rate_settled", 0.0, 1.0),
-            ("dssim", 0.0, 1e3),
-            ("seed_scale", 0.01, 100.0),
-            ("seed_opacity", 0.001, 0.99),
-            ("fade", 0.0, 1e3),
-            ("grow", 0.0, 1.0),
-            ("prune", 0.0, 0.9),
-            ("largest", 1e-3, 50.0),
-            ("widest", 1e-3, 1e3),
-            ("aspect", 1.0, 1e4),
-            ("reseed", 0.0, 1.0),
-            ("rate_position", 0.0, 100.0),
-            ("rate_scale", 0.0, 10.0),
-            ("rate_rotation", 0.0, 10.0),
-            ("rate_opacity", 0.0, 10.0),
-            ("rate_color", 0.0, 10.0),
             ("flatten", 0.0, 1.0),
             ("align", 0.0, 1.0),
-            ("align_every", 1, 1 << 30),
         )
-        for name, allowed in (("harmonics", (1, 4, 9)), ("loss", ("mse", "l1"))):
-            if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"splat: {name} must be one of {', '.join(map(str, allowed))}, not {getattr(self, name)!r}"
-                )
-        if self.layers and self.device == "cuda":
-            raise ValueError("splat: layers work on the CPU: device must be cpu or auto, not cuda")
+        if self.harmonics not in (1, 4, 9):
+            raise ValueError(f"splat: harmonics must be one of 1, 4, 9, not {self.harmonics!r}")
         super().__post_init__()
 
     @property
     def planar(self) -> bool:
         """Whether Gaussians are made flat, so that depth is rendered from their planes."""
         return self.flatten > 0.0 or self.align > 0.0
-
-    @property
-    def scale_bounds(self) -> tuple[np.float32, np.float32]:
-        """``largest``, and the logarithm of ``aspect``, as ``kernels.optimizer_step`` takes them."""
-        return np.float32(self.largest), np.float32(np.log(self.aspect))
 
 
 SETTINGS = SplatSettings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_tiles
 from freshfield.geometry import Pinhole
 
-MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
@@ -25,9 +24,6 @@ SOLID = 0.5  # opacity above which a pixel shows a surface
 class SplatSnapshot:
     """Gaussians and cameras, never written after construction.
 
-    gaussians: at ``now_ns``, with the velocities of those that move.
-    now_ns: the instant of the newest view; None before the first.
-    ahead_s: how much later the instant that is rendered is.
     planar: the Gaussians are flat, so ``render_surface`` renders depth from their planes.
     """
 
@@ -37,29 +33,15 @@ class SplatSnapshot:
     cameras: tuple[View, ...]
     pool: Pool
     step: int
-    now_ns: int | None = None
-    ahead_s: float = 0.0
     planar: bool = False
 
-    def at(self, present_ns: int) -> SplatSnapshot:
-        """The snapshot with its moving Gaussians extrapolated to another instant."""
-        ahead_s = 0.0 if self.now_ns is None else (present_ns - self.now_ns) / 1e9
-        ahead_s = min(max(ahead_s, 0.0), MAX_AHEAD_S)
-        return self if ahead_s == self.ahead_s else replace(self, ahead_s=ahead_s)
+    def at(self, present_ns: int | None) -> Self:
+        """The same: nothing moves."""
+        return self
 
     def copied(self) -> SplatSnapshot:
         """See ``stepped_field.StepSnapshot``."""
-        params, velocity = self.gaussians.params.copy(), self.gaussians.velocity.copy()
-        return replace(self, gaussians=self.gaussians._replace(params=params, velocity=velocity))
-
-    @cached_property
-    def shown(self) -> Gaussians:
-        """The Gaussians at the instant that is rendered."""
-        if self.ahead_s == 0.0 or not self.gaussians.velocity.any():
-            return self.gaussians
-        params, velocity = self.gaussians.params.copy(), self.gaussians.velocity
-        params[:, :3] += velocity * np.float32(self.ahead_s)
-        return self.gaussians._replace(params=params, velocity=np.zeros_like(velocity))
+        return replace(self, gaussians=self.gaussians._replace(params=self.gaussians.params.copy()))
 
     def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """As ``render``, with the depth at which rays meet the Gaussians' planes (see ``planar``)."""
@@ -67,7 +49,7 @@ class SplatSnapshot:
 
         image = self.render(camera_to_world, intrinsics)
         raster, cams = self._project(camera_to_world, intrinsics)
-        depth, opacity = plane_depth(raster, self.shown, cams[0], intrinsics)
+        depth, opacity = plane_depth(raster, self.gaussians, cams[0], intrinsics)
         return Rendering(image.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
@@ -97,7 +79,7 @@ class SplatSnapshot:
     def _project(self, pose: NDArray[np.float64], lens: Pinhole) -> tuple[RasterBuffers, NDArray[np.float32]]:
         """Fresh buffers with the Gaussians that one camera sees, and that camera's rows."""
         raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
-        raster.project_and_bin(cams, self.shown, [None], differentiate=False)
+        raster.project_and_bin(cams, self.gaussians, differentiate=False)
         return raster, cams
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -124,7 +124,7 @@ def test_trajectories_keep_nanoseconds(tmp_path):
 def test_splats_stand_as_viewers_expect_them(tmp_path, harmonics):
     params = RNG.normal(size=(30, 14 + 3 * (harmonics - 1))).astype(np.float32)
     box = SceneBox((1.0, -2.0, 0.5), 2.5, 0.1, False, 3.0, 0.01)
-    gaussians = Gaussians(params, harmonics, np.zeros((30, 3), np.float32))
+    gaussians = Gaussians(params, harmonics)
     assert write_splats(tmp_path / "s.ply", gaussians, box) == 30
     data = read_floats(tmp_path / "s.ply")
     rest = [f"f_rest_{k}" for k in range(3 * (harmonics - 1))]

@@ -11,15 +11,15 @@ import torch
 from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.project import BASE
 from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.fields.splat.still_field import StillField
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.fisher import FisherRF, information
 from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
-from tests.edge_server.fields.splat.kernels.small_cloud import BOX, random_params, static
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, random_params
 from tests.edge_server.fields.splat.small import TINY
 
 LENS = Pinhole(9, 7, 9.0, 9.5, 4.3, 3.6)
@@ -29,7 +29,7 @@ POSES = [look_at(eye, (0.05, 0.0, 0.1)) for eye in ((1.0, -2.5, 0.8), (-0.4, -1.
 
 
 def snapshot(params, threads=1):
-    return SplatSnapshot(BOX, static(params), BACK, (), Pool(threads, 0), 1)
+    return SplatSnapshot(BOX, as_gaussians(params), BACK, (), Pool(threads, 0), 1)
 
 
 def oracle(params, pose, lens):
@@ -91,7 +91,7 @@ def test_fisher_works_on_a_field_that_is_being_captured():
     candidates = half_hemisphere((0, 0, 0), 2.0, lens, 6)
     rng = np.random.default_rng(0)
     views = [View(f"v{k}", rng.integers(0, 255, (32, 32, 3), np.uint8), candidates.poses[k], lens) for k in (0, 3)]
-    field = SplatField(TINY)
+    field = StillField(TINY)
     field.fit(views, Budget(steps=5))
     state = CaptureState(candidates, 4, rng, lambda given: field, [0, 3], views)
     values = FisherRF().values(state)

@@ -7,8 +7,8 @@ import numpy as np
 from edge_server.fields.common.kernels.jit import part
 
 # Columns: the rotation's nine numbers first. LENS: fx, fy, cx, cy, k1, k2, p1, p2. LIMITS: lowest and highest
-# x / z, then y / z. SIZE: width, height. TIME: seconds from the instant of the Gaussians' parameters.
-ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
+# x / z, then y / z. SIZE: width, height.
+ORIGIN, LENS, LIMITS, NEAR, SIZE, CAMERA = 9, 12, 20, 24, 25, 27
 
 _F1, _F2 = np.float32(1.0), np.float32(2.0)
 
@@ -46,7 +46,6 @@ def load_camera(cams, b):
         cams[b, 24],
         cams[b, 25],
         cams[b, 26],
-        cams[b, 27],
     )
 
 

@@ -18,7 +18,6 @@ from numba.extending import intrinsic
 from edge_server.fields.common.kernels.jit import part
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
-    ALPHA_MIN,
     CONIC_A,
     CONIC_B,
     CONIC_C,
@@ -40,8 +39,8 @@ from edge_server.fields.splat.kernels.simd_vectors import (
     mask_and,
     require_contiguous,
 )
+from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
 
-ALPHA_MAX = 0.99  # in both passes: no Gaussian hides everything, and a clamped alpha has no gradient
 STOP = 1e-4  # transmittance below which compositing stops
 SUMS = 9  # sums that the backward pass gathers a pair: see ``project_backward``
 

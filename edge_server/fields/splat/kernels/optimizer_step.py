@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite, log32
+from edge_server.fields.common.kernels.simd import draw, is_finite, log32
+from edge_server.fields.common.training_schedule import BETA1, BETA2
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,
@@ -25,15 +23,24 @@ from edge_server.fields.splat.kernels.project_backward import (
     load_block,
     project_backward,
 )
-from edge_server.fields.splat.kernels.simd_vectors import LANES, Vector, mask_and, require_contiguous
+from edge_server.fields.splat.settings import (
+    ASPECT,
+    COLOR_HIGH,
+    COLOR_LOW,
+    GRADIENT_LIMIT,
+    LARGEST,
+    POSITION_LIMIT,
+    RATE_SETTLED,
+    RAW_OPACITY_LIMIT,
+    SETTLE_STEPS,
+)
 
-GRADIENT_LIMIT = 1e6
-OPACITY_LIMIT = 9.0  # raw: 1.2e-4 to .99988
-COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's color may leave [0, 1] a little: rendered ones are clamped
-POSITION_LIMIT = 100.0  # scene units
-DEAD = -9.0  # raw opacity given to a Gaussian that was not finite: invisible, and soon pruned
+DEAD = -RAW_OPACITY_LIMIT  # raw opacity of a Gaussian that was not finite: invisible, and soon pruned
+_AGES = 4096  # steps after which Adam's bias correction no longer matters
 
 _F0, _F1, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
+_BETA1, _BETA2 = np.float32(BETA1), np.float32(BETA2)
+_LOG_ASPECT = np.float32(np.log(ASPECT))
 
 
 class OptimizerState(NamedTuple):
@@ -60,23 +67,24 @@ class AdamParameters(NamedTuple):
     rates: float32 (P,), learning rates.
     corrections: float32 (A, 3) by age, the last row for all higher ages: Adam's two bias corrections
         1 / (1 - beta^t), and the share of the rates that is left.
-    fade: penalty on opacity, loss per unit of opacity.
-    largest: largest scale, scene units.
-    thinnest: logarithm of the largest ratio of longest to shortest axis.
+    epsilon: Adam's.
     """
 
     rates: NDArray[np.float32]
     corrections: NDArray[np.float32]
-    beta1: np.float32
-    beta2: np.float32
     epsilon: np.float32
-    fade: np.float32
-    largest: np.float32
-    thinnest: np.float32
+
+
+@cache
+def age_corrections() -> NDArray[np.float32]:
+    """``AdamParameters.corrections``, (4096, 3)."""
+    age = np.maximum(np.arange(_AGES), 1)
+    decay = np.maximum(np.minimum(SETTLE_STEPS / age, 1.0), RATE_SETTLED)
+    return np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), decay], axis=-1).astype(np.float32)
 
 
 @part
-def clamp_gaussian(params, i, largest, thinnest):
+def clamp_gaussian(params, i):
     """Clamp Gaussian i to its bounds: finite, not a needle, not a giant."""
     row = params[i]
     total = _F0
@@ -91,10 +99,10 @@ def clamp_gaussian(params, i, largest, thinnest):
         x = min(max(row[POSITION + k], np.float32(-POSITION_LIMIT)), np.float32(POSITION_LIMIT))
         row[POSITION + k] = x
         far = max(far, abs(x))
-    top = log32(largest * far)
+    top = log32(np.float32(LARGEST) * far)
     for k in range(3):
         row[SCALE + k] = min(row[SCALE + k], top)
-    low = max(row[SCALE], max(row[SCALE + 1], row[SCALE + 2])) - thinnest
+    low = max(row[SCALE], max(row[SCALE + 1], row[SCALE + 2])) - _LOG_ASPECT
     for k in range(3):
         row[SCALE + k] = max(row[SCALE + k], max(low, np.float32(-11.0)))
     square = _F0
@@ -103,7 +111,7 @@ def clamp_gaussian(params, i, largest, thinnest):
     if not (square > np.float32(1e-6) and square < np.float32(1e6)):
         row[QUATERNION] = _F1
         row[QUATERNION + 1] = row[QUATERNION + 2] = row[QUATERNION + 3] = _F0
-    row[OPACITY] = min(max(row[OPACITY], np.float32(-OPACITY_LIMIT)), np.float32(OPACITY_LIMIT))
+    row[OPACITY] = min(max(row[OPACITY], np.float32(-RAW_OPACITY_LIMIT)), np.float32(RAW_OPACITY_LIMIT))
     for k in range(COLOR, row.size):
         low_color = np.float32(COLOR_LOW) if k < BASE else np.float32(-1.0)
         high_color = np.float32(COLOR_HIGH) if k < BASE else _F1
@@ -111,10 +119,10 @@ def clamp_gaussian(params, i, largest, thinnest):
 
 
 @kernel
-def clamp_gaussians(params, largest, thinnest):
-    """``clamp_gaussian`` for all: params, float32 (N, P). largest, thinnest: see ``AdamParameters``."""
+def clamp_gaussians(params):
+    """``clamp_gaussian`` for all: params, float32 (N, P)."""
     for i in range(params.shape[0]):
-        clamp_gaussian(params, i, largest, thinnest)
+        clamp_gaussian(params, i)
 
 
 @part
@@ -129,9 +137,6 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
             for k in range(width):
                 g[at + k] = _NAN
             continue
-        if rule.fade > _F0:
-            alpha = _F1 / (_F1 + np.exp(-params[i, OPACITY]))
-            s[GRADIENT + OPACITY * BLOCK + j] += rule.fade * alpha * (_F1 - alpha)
         moments.age[i] += 1
         age = min(np.int64(moments.age[i]), np.int64(rule.corrections.shape[0] - 1))
         rate, second = rule.corrections[age, 0] * rule.corrections[age, 2], rule.corrections[age, 1]
@@ -145,71 +150,23 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
     return lost
 
 
-@intrinsic
-def _adam_vectors(
-    typingctx: Any,
-    g: Any,
-    third: Any,
-    params: Any,
-    m: Any,
-    v: Any,
-    first: Any,
-    vectors: Any,
-    beta1: Any,
-    beta2: Any,
-    epsilon: Any,
-) -> Any:
-    """``_adam`` for the first ``vectors`` * LANES of its parameters."""
-    require_contiguous(g, params, m, v)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        g_data, params_data, m_data, v_data = (
-            context.make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 2, 3, 4)
-        )
-        _, third, _, _, _, first, vectors, *numbers = args
-        i64 = ir.IntType(64)
-        beta1, beta2, epsilon = (Vector.broadcast(builder, number) for number in numbers)
-        with cgutils.for_range(builder, vectors) as loop:
-            k = builder.mul(loop.index, i64(LANES))
-            here = builder.add(first, k)
-            places = [builder.gep(data, [here]) for data in (params_data, m_data, v_data)]
-            old, old_m, old_v = (Vector.load(builder, place) for place in places)
-            given, rate, second = (
-                Vector.load(builder, builder.gep(builder.gep(g_data, [builder.mul(third, i64(n))]), [k]))
-                for n in range(3)
-            )
-            d = given.maximum(-GRADIENT_LIMIT).minimum(GRADIENT_LIMIT)
-            new_m = beta1 * old_m + beta1.one_minus() * d
-            new_v = beta2 * old_v + beta2.one_minus() * d * d
-            sound = mask_and(builder, new_m.is_finite(), new_v.is_finite())
-            new_m, new_v = new_m.where(sound), new_v.where(sound)
-            step = rate * new_m / ((new_v * second).sqrt() + epsilon)
-            moves = given.is_finite()
-            for place, new, before in zip(places, (old - step, new_m, new_v), (old, old_m, old_v), strict=True):
-                new.where(moves, before).store(place)
-        return context.get_dummy_value()
-
-    f32, size = types.float32, types.int64
-    return types.void(g, size, params, m, v, size, size, f32, f32, f32), codegen
-
-
 @part
 def _adam(first, size, params, moments, rule, g):
     """An Adam step for parameters first, ..., first + size - 1 of the flattened arrays; g: see
     ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""
-    third, limit, width = g.size // 3, np.float32(GRADIENT_LIMIT), params.shape[1]
-    vectors = size // LANES
-    _adam_vectors(g, third, params, moments.m, moments.v, first, vectors, rule.beta1, rule.beta2, rule.epsilon)
-    for k in range(vectors * LANES, size):  # the remainder, in the last block only
-        i, column, d = (first + k) // width, (first + k) % width, g[k]
-        if is_finite(d):
-            d = min(max(d, -limit), limit)
-            m = rule.beta1 * moments.m[i, column] + (_F1 - rule.beta1) * d
-            v = rule.beta2 * moments.v[i, column] + (_F1 - rule.beta2) * d * d
-            if not (is_finite(m) and is_finite(v)):
-                m, v = _F0, _F0
-            moments.m[i, column], moments.v[i, column] = m, v
-            params[i, column] -= g[third + k] * m / (np.sqrt(v * g[2 * third + k]) + rule.epsilon)
+    third, limit = g.size // 3, np.float32(GRADIENT_LIMIT)
+    flat, flat_m, flat_v = params.reshape(-1), moments.m.reshape(-1), moments.v.reshape(-1)
+    for k in range(size):
+        old, old_m, old_v, given = flat[first + k], flat_m[first + k], flat_v[first + k], g[k]
+        d = min(max(given, -limit), limit)
+        m = _BETA1 * old_m + (_F1 - _BETA1) * d
+        v = _BETA2 * old_v + (_F1 - _BETA2) * d * d
+        sound = is_finite(m) & is_finite(v)
+        m, v = m if sound else _F0, v if sound else _F0
+        moves = is_finite(given)
+        step = g[third + k] * m / (np.sqrt(v * g[2 * third + k]) + rule.epsilon)
+        flat[first + k] = old - step if moves else old
+        flat_m[first + k], flat_v[first + k] = m if moves else old_m, v if moves else old_v
 
 
 @kernel
@@ -257,28 +214,5 @@ def adam_step(
         _adam(base * width, here * width, params, moments, rule, g)
         for j in range(here):
             if touched[j]:
-                clamp_gaussian(params, base + j, rule.largest, rule.thinnest)
+                clamp_gaussian(params, base + j)
         dropped[block] = lost
-
-
-@kernel
-def position_gradients(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums, slope):
-    """Write the gradient by position of Gaussians ``which``, int64 (M,), to slope: float32 (M, 3)."""
-    s, ids = block_scratch(gaussians.params.shape[1]), np.empty(BLOCK, np.int64)
-    while True:
-        base = fetch_add(counter, 1) * BLOCK
-        if base >= which.size:
-            return
-        here = min(BLOCK, which.size - base)
-        for j in range(here):
-            ids[j] = which[base + j]
-        load_block(gaussians, ids, here, s)
-        for b in range(cams.shape[0]):
-            if gather_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) > 0:
-                cam = load_camera(cams, b)
-                project_backward(cam, s)
-                harmonics_backward(cam, gaussians, ids, here, s)
-        for j in range(here):
-            for k in range(3):
-                d = s[GRADIENT + k * BLOCK + j]
-                slope[base + j, k] = d if is_finite(d) else _F0

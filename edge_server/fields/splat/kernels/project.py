@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN, SIZE, TIME, distort, load_camera
+from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN, SIZE, distort, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
+from edge_server.fields.splat.settings import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
 # Columns of a Gaussian's parameters; from BASE on, three for each further spherical harmonic.
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
@@ -37,17 +38,13 @@ DEPTH_BITS = 20
 _NEAREST_BITS, _DROPPED_BITS = (np.int32(0x3C23D70A), np.int32(9))  # the bits of .01; lower bits that are left out
 
 LOW_PASS = 0.3  # pixels squared, added to projected variances: nothing is sharper than a pixel
-ALPHA_MIN = 1.0 / 255.0  # a Gaussian ends where its alpha is below this
-# Bounds of raw parameters, applied in the forward pass; the gradient is 0 where they bind.
-SCALE_LOW, SCALE_HIGH = -12.0, 4.0
-RAW_OPACITY = 12.0
 FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
 _NO_DIRECTION = 1e-20  # squared length below which a quaternion has no direction
 
 # Rows of BLOCK numbers, in which a block of Gaussians is projected side by side.
-_X, _VX, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 6, 15, 16, 17, 21))
-_PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 29))
-_ROWS = 29
+_X, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 12, 13, 14, 18))
+_PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(14, 26))
+_ROWS = 26
 
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
@@ -57,13 +54,10 @@ class Gaussians(NamedTuple):
 
     params: float32 (N, BASE + 3 (harmonics - 1)).
     harmonics: spherical harmonics of the color: 1, 4 or 9.
-    velocity: float32 (N, 3), scene units a second. A camera whose column TIME is t, in seconds from the
-        instant of ``params``, sees a Gaussian where it was then.
     """
 
     params: NDArray[np.float32]
     harmonics: int
-    velocity: NDArray[np.float32]
 
 
 @part
@@ -100,17 +94,7 @@ def rotation(w, x, y, z):
 @part
 def exp_scale(raw):
     """The scale of a raw parameter, which is clamped first."""
-    return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
-
-
-@part
-def camera_point(cam, params, velocity, i):
-    """The center of Gaussian i in camera axes, at the camera's time. cam: see ``load_camera``."""
-    t = cam[TIME]
-    x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
-    y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
-    z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
-    return rotate_to_camera(cam, x, y, z)
+    return exp32(min(max(raw, np.float32(LOG_SCALE_LOW)), np.float32(LOG_SCALE_HIGH)))
 
 
 @part
@@ -152,13 +136,13 @@ def rotate_to_world(cam, j0, j1, j2):
 @part
 def _load_block(gaussians, base, count, s):
     """Load what is the same for all cameras of Gaussians base, ..., base + count - 1 into the rows of ``s``:
-    position, velocity, axes of the ellipsoid times their lengths, opacity, and the Gaussian's extent in
+    position, axes of the ellipsoid times their lengths, opacity, and the Gaussian's extent in
     standard deviations squared (0: invisible)."""
-    params, velocity = gaussians.params, gaussians.velocity
+    params = gaussians.params
     for j in range(count):
         i = base + j
         for k in range(3):
-            s[_X + k * BLOCK + j], s[_VX + k * BLOCK + j] = params[i, k], velocity[i, k]
+            s[_X + k * BLOCK + j] = params[i, k]
             s[_S + k * BLOCK + j] = params[i, SCALE + k]
         for k in range(4):
             s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
@@ -171,7 +155,7 @@ def _load_block(gaussians, base, count, s):
         s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
         s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
         raw = s[_ALPHA + j]
-        alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
+        alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY_LIMIT)), np.float32(RAW_OPACITY_LIMIT))))
         shows = is_finite(raw) & (alpha > np.float32(ALPHA_MIN))
         s[_ALPHA + j] = alpha
         s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_MIN)) if shows else _F0
@@ -182,13 +166,10 @@ def _project_block(cam, s):
     """Project the Gaussians in the rows of ``s`` into a camera: mean, depth, conic, and the edges of the box
     they cover, in tiles (LEFT > RIGHT: not in the image). cam: see ``load_camera``."""
     fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
-    low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
+    low, over = np.float32(LOW_PASS), np.float32(1.0 / TILE)
     for j in range(BLOCK):
         x, y, z = rotate_to_camera(
-            cam,
-            s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
-            s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
-            s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
+            cam, s[_X + j] - cam[ORIGIN], s[_X + BLOCK + j] - cam[ORIGIN + 1], s[_X + 2 * BLOCK + j] - cam[ORIGIN + 2]
         )
         shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
         _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = lens_terms(cam, x, y, z if shows else _F1)

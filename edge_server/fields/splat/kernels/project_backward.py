@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.camera import LENS, ORIGIN, TIME
+from edge_server.fields.common.kernels.camera import LENS, ORIGIN
 from edge_server.fields.common.kernels.jit import part
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.kernels.project import (
@@ -21,10 +21,7 @@ from edge_server.fields.splat.kernels.project import (
     CONIC_C,
     OPACITY,
     QUATERNION,
-    RAW_OPACITY,
     SCALE,
-    SCALE_HIGH,
-    SCALE_LOW,
     exp_scale,
     lens_terms,
     rotate_to_camera,
@@ -32,13 +29,14 @@ from edge_server.fields.splat.kernels.project import (
     rotation,
     unit_quaternion,
 )
+from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
-# Rows of BLOCK numbers: position, velocity, raw scale, quaternion, raw opacity; then for one camera: opacity,
+# Rows of BLOCK numbers: position, raw scale, quaternion, raw opacity; then for one camera: opacity,
 # conic, sums over pairs, whether there are any pairs, and the length of the gradient by the projected mean;
 # from GRADIENT on, a row for each parameter's gradient.
-_X, _VX, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, SUM = (n * BLOCK for n in (0, 3, 6, 9, 13, 14, 15, 16, 17, 18))
-SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (27, 28, 29))
-_ROWS = 29
+_X, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, SUM = (n * BLOCK for n in (0, 3, 6, 10, 11, 12, 13, 14, 15))
+SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (24, 25, 26))
+_ROWS = 26
 
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
@@ -52,11 +50,11 @@ def block_scratch(width):
 @part
 def load_block(gaussians, ids, count, s):
     """Load Gaussians ids[:count] into the rows of ``s`` and set their gradients to 0."""
-    params, velocity = gaussians.params, gaussians.velocity
+    params = gaussians.params
     for j in range(count):
         i = ids[j]
         for k in range(3):
-            s[_X + k * BLOCK + j], s[_VX + k * BLOCK + j] = params[i, k], velocity[i, k]
+            s[_X + k * BLOCK + j] = params[i, k]
             s[_S + k * BLOCK + j] = params[i, SCALE + k]
         for k in range(4):
             s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
@@ -97,14 +95,11 @@ def project_backward(cam, s):
     The sums over the pixels that a Gaussian covers are: h = d loss / d power, h dx, h dy, h dx^2, h dx dy,
     h dy^2, with (dx, dy) from the mean to the pixel, and d loss / d color. Row SLOPE gets the length of the
     gradient by the projected mean (pixels), 0 where the Gaussian is not seen."""
-    fx, fy, t = cam[LENS], cam[LENS + 1], cam[TIME]
+    fx, fy = cam[LENS], cam[LENS + 1]
     for j in range(BLOCK):
         seen = s[SEEN + j] > _F0
         x, y, z = rotate_to_camera(
-            cam,
-            s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
-            s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
-            s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
+            cam, s[_X + j] - cam[ORIGIN], s[_X + BLOCK + j] - cam[ORIGIN + 1], s[_X + 2 * BLOCK + j] - cam[ORIGIN + 2]
         )
         a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = lens_terms(cam, x, y, z if seen else _F1)
         gx, gy = fx * inverse, fy * inverse
@@ -141,7 +136,7 @@ def project_backward(cam, s):
         # cov = V V^T
         a0, a1, a2 = _F2 * (e * v0 + f * w0), _F2 * (e * v1 + f * w1), _F2 * (e * v2 + f * w2)
         b0, b1, b2 = _F2 * (f * v0 + g * w0), _F2 * (f * v1 + g * w1), _F2 * (f * v2 + g * w2)
-        low, high, bounded = np.float32(SCALE_LOW), np.float32(SCALE_HIGH), np.float32(RAW_OPACITY)
+        low, high, bounded = np.float32(LOG_SCALE_LOW), np.float32(LOG_SCALE_HIGH), np.float32(RAW_OPACITY_LIMIT)
         d0, d1, d2 = a0 * v0 + b0 * w0, a1 * v1 + b1 * w1, a2 * v2 + b2 * w2
         at = GRADIENT + SCALE * BLOCK + j
         s[at] += d0 if seen & (raw0 > low) & (raw0 < high) else _F0
@@ -188,7 +183,7 @@ def project_backward(cam, s):
         s[at + BLOCK] += o1 if seen else _F0
         s[at + 2 * BLOCK] += o2 if seen else _F0
         opaque = s[SUM + j] * (_F1 - s[_ALPHA + j])
-        s[at + OPACITY * BLOCK] += opaque if seen & (abs(s[_RAW + j]) < bounded) else _F0
+        s[at + OPACITY * BLOCK] += opaque if seen & (abs(s[_RAW + j]) <= bounded) else _F0
         s[at + COLOR * BLOCK] += s[SUM + 6 * BLOCK + j]
         s[at + (COLOR + 1) * BLOCK] += s[SUM + 7 * BLOCK + j]
         s[at + (COLOR + 2) * BLOCK] += s[SUM + 8 * BLOCK + j]

@@ -32,23 +32,18 @@ _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
 ROWS = 9
 
-_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+_F0, _F1, _F2 = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _BYTE = np.float32(1.0 / 255.0)
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM
 
 
-class Loss(NamedTuple):
-    """The loss, summed over pixels.
+class Background(NamedTuple):
+    """The color behind everything.
 
-    absolute: absolute (L1) rather than squared errors.
-    dssim: weight of (1 - SSIM) / 2, with the tile as one window.
-    background: float32 (3,).
-    random: use a random background for each tile, from stream ``key``, instead.
+    color: float32 (3,).
+    random: use a random color for each tile, from stream ``key``, instead.
     """
 
-    absolute: bool
-    dssim: np.float32
-    background: NDArray[np.float32]
+    color: NDArray[np.float32]
     random: bool
     key: np.uint64
 
@@ -92,43 +87,14 @@ def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
 
 
 @part
-def add_dssim(s, row, error_row, target, count, weight):
-    """Return the loss weight * count * (1 - SSIM) / 2 between the color row at ``row`` of ``s`` and target
-    (PIXELS,), over the ``count`` pixels where target is not negative; add its gradient at ``error_row``."""
-    n = _F1 / np.float32(count)
-    mx = my = xx = yy = xy = _F0
-    for k in range(PIXELS):
-        inside = target[k] >= _F0
-        x, y = s[row + k] if inside else _F0, target[k] if inside else _F0
-        mx += x
-        my += y
-        xx += x * x
-        yy += y * y
-        xy += x * y
-    mx, my = mx * n, my * n
-    # Rounding can make a variance negative.
-    xx, yy, xy = max(xx * n - mx * mx, _F0), max(yy * n - my * my, _F0), xy * n - mx * my
-    a1, a2, b1, b2 = _F2 * mx * my + _C1, _F2 * xy + _C2, mx * mx + my * my + _C1, xx + yy + _C2
-    ssim = min(max(a1 * a2 / (b1 * b2), -_F1), _F1)
-    by_mean = _F2 * my * a2 / (b1 * b2) - _F2 * mx * ssim / b1
-    by_xy, by_xx = _F2 * a1 / (b1 * b2), -ssim / b2
-    scale = -_HALF * weight
-    for k in range(PIXELS):
-        if target[k] >= _F0:
-            x, y = s[row + k], target[k]
-            s[error_row + k] += scale * (by_mean + by_xy * (y - my) + _F2 * by_xx * (x - mx))
-    return _HALF * weight * np.float32(count) * (_F1 - ssim)
-
-
-@part
-def _load_target(views, view, x0, y0, loss, task, target, back):
+def _load_target(views, view, x0, y0, background, task, target, back):
     """Fill target (3, PIXELS), -1 outside the image, and the background, back (3,). Returns how many pixels
     are inside."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     for c in range(3):
-        back[c] = loss.background[c]
-        if loss.random:
-            back[c] = uniform(loss.key, np.uint64(3 * task + c))
+        back[c] = background.color[c]
+        if background.random:
+            back[c] = uniform(background.key, np.uint64(3 * task + c))
     count = 0
     transparent = views.pixels.shape[1] == 4
     for k in range(PIXELS):
@@ -147,47 +113,46 @@ def _load_target(views, view, x0, y0, loss, task, target, back):
 @part
 def _load_weights(views, view, x0, y0, target, share):
     """Fill share (PIXELS,) with the pixels' weights, and treat pixels of weight 0 as outside the image: -1 in
-    target. Returns how many pixels are left, and their mean weight."""
+    target. Returns how many pixels are left."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
-    count, total = 0, _F0
+    count = 0
     for k in range(PIXELS):
         x, y = x0 + k % TILE, y0 + k // TILE
         inside = x < width and y < height
         share[k] = views.weight[first + y * width + x] if inside else _F0
         if share[k] > _F0:
             count += 1
-            total += share[k]
         else:
             target[0, k] = target[1, k] = target[2, k] = -_F1
-    return count, total / np.float32(max(count, 1))
+    return count
 
 
 @part
-def _apply_weights(s, target, share, absolute):
-    """Multiply the error rows of ``s`` by the pixels' weights; returns weighted loss and squared error."""
-    total, square = _F0, _F0
+def _apply_weights(s, target, share):
+    """Multiply the error rows of ``s`` by the pixels' weights; returns the weighted squared error."""
+    square = _F0
     for c in range(3):
         for k in range(PIXELS):
             e = s[_R + c * PIXELS + k] - target[c, k] if share[k] > _F0 else _F0
             square += share[k] * (e * e)
-            total += share[k] * (abs(e) if absolute else e * e)
             s[_ER + c * PIXELS + k] *= share[k]
-    return total, square
+    return square
 
 
 @kernel
-def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved, sums, losses):
-    """Render tiles, compare them with the views, and backpropagate to the pairs.
-
-    With ``views.weight``, each pixel's loss is multiplied by its weight and the tile's SSIM loss by the mean
-    of the positive weights; pixels of weight 0 are not part of the SSIM window.
+def train_tiles(
+    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, sums, losses
+):
+    """Render tiles, compare them with the views, and backpropagate to the pairs. The loss is the squared color
+    error, times the pixel's weight where there are ``views.weight``, summed over pixels.
 
     views: ``rays.Views``.
     picked: int64 (B,), the view of each camera slot.
     tasks: int32 (M, 2), slot and tile.
     memory, saved: float32 (W, ROWS * PIXELS) and (W, longest * STRIPS * SAVED), scratch of each worker.
     sums: float32 (B, P, SUMS), written for the pairs of the tasks' tiles.
-    losses: float64 (M, 3), written: loss, squared color error, 1 if the tile is left out as not finite.
+    background: ``Background``.
+    losses: float64 (M, 2), written: the loss, and 1 if the tile is left out as not finite.
     """
     s, store = memory[worker], saved[worker]
     weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
@@ -199,10 +164,9 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
         x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        inside, dssim = _load_target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        inside = _load_target(views, picked[b], x0, y0, background, task, target, back)
         if weighed:
-            inside, mean = _load_weights(views, picked[b], x0, y0, target, share)
-            dssim *= mean
+            inside = _load_weights(views, picked[b], x0, y0, target, share)
         clear_tile(s)
         begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
         size = (end - begin) * SAVED
@@ -220,24 +184,18 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
                 store[n * size : (n + 1) * size],
                 SAVED,
             )
-        total, square = _F0, _F0
+        square = _F0
         for c in range(3):
             for k in range(PIXELS):
                 s[_R + c * PIXELS + k] += s[_T + k] * back[c]
                 known = target[c, k] >= _F0
                 e = s[_R + c * PIXELS + k] - target[c, k] if known else _F0
                 square += e * e
-                total += abs(e) if loss.absolute else e * e
-                sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
-                s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
+                s[_ER + c * PIXELS + k] = _F2 * e
         if weighed:
-            total, square = _apply_weights(s, target, share, loss.absolute)
-        if dssim > _F0:
-            for c in range(3):
-                total += add_dssim(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
-        finite = is_finite(total)
-        losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
-        losses[task, 2] = 0.0 if finite else 1.0
+            square = _apply_weights(s, target, share)
+        finite = is_finite(square)
+        losses[task, 0], losses[task, 1] = square if finite else 0.0, 0.0 if finite else 1.0
         for j in range(begin, end):
             rest = sums[b, lists.pair[b, j]]
             for k in range(SUMS):
@@ -288,32 +246,3 @@ def render_tiles(
             healthy = is_finite(far) and is_finite(seen)
             depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
             opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0
-
-
-@kernel
-def compare_tiles(counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error):
-    """Write each pixel's color error, the largest difference of a channel, for the tiles of ``tasks``.
-
-    error: float32 (P,), for all pixels of ``views``; other arguments as in ``train_tiles``."""
-    s, store = memory[worker], saved[worker]
-    strip_pairs, count = strip_scratch(lists)
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= tasks.shape[0]:
-            return
-        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
-        x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
-        width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
-        transparent = views.pixels.shape[1] == 4
-        composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
-        for k in range(PIXELS):
-            x, y = x0 + k % TILE, y0 + k // TILE
-            if x >= width or y >= height:
-                continue
-            pixel, worst = first + y * width + x, _F0
-            opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
-            for c in range(3):
-                wanted = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + background[c] * (_F1 - opaque)
-                shown = s[_R + c * PIXELS + k] + s[_T + k] * background[c]
-                worst = max(worst, abs(shown - wanted))
-            error[pixel] = worst if is_finite(worst) else _F1

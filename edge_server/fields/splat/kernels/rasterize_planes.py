@@ -19,7 +19,7 @@ _F0 = np.float32(0.0)
 
 
 @part
-def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
+def composite_next(s, strip_pairs, n, j, lists, projected, x0, y0, store):
     """Composite the j-th Gaussian of strip n alone; ``store`` then has its alphas and the light before it.
     Returns False, and composites nothing, if no light was left at the last test."""
     first = _T + n * STRIP
@@ -32,8 +32,8 @@ def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
     composite(
         strip_pairs[n, j : j + 1],
         1,
-        lists.owner[slot],
-        projected[slot],
+        lists.owner[0],
+        projected[0],
         np.float32(x0),
         np.float32(y0 + 2 * n),
         s,
@@ -45,8 +45,8 @@ def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
 
 
 @kernel
-def render_planes(counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, saved, out):
-    """Blend the Gaussians' planes with the weights of their colors. Tasks are tiles of camera ``slot``.
+def render_planes(counter, worker, columns, rows, width, height, projected, lists, planes, memory, saved, out):
+    """Blend the Gaussians' planes with the weights of their colors. Tasks are tiles of camera slot 0.
 
     planes: float32 (N, 4), unit normal in camera axes, and the plane's distance from the camera along it.
     out: float32 (H, W, 5), written: blended normal, blended distance, opacity.
@@ -61,13 +61,13 @@ def render_planes(counter, worker, slot, columns, rows, width, height, projected
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
         clear_tile(s)
         sums[:] = _F0
-        bin_strips(lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, strip_pairs, count)
+        bin_strips(lists, 0, lists.first[0, t], lists.first[0, t + 1], projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             for j in range(count[n]):
-                if not composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
+                if not composite_next(s, strip_pairs, n, j, lists, projected, x0, y0, store):
                     break
                 for c in range(4):
-                    value = planes[lists.owner[slot, strip_pairs[n, j]], c]
+                    value = planes[lists.owner[0, strip_pairs[n, j]], c]
                     for k in range(STRIP):
                         sums[c, n * STRIP + k] += store[k] * store[STRIP + k] * value
         for k in range(PIXELS):
@@ -80,12 +80,12 @@ def render_planes(counter, worker, slot, columns, rows, width, height, projected
 
 @kernel
 def accumulate_normals(
-    counter, worker, slot, columns, rows, width, height, projected, lists, normals, memory, saved, normal_sums
+    counter, worker, columns, rows, width, height, projected, lists, normals, memory, saved, normal_sums
 ):
     """Sum the pixels' normals over each pair, with the Gaussian's weight in the pixel. Tasks are tiles.
 
     normals: float32 (H, W, 4), unit vectors in camera axes, and the confidence in each.
-    normal_sums: float32 (P, 4), written for every pair of ``slot``: weighted normals, and the weights' sum.
+    normal_sums: float32 (P, 4), written for every pair of slot 0: weighted normals, and the weights' sum.
     """
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
@@ -95,13 +95,13 @@ def accumulate_normals(
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
         clear_tile(s)
-        begin, end = lists.first[slot, t], lists.first[slot, t + 1]
-        bin_strips(lists, slot, begin, end, projected, y0, strip_pairs, count)
+        begin, end = lists.first[0, t], lists.first[0, t + 1]
+        bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
         for j in range(begin, end):
-            normal_sums[lists.pair[slot, j]] = _F0
+            normal_sums[lists.pair[0, j]] = _F0
         for n in range(STRIPS):
             for j in range(count[n]):
-                if not composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
+                if not composite_next(s, strip_pairs, n, j, lists, projected, x0, y0, store):
                     break
                 nx = ny = nz = total = _F0
                 for k in range(STRIP):

@@ -27,7 +27,6 @@ from edge_server.fields.common.supervision import check_view
 from edge_server.fields.common.threads.precompile import compile_ahead
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
-from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
@@ -38,6 +37,7 @@ from edge_server.fields.splat.layers.static_field import PlateImage
 from edge_server.fields.splat.layers.static_layer import StaticLayer, gaussians
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.still_field import StillField
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class LayeredField:
     """See ``fields.Field`` for the protocol.
 
     Until plates are known, with a single camera, and for good where a camera moves or images are transparent,
-    views go to a ``SplatField``. Call ``fit`` from one thread only; snapshots may be taken and rendered from
+    views go to a ``StillField``. Call ``fit`` from one thread only; snapshots may be taken and rendered from
     any thread.
 
     part_s: seconds spent by part, in all fits.
@@ -73,7 +73,7 @@ class LayeredField:
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self.caller = CallerPool()
         self.now = time.perf_counter  # the clock of budgets in seconds
-        self.first = SplatField(self.settings, self.pool)
+        self.first = StillField(self.settings, self.pool)
         self.static = StaticLayer(self.settings, self.pool)
         self.part_s = PartTimes(self.now)
         self._frame_time = StepTimer()

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
-from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import StaticLayer
+from edge_server.fields.splat.still_field import StillField
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
@@ -84,7 +84,7 @@ def pack(field: Any) -> Arrays:
 def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
     meta = unpack_meta(field.settings, state, NAME, ("harmonics",), VERSION)
-    field.first = SplatField(field.settings, field.pool)
+    field.first = StillField(field.settings, field.pool)
     field.static = StaticLayer(field.settings, field.pool)
     field.first.load_state(_under("first.", state))
     field.static.field.load_state(_under("static.", state))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -89,7 +89,7 @@ class MovingSet:
         """The Gaussians of an instant, copied."""
         params = self.cloud.params.copy()
         params[:, :3] = self.places(instant_s)
-        return Gaussians(params, self.settings.harmonics, np.zeros((len(params), 3), np.float32))
+        return Gaussians(params, self.settings.harmonics)
 
     def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
         """Distance from a camera to the middle of the Gaussians, meters."""
@@ -105,7 +105,7 @@ class MovingSet:
         assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
         instant_s = observation.instant_s
         gaussians = self.gaussians(instant_s)
-        self.raster.project_and_bin(camera.row, gaussians, [None], differentiate=False)
+        self.raster.project_and_bin(camera.row, gaussians, differentiate=False)
         m, v, shown, opacity = align_view(
             self.raster,
             camera.row[0],
@@ -129,10 +129,7 @@ class MovingSet:
         observation.weight = np.ones(observation.foreground.shape, np.float32)
         self.align(observation, camera)
         rates = np.zeros(params.shape[1], np.float32)
-        one = np.float32(1.0)
-        self.train(
-            observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), one, one, one, one, one, one)
-        )
+        self.train(observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), np.float32(1.0)))
         self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
         self.motion.pool = self.pool
         assert observation.row is not None
@@ -147,7 +144,7 @@ class MovingSet:
         raster, cloud = self.raster, self.cloud
         gaussians = self.gaussians(observation.instant_s)
         before = gaussians.params[:, :3].copy()
-        raster.project_and_bin(camera.row, gaussians, [None])
+        raster.project_and_bin(camera.row, gaussians)
         tasks = raster.tasks()
         self.pool.run(
             train_over,
@@ -188,10 +185,8 @@ class MovingSet:
     def _grow(self, pixels: int) -> None:
         """Split and prune; what is split keeps its anchors."""
         self._grown = self.steps
-        self.cloud.guest[:] = np.arange(len(self.cloud))  # which Gaussian each comes from
-        densify_and_prune(self.cloud, replace(self.settings, gaussians=self.capacity), pixels, self._rng(1))
-        self.anchor, self.share = self.anchor[self.cloud.guest], self.share[self.cloud.guest]
-        self.cloud.guest[:] = 0
+        origin = densify_and_prune(self.cloud, self.capacity, pixels, self._rng(1))
+        self.anchor, self.share = self.anchor[origin], self.share[origin]
 
     # --- seeding and removal -------------------------------------------------------------------
 

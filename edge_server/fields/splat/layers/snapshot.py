@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import Motion
-from edge_server.fields.splat.snapshot import MAX_AHEAD_S, SplatSnapshot
+from edge_server.fields.splat.snapshot import SplatSnapshot
+
+MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,4 @@ class LayeredSnapshot(SplatSnapshot):
             return self
         ahead_s = self.moving.ahead_s(present_ns)
         params = np.concatenate([self.static, self.moving.params_at(ahead_s)])
-        still = np.zeros((len(params), 3), np.float32)
-        gaussians = Gaussians(params, self.gaussians.harmonics, still)
-        return replace(self, gaussians=gaussians, ahead_s=ahead_s)
+        return replace(self, gaussians=Gaussians(params, self.gaussians.harmonics))

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget
-from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.still_field import StillField
 
 Arrays = dict[str, NDArray]
 
@@ -40,7 +39,7 @@ class PlateImage(NamedTuple):
     known: NDArray[np.bool_]
 
 
-class StaticField(SplatField):
+class StaticField(StillField):
     """A field of what stands still. ``learn`` says from which plates; ``train`` spends steps on them.
 
     Nothing of motion is part of it: nothing is tracked, removed or seeded. The first schedule is one descent
@@ -49,7 +48,7 @@ class StaticField(SplatField):
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool | None = None) -> None:
-        super().__init__(replace(settings, refuse_beyond=0.0, follow=0, age_tau_ms=0.0, mask_stale_ms=0.0), pool)
+        super().__init__(replace(settings, age_tau_ms=0.0, mask_stale_ms=0.0), pool)
 
     def reset(self) -> None:
         """Forget everything, the schedule included."""
@@ -145,7 +144,7 @@ class StaticField(SplatField):
 
     def moving_parameters(self, progress: float) -> AdamParameters:
         """Parameters of an optimizer step of the moving set."""
-        return self._adam_parameters(progress)
+        return self.adam_parameters(progress)
 
     def state(self) -> Arrays:
         """Everything needed to resume bit for bit."""
@@ -179,11 +178,6 @@ class StaticField(SplatField):
                 self._ingest(views)
 
     # --- inside -------------------------------------------------------------------------------
-
-    def _ingest(self, views: Sequence[View]) -> SceneChange | None:
-        super()._ingest(views)
-        self._changed = [None] * len(views)
-        return None
 
     def _finish_step(self) -> None:
         if self.step < self._grows_until:

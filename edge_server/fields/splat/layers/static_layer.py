@@ -107,4 +107,4 @@ class StaticLayer:
 
 def gaussians(params: NDArray[np.float32], settings: SplatSettings) -> Gaussians:
     """Gaussians that do not move, of parameters float32 (N, P)."""
-    return Gaussians(params, settings.harmonics, np.zeros((len(params), 3), np.float32))
+    return Gaussians(params, settings.harmonics)

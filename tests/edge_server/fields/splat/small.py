@@ -3,15 +3,14 @@
 import numpy as np
 
 from edge_server.fields import Rendering
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.kernels.optimizer_step import OPACITY_LIMIT, POSITION_LIMIT
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.settings import ASPECT, POSITION_LIMIT, RAW_OPACITY_LIMIT, SplatSettings
+from edge_server.fields.splat.still_field import StillField
 
-FIELD = SplatField
+FIELD = StillField
 SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)
 TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
-POISONED = SplatSettings(gaussians=600, start=400, seed_cells=24, densify_every=20, views_a_step=3, threads=2)
+POISONED = SplatSettings(gaussians=600, start=400, seed_cells=24, densify_every=20, threads=2)
 FINITE = ("params", "m", "v", "slope", "looks", "reach", "behind")
 REACHED_DB = {
     "held out": 23.1,
@@ -23,13 +22,13 @@ REACHED_DB = {
 }
 
 
-def check_bounds(field: SplatField, out: Rendering) -> None:
+def check_bounds(field: StillField, out: Rendering) -> None:
     """Of parameters and opacity, after anything that may have happened to them."""
     params = field.state()["params"]
     assert len(params) <= field.settings.gaussians
     if len(params):
         assert np.abs(params[:, :3]).max() <= POSITION_LIMIT
-        assert np.abs(params[:, OPACITY]).max() <= OPACITY_LIMIT
+        assert np.abs(params[:, OPACITY]).max() <= RAW_OPACITY_LIMIT
         sizes = params[:, SCALE:QUATERNION]
-        assert (np.ptp(sizes, axis=1) <= np.log(field.settings.aspect) + 1e-4).all(), "a needle"
+        assert (np.ptp(sizes, axis=1) <= np.log(ASPECT) + 1e-4).all(), "a needle"
     assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0

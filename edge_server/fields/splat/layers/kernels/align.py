@@ -22,7 +22,6 @@ from edge_server.fields.common.kernels.camera import LENS, NEAR, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.splat.kernels.composite import (
-    ALPHA_MAX,
     PIXELS,
     SAVED,
     STRIP,
@@ -32,7 +31,6 @@ from edge_server.fields.splat.kernels.composite import (
     composite,
 )
 from edge_server.fields.splat.kernels.project import (
-    ALPHA_MIN,
     CONIC_A,
     CONIC_B,
     CONIC_C,
@@ -52,6 +50,7 @@ from edge_server.fields.splat.kernels.simd_vectors import (
     eight_lane_sums,
     require_contiguous,
 )
+from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
 
 NOISE = 0.2  # of full scale: standard deviation of a pixel's error in the least squares
 ROBUST = 1.0  # scale of Cauchy's weights 1 / (1 + e^2 / ROBUST^2)
@@ -76,12 +75,11 @@ def align_view(
     anchor: NDArray[np.int64],
     share: NDArray[np.float32],
     anchors: int,
-    slot: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Normal matrix (3K, 3K) and right side (3K,) of one view, see ``motion.ViewRow``; what is shown, float32
     (H, W, 3), and the Gaussians' opacity, float32 (H, W). Tiles of weight 0 show the plate alone.
 
-    raster: ``RasterBuffers`` whose last ``project_and_bin`` had this camera at ``slot``.
+    raster: ``RasterBuffers`` whose last ``project_and_bin`` had this camera first.
     camera: float32 (CAMERA,), its row.
     places: float32 (N, 3), of the projected Gaussians, scene units.
     image: uint8 (H, W, 3). plate: float32 (H, W, 3), of 255. weight: float32 (H, W), at least 0.
@@ -94,8 +92,7 @@ def align_view(
         image,
         plate,
         weight,
-        slot,
-        int(raster.columns[slot]),
+        int(raster.columns[0]),
         camera[None],
         places,
         raster.projected,
@@ -297,7 +294,6 @@ def add_view(
     image,
     plate,
     weight,
-    slot,
     columns,
     cams,
     places,
@@ -331,18 +327,18 @@ def add_view(
     size = strip_pairs.shape[1] * SAVED
     store = np.empty(STRIPS * size, np.float32)
     for t in range(columns * ((height + TILE - 1) // TILE)):
-        begin, end = np.int64(lists.first[slot, t]), np.int64(lists.first[slot, t + 1])
+        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
         if begin == end or not _heaviest(image, plate, weight, x0, y0, behind) > _F0:
             continue
         clear_tile(s)
-        bin_strips(lists, slot, begin, end, projected, y0, strip_pairs, count)
+        bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             composited[n] = composite(
                 strip_pairs[n],
                 count[n],
-                lists.owner[slot],
-                projected[slot],
+                lists.owner[0],
+                projected[0],
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 s,
@@ -353,7 +349,7 @@ def add_view(
         _compare(s, image, weight, x0, y0, behind, rest, shown, opacity)
         many = 0
         for j in range(begin, end):
-            i = lists.owner[slot, lists.pair[slot, j]]
+            i = lists.owner[0, lists.pair[0, j]]
             for m in range(ATTACHED):
                 a = anchor[i, m]
                 if mark[a] != t:
@@ -366,8 +362,8 @@ def add_view(
             _spread(
                 strip_pairs[n],
                 composited[n],
-                lists.owner[slot],
-                projected[slot],
+                lists.owner[0],
+                projected[0],
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 behind,

@@ -23,10 +23,9 @@ def random_params(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndar
     return params
 
 
-def static(params: np.ndarray) -> Gaussians:
-    """Gaussians without velocity."""
-    harmonics = (params.shape[1] - BASE) // 3 + 1
-    return Gaussians(params, harmonics, np.zeros((len(params), 3), np.float32))
+def as_gaussians(params: np.ndarray) -> Gaussians:
+    """What the kernels read."""
+    return Gaussians(params, (params.shape[1] - BASE) // 3 + 1)
 
 
 def binned(
@@ -38,5 +37,5 @@ def binned(
 ) -> RasterBuffers:
     """Buffers after ``project_and_bin``; wanted: None for all tiles of all cameras."""
     raster = RasterBuffers(pool or CallerPool())
-    raster.project_and_bin(cams, static(params), wanted or [None] * len(cams), differentiate)
+    raster.project_and_bin(cams, as_gaussians(params), wanted, differentiate)
     return raster

@@ -21,7 +21,6 @@ from edge_server.fields.splat.kernels.composite import (
 )
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
-    ALPHA_MIN,
     CONIC_A,
     CONIC_B,
     CONIC_C,
@@ -35,6 +34,7 @@ from edge_server.fields.splat.kernels.project import (
     SCALE,
     TILE,
 )
+from edge_server.fields.splat.settings import ALPHA_MIN
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned
 

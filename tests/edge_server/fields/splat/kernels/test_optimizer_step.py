@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
-from edge_server.fields.splat.kernels.composite import SUMS
-from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
-from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step, clamp_gaussians
+from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE
 from freshfield.geometry import Pinhole, look_at
-from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params, static
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
 
 COUNT = 2 * BLOCK + 44  # two full blocks and a part of one
 LENS = Pinhole(48, 40, 50.0, 50.0, 24.0, 20.0, (-0.05, 0.01, 0.002, -0.001))
 EYES = ((1.0, -2.5, 0.8), (-2.0, 1.5, 1.0))
-BETA1, BETA2, EPSILON, FADE = 0.9, 0.99, 1e-8, 0.3
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8
 
 
 def _raster(params: NDArray[np.float32]) -> tuple[RasterBuffers, NDArray[np.float32]]:
@@ -41,14 +40,10 @@ def _moments(width: int, filled: bool) -> OptimizerState:
     return OptimizerState((share * m).astype(np.float32), (share * v).astype(np.float32), age.astype(np.int32), *flat)
 
 
-def _adam_parameters(width: int, beta1: float, rate: float, fade: float = 0.0) -> AdamParameters:
+def _adam_parameters(width: int, rate: float) -> AdamParameters:
     rates = rate * (1.0 + np.arange(width)) / width
     corrections = np.array([[9.0, 9.0, 9.0], [3.0, 2.5, 1.0], [2.0, 1.8, 0.9], [1.5, 1.2, 0.8]])
-    return AdamParameters(
-        rates.astype(np.float32),
-        corrections.astype(np.float32),
-        *(np.float32(x) for x in (beta1, BETA2, EPSILON, fade, 4.0, 5.0)),
-    )
+    return AdamParameters(rates.astype(np.float32), corrections.astype(np.float32), np.float32(EPSILON))
 
 
 def _update(
@@ -64,7 +59,7 @@ def _update(
     (pool or CallerPool()).run(
         adam_step,
         cams,
-        static(params),
+        as_gaussians(params),
         COUNT,
         raster.projected,
         raster.lists.own_first,
@@ -78,11 +73,11 @@ def _update(
 
 
 def _gradient(params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Adam's first moment after a step with beta1 = 0."""
+    """From Adam's first moment after one step from 0."""
     width = params.shape[1]
     moments = _moments(width, filled=False)
-    _update(params.copy(), moments, _adam_parameters(width, 0.0, 0.0), raster, cams)
-    return moments.m
+    _update(params.copy(), moments, _adam_parameters(width, 0.0), raster, cams)
+    return moments.m / np.float32(1.0 - BETA1)
 
 
 @pytest.mark.parametrize("harmonics", [1, 4])
@@ -93,11 +88,9 @@ def test_a_step_is_adams(harmonics: int) -> None:
     g = _gradient(params, raster, cams).astype(np.float64)
     seen = (raster.lists.own_count[:, :COUNT] > 0).any(axis=0)
     assert 0 < (~seen).sum() < COUNT // 2 and (np.abs(g[seen]).max(axis=1) > 0).all()
-    alpha = 1.0 / (1.0 + np.exp(-params[:, OPACITY].astype(np.float64)))
-    g[:, OPACITY] += FADE * alpha * (1.0 - alpha)
     moments, after = _moments(width, filled=True), params.copy()
     before = OptimizerState(*(np.array(array, np.float64) for array in moments))
-    rule = _adam_parameters(width, BETA1, 1e-3, FADE)
+    rule = _adam_parameters(width, 1e-3)
     assert _update(after, moments, rule, raster, cams) == 0
 
     m = BETA1 * before.m + (1.0 - BETA1) * g
@@ -148,7 +141,7 @@ def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -
     params = random_params(COUNT, seed=3)
     raster, cams = _raster(params)
     victim = int(np.flatnonzero(raster.lists.own_count[0, :COUNT] > 0)[40])
-    rule, sound = _adam_parameters(BASE, BETA1, 1e-3), params.copy()
+    rule, sound = _adam_parameters(BASE, 1e-3), params.copy()
     moments = _moments(BASE, filled=True)
     _update(sound, moments, rule, raster, cams)
     raster.sums[0, raster.lists.own_first[0, victim], column] = broken
@@ -171,13 +164,30 @@ def test_threads_do_not_change_a_bit() -> None:
     results = []
     for pool in (CallerPool(), Pool(3)):
         after, moments = params.copy(), _moments(params.shape[1], filled=True)
-        _update(after, moments, _adam_parameters(params.shape[1], BETA1, 1e-3, FADE), raster, cams, pool)
+        _update(after, moments, _adam_parameters(params.shape[1], 1e-3), raster, cams, pool)
         results.append((after, moments.m, moments.v))
         pool.close()
     for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_sums_have_a_row_for_each_pair() -> None:
-    raster, _ = _raster(random_params(COUNT, seed=3))
-    assert raster.sums.shape == (*raster.lists.pair.shape, SUMS)
+def test_parameters_are_kept_within_their_bounds() -> None:
+    """In numbers: what lies within stays as it is to the last bit."""
+    params = random_params(5, seed=3)
+    params[:, OPACITY] = 8.0, -8.5, 50.0, -50.0, np.nan
+    params[1, :3], params[2, SCALE:QUATERNION], params[3, SCALE:QUATERNION] = (
+        (500.0, -500.0, 1.0),
+        3.0,
+        (-1.0, -9.0, -1.0),
+    )
+    params[2, QUATERNION:OPACITY], params[3, COLOR] = 0.0, 7.0
+    before = params.copy()
+    clamp_gaussians(params)
+    np.testing.assert_array_equal(params[0], before[0])
+    np.testing.assert_array_equal(params[:, OPACITY], np.float32([8.0, -8.5, 9.0, -9.0, -9.0]))
+    np.testing.assert_array_equal(params[1, :3], np.float32([100.0, -100.0, 1.0]))
+    far = max(1.0, np.abs(before[2, :3]).max())
+    np.testing.assert_allclose(params[2, SCALE:QUATERNION], np.log(0.5 * far), rtol=1e-5)
+    assert np.ptp(params[3, SCALE:QUATERNION]) == pytest.approx(np.log(20.0), abs=1e-5)
+    np.testing.assert_array_equal(params[2, QUATERNION:OPACITY], [1.0, 0.0, 0.0, 0.0])
+    assert params[3, COLOR] == 1.5

@@ -12,8 +12,6 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.kernels.composite import ALPHA_MAX
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
     ALPHA_MIN,
@@ -37,7 +35,8 @@ from edge_server.fields.splat.planar import (
     gaussian_planes,
     plane_depth,
 )
-from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.settings import ALPHA_MAX, SplatSettings
+from edge_server.fields.splat.still_field import StillField
 from edge_server.surface.depth import render_depth_maps
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, world_rays
 from tests.edge_server.fields.scenes import ring
@@ -60,7 +59,7 @@ def flat(count: int, tilt: np.ndarray, seed: int = 0, thickness: float = -7.0) -
 
 
 def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
-    gaussians = Gaussians(params, 1, np.zeros((len(params), 3), np.float32))
+    gaussians = Gaussians(params, 1)
     raster, cams = RasterBuffers(POOL), camera_rows([POSE], [LENS], BOX)
     raster.project_and_bin(cams, gaussians, [None], differentiate=False)
     return raster, gaussians, cams[0]
@@ -68,7 +67,7 @@ def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
 
 def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
     out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory, raster.saved, out)
+    POOL.run(render_planes, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory, raster.saved, out)
     return out
 
 
@@ -119,7 +118,6 @@ def test_what_pixels_tell_adds_up_to_what_they_show():
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     POOL.run(
         accumulate_normals,
-        0,
         3,
         3,
         24,
@@ -149,14 +147,14 @@ def test_gaussians_turn_to_the_surface_they_show_and_get_flat():
     cloud = GaussianCloud.new(params)
     off = [_degrees(cloud, tilt)]
     for _ in range(12):
-        flatten(cloud, settings)
+        flatten(cloud, settings.flatten)
         raster, _, camera = looked(cloud.params)
-        align(cloud, settings, raster, camera, LENS)
+        align(cloud, settings.align, raster, camera, LENS)
         off.append(_degrees(cloud, tilt))
     assert off[-1] < 0.4 * off[0]
     scale = cloud.params[:, SCALE : SCALE + 3]
     assert (scale.max(axis=1) - scale.min(axis=1)).min() > 1.3
-    assert (scale.max(axis=1) - scale.min(axis=1)).max() <= np.log(settings.aspect) + 1e-5
+    assert (scale.max(axis=1) - scale.min(axis=1)).max() <= np.log(20.0) + 1e-5
 
 
 def _degrees(cloud: GaussianCloud, tilt: np.ndarray) -> float:
@@ -187,8 +185,8 @@ def test_hard_cases_stay_finite():
     depth, opacity = plane_depth(raster, gaussians, camera, LENS)
     assert np.isfinite(depth).all() and np.isfinite(opacity).all()
     cloud = GaussianCloud.new(params.copy())
-    align(cloud, SplatSettings(align=1.0), raster, camera, LENS)
-    flatten(cloud, SplatSettings(flatten=1.0))
+    align(cloud, 1.0, raster, camera, LENS)
+    flatten(cloud, 1.0)
     assert np.isfinite(cloud.params).all()
     empty, gaussians, camera = looked(params[:0])
     depth, opacity = plane_depth(empty, gaussians, camera, LENS)
@@ -198,7 +196,7 @@ def test_hard_cases_stay_finite():
 def test_a_field_that_is_asked_for_surfaces_shows_their_planes():
     views = ring(5, size=32)
     fields = [
-        SplatField(SplatSettings(gaussians=512, start=256, **more))
+        StillField(SplatSettings(gaussians=512, start=256, **more))
         for more in ({}, {"flatten": 0.02, "align": 0.3}, {"flatten": 0.02, "align": 0.3})
     ]
     for field in fields:

@@ -17,10 +17,10 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
-from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.layers import layered_field, static_field, static_layer
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
@@ -106,13 +106,13 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
 
 def test_the_option_makes_it() -> None:
     assert type(make_field("splat", {"layers": True, "threads": 1})) is LayeredField
-    assert type(make_field("splat", {"threads": 1})) is SplatField
+    assert type(make_field("splat", {"threads": 1})) is StillField
     with pytest.raises(ValueError, match="layers work on the CPU"):
         make_field("splat", {"layers": True, "device": "cuda"})
 
 
 def test_it_is_the_plain_field_at_first_and_where_a_camera_moves() -> None:
-    layered, plain = LayeredField(SMALL), SplatField(SMALL)
+    layered, plain = LayeredField(SMALL), StillField(SMALL)
     for field in (layered, plain):
         _run(field, range(4))
     _same_state(layered.first, plain)
@@ -219,7 +219,7 @@ def test_a_refused_state_changes_nothing() -> None:
     _run(field, range(2))
     before = field.state()
     for wrong in (
-        SplatField(SMALL).state(),
+        StillField(SMALL).state(),
         {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
         {k: v * np.nan if k == "moving.share" else v for k, v in _moving().state().items()},
         {

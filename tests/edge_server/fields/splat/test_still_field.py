@@ -1,0 +1,142 @@
+"""What only the field of still Gaussians does; ``test_every_representation`` has the rest."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget
+from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells
+from edge_server.fields.common.scene_box import scene_box
+from edge_server.fields.common.supervision import pack_cameras
+from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.seeding import seed_gaussians
+from edge_server.fields.splat.still_field import StillField
+from tests.edge_server.fields.scenes import picture
+from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, score
+from tests.edge_server.fields.splat.small import SMALL
+
+
+def test_nothing_begins_at_pixels_without_weight() -> None:
+    box, pool, rng = scene_box(SEEN), CallerPool(), np.random.default_rng
+    weight = [np.full(v.image.shape[:2], k % 2, np.float32) for k, v in enumerate(SEEN)]
+    found = []
+    for other in (False, True):  # views of weight 0 may show anything
+        views = [replace(v, image=255 - v.image) if other and k % 2 == 0 else v for k, v in enumerate(SEEN)]
+        share = np.concatenate([w.ravel() for w in weight])
+        found.append(seed_gaussians(SMALL, pool, box, views, None, share, 300, rng(1)))
+    assert len(found[0]) > 100
+    np.testing.assert_array_equal(found[0], found[1])
+    assert len(seed_gaussians(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(contracted: bool) -> None:
+    box, pool, cells = replace(scene_box(SEEN), contracted=contracted), CallerPool(), 12
+    cams = camera_rows([v.camera_to_world for v in SEEN], [v.intrinsics for v in SEEN], box)
+    data, rng = pack_cameras(SEEN, box), np.random.default_rng(3)
+    pixels = np.concatenate([v.image.reshape(-1, 3) for v in SEEN])
+    says = rng.choice([0, SEES, SEES + UNMARKED], len(pixels) + 1, p=[0.1, 0.7, 0.2]).astype(np.int32)
+    for k in range(0, len(SEEN), 2):  # most of them mark nothing
+        says[data.first[k] : data.first[k + 1]] = SEES + UNMARKED
+    says[-1] = 0
+    data = data._replace(weight=(says[:-1] > 0).astype(np.float32))
+
+    def scores(says: np.ndarray) -> np.ndarray:
+        found = np.zeros(cells**3, np.float32)
+        pool.run(
+            score_cells,
+            cams,
+            data,
+            pixels,
+            says,
+            False,
+            np.zeros(3, np.float32),
+            np.float32(0.3),
+            contracted,
+            cells,
+            2,
+            found,
+        )
+        return found
+
+    everywhere, where_marked = scores(np.zeros(0, np.int32)), scores(says)
+    side = (np.arange(cells) + 0.5) * (4.0 if contracted else 2.0) / cells - (2.0 if contracted else 1.0)
+    z, y, x = np.meshgrid(side, side, side, indexing="ij")
+    places = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    far = np.abs(places).max(axis=1, keepdims=True)
+    if contracted:
+        places = np.where(far > 1.0, places / ((2.0 - far) * far), places)
+    seen, unmarked = np.zeros(len(places), int), np.zeros(len(places), int)
+    for k, view in enumerate(SEEN):
+        away = places * box.radius_m + box.centre_m - view.camera_to_world[:3, 3]
+        local = away @ view.camera_to_world[:3, :3]
+        ahead = local[:, 2] > max(0.01 * box.radius_m, box.near_m)
+        u, v = np.where(ahead[:, None], view.intrinsics.project(np.where(ahead[:, None], local, 1.0)), -1.0).T
+        inside = (u >= 0) & (v >= 0) & (u < view.intrinsics.width) & (v < view.intrinsics.height)
+        pixel = np.where(inside, v.astype(int) * view.intrinsics.width + u.astype(int), 0)
+        told = np.where(inside, says[data.first[k] : data.first[k + 1]][pixel], 0)
+        seen, unmarked = seen + told % UNMARKED, unmarked + told // UNMARKED
+    expected = np.where(2 * unmarked > seen, NOT_SEEN, everywhere)
+    assert 0.02 < (expected > NOT_SEEN).mean() < 0.8 * (everywhere > NOT_SEEN).mean()
+    # Rounding puts the middle of a cell now and then into the next pixel.
+    assert (where_marked == expected).mean() > 0.99
+
+
+def test_warming_up_compiles_every_kernel() -> None:
+    """In a process of its own. The first step must not wait for a compiler."""
+    code = """
+from edge_server.fields.common.kernels import plane_sweep
+from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize
+from edge_server.fields.splat.still_field import StillField
+StillField().warm_up()
+for module in (plane_sweep, project, rasterize, bin_tiles, optimizer_step):
+    for name, thing in vars(module).items():
+        own = hasattr(thing, "signatures") and thing.py_func.__module__ == module.__name__
+        if own and thing.py_func.__code__.co_varnames[0] == "counter":
+            print(name, len(thing.signatures))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-1000:]
+    counts = dict(line.split() for line in done.stdout.splitlines())
+    assert {"project", "bin_tiles", "train_tiles", "render_tiles", "adam_step"} <= counts.keys()
+    assert set(counts.values()) == {"1"}, counts
+
+
+def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:
+    field = StillField(SMALL)
+    counts = []
+    for _ in range(12):
+        field.fit(SEEN, Budget(steps=20))
+        counts.append(len(field.cloud))
+    assert counts[0] < counts[-1] == max(counts) <= SMALL.gaussians and counts[-1] > 1400
+
+
+@pytest.mark.parametrize("harmonics", [4, 9])
+def test_view_dependent_colors_learn(harmonics: int) -> None:
+    field = StillField(replace(SMALL, harmonics=harmonics))
+    field.fit(SEEN, Budget(steps=200))
+    assert score(field) > 18.0
+
+
+def test_a_lens_with_distortion_needs_no_undistortion() -> None:
+    bent = replace(HELD.intrinsics, distortion=(-0.15, 0.02, 0.003, -0.002))
+    views = [replace(v, intrinsics=bent, image=picture(bent, v.camera_to_world)) for v in VIEWS]
+    field = StillField(SMALL)
+    field.fit(views[:6] + views[7:], Budget(steps=250))
+    assert score(field, views[6]) > 20.0
+    assert score(field, HELD) > 19.0, "a pinhole camera sees the same scene"
+
+
+def test_a_random_background_keeps_transparent_pixels_empty() -> None:
+    views = [cut_out(view) for view in SEEN]
+    field = StillField(replace(SMALL, background="random"))
+    field.fit(views, Budget(steps=150))
+    out = field.render(views[0].camera_to_world, views[0].intrinsics)
+    clear = views[0].image[..., 3] == 0
+    assert out.opacity[clear].mean() < 0.2 < 0.8 < out.opacity[~clear].mean()
