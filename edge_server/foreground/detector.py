@@ -100,9 +100,7 @@ class Detector:
         return mask
 
 
-def decode(
-    output: NDArray[np.floating], confidence: float, name: str, coefficients: int
-) -> list[tuple[float, ...]]:
+def decode(output: NDArray[np.floating], confidence: float, name: str, coefficients: int) -> list[tuple[float, ...]]:
     """Decode a YOLO head's ``output`` (1, 4 + kinds + coefficients, cells) or its transpose: center, size and
     a score per class, in pixels of the model's input, and the weights of the masks.
 

@@ -1,9 +1,9 @@
 """Measures meshes of one object: the tile on its bench (scenario ``scan``), segmented in several ways.
 
 The viewpoints are those of the scenario's arm. A field is fitted to whole images, and to images cut by the
-scenario's ``edge.foreground``, and by true masks. Each mesh is compared with the tile's surface, without bench and tools: error, the share of the surface within 3 mm
-of the mesh, and the share of the mesh within 3 mm of the surface. From whole images, a mesh is also made
-within the tile's bounding box, given by hand.
+scenario's ``edge.foreground``, and by true masks. Each mesh is compared with the tile's surface, without bench and
+tools: error, the share of the surface within 3 mm of the mesh, and the share of the mesh within 3 mm of the surface.
+From whole images, a mesh is also made within the tile's bounding box, given by hand.
 """
 
 from __future__ import annotations

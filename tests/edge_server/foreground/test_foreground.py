@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
 class Says:
     """A detector that always gives the same detections."""
 
-    kinds: dict[int, str] = {}
+    kinds: ClassVar[dict[int, str]] = {}
 
     def __init__(self, *found: Detection) -> None:
         self.found = list(found)
