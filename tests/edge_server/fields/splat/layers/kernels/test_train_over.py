@@ -9,7 +9,7 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.project import RED
-from edge_server.fields.splat.kernels.rasterize import Loss, train_tiles
+from edge_server.fields.splat.kernels.rasterize import Background, train_tiles
 from edge_server.fields.splat.layers.kernels.train_over import train_over
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params
@@ -46,7 +46,7 @@ def _trained(raster: RasterBuffers, plate: np.ndarray, weight: np.ndarray) -> tu
 def test_a_plate_of_one_color_is_a_background() -> None:
     raster, color = binned(CAMS, random_params(30)), np.array([0.2, 0.6, 0.4], np.float32)
     losses, sums = _trained(raster, np.broadcast_to(color * 255, IMAGE.shape).astype(np.float32), np.ones_like(WEIGHT))
-    tasks, expected = raster.tasks(), np.zeros((len(raster.tasks()), 3))
+    tasks, expected = raster.tasks(), np.zeros((len(raster.tasks()), 2))
     views = Views(
         first=np.array([0, 21 * 29]),
         size=np.array([[29, 21]]),
@@ -64,7 +64,7 @@ def test_a_plate_of_one_color_is_a_background() -> None:
         raster.columns,
         raster.projected,
         raster.lists,
-        Loss(False, np.float32(0), color, False, np.uint64(0)),
+        Background(color, False, np.uint64(0)),
         raster.memory,
         raster.saved,
         raster.sums,
