@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
 from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
 from edge_server.fields.common.threads.fair_lock import FairLock
-from edge_server.fields.common.threads.precompile import compile_ahead
-from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
+from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, ViewStore
 from freshfield.geometry import Pinhole
@@ -118,10 +117,9 @@ class SteppedField(ABC, Generic[S]):
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds.
 
-        Trains small fields of its own, in the calling thread and at its priority: at the workers' low one,
-        compiling on a busy machine takes minutes. This field's state is not touched.
+        Trains small fields of its own; this field's state is not touched.
         """
-        return compile_ahead(self._run_kernels)
+        return compile_kernels(self._run_kernels)
 
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: what was learned, moments, cameras, counters."""

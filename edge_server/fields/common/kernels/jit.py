@@ -5,36 +5,38 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numba
 from numba import njit, types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
-
 # No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimize away.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
-def _digest(fields: Path) -> str:
-    """Digest of the kernel sources of all representations. Kernels elsewhere (``surface.kernels``) call
-    parts of these only, and numba's own stamp covers the file that they stand in."""
+def cache_folder(root: Path) -> Path:
+    """Where compiled kernels are kept: a folder in $NUMBA_CACHE_DIR, or in the user's cache, for each state of
+    the sources. numba checks only the file that a function stands in, but kernels inline functions of others.
+
+    root: the package whose folders called ``kernels`` count.
+    """
     total = hashlib.sha256()
-    for path in sorted([*fields.glob("*/kernels/*.py"), *fields.glob("*/threads/*.py")]):
-        total.update(path.relative_to(fields).as_posix().encode() + path.read_bytes())
-    return total.hexdigest()
+    for path in sorted(root.rglob("kernels/*.py")):
+        total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = os.environ.get("NUMBA_CACHE_DIR") or f"{user}/freshfield"
+    return Path(folder, f"kernels-{total.hexdigest()[:16]}").expanduser()
 
 
-SOURCES = _digest(Path(__file__).parents[2])
+numba.config.CACHE_DIR = str(cache_folder(Path(__file__).parents[3]))
 
 
 @intrinsic
@@ -74,11 +76,11 @@ def part(function: Callable[..., Any]) -> Any:
     Otherwise every caller's object code has a copy, and the copy that a process happens to load first serves
     all callers. Copies differ in the last bits, so results would depend on what was called before.
     """
-    return _cached(_compiled(forceinline=True)(function))
+    return _compiled(forceinline=True, cache=True)(function)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """``njit`` with ``borrowed`` arguments, and a cache that depends on the sources of all kernels.
+    """``njit`` with ``borrowed`` arguments.
 
     ValueError: the function stands inside another one. All functions made there would share one cached code,
     since what they enclose is not part of the cache's key, unless ``__qualname__`` is set to a unique name.
@@ -97,45 +99,4 @@ def kernel(function: Callable[..., Any]) -> Any:
     outer.__code__ = outer.__code__.replace(**place)
     for name in ("__module__", "__qualname__", "__doc__"):
         setattr(outer, name, getattr(function, name))
-    return _cached(_compiled()(outer))
-
-
-def _cached(dispatcher: Any) -> Any:
-    """A compiled function, cached on disk.
-
-    numba's own cache checks only the file a function stands in, but kernels inline functions of other files.
-    The digest of all of them is made part of the cache's stamp, so that no outdated code runs.
-    """
-    dispatcher.enable_caching()
-    file = dispatcher._cache._cache_file
-    file._source_stamp = (*file._source_stamp, SOURCES)
-    file.save = partial(_save_alone, Path(file._cache_path), file.save)
-    file._load_index = partial(_load_index, file._load_index)
-    return dispatcher
-
-
-def _load_index(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
-    """``load``; empty if the index names types that today's sources no longer have."""
-    try:
-        return load()
-    except (AttributeError, ImportError):  # numba reads the types before it compares the stamp
-        return {}
-
-
-def _save_alone(folder: Path, save: Callable[..., None], key: Any, data: Any) -> None:
-    """``save`` under a lock between processes: numba reads a function's index, changes and writes it, so that
-    two processes that compile it for different types would overwrite each other's entries."""
-    if fcntl is None:
-        return save(key, data)
-    with open(folder / ".lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        return save(key, data)
-
-
-def is_stored(dispatcher: Any, types: tuple[Any, ...]) -> bool:
-    """Whether a kernel is compiled for arguments of these numba types, in this process or on disk."""
-    if types in dispatcher.overloads:
-        return True
-    cache, target = dispatcher._cache, dispatcher.targetctx
-    target.refresh()
-    return cache._index_key(types, target.codegen()) in cache._cache_file._load_index()
+    return _compiled(cache=True)(outer)

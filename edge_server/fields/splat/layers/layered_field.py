@@ -24,8 +24,7 @@ from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.field_state import all_or_nothing
 from edge_server.fields.common.supervision import check_view
-from edge_server.fields.common.threads.precompile import compile_ahead
-from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, shared_pool
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, compile_kernels, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.layered_state import pack, unpack
@@ -194,7 +193,7 @@ class LayeredField:
 
     def warm_up(self) -> float:
         """Compile every kernel, or load it from numba's cache; returns the seconds taken."""
-        return self.first.warm_up() + compile_ahead(self._run_kernels)
+        return self.first.warm_up() + compile_kernels(self._run_kernels)
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel of the layers once, in a small field of its own."""

@@ -1,10 +1,10 @@
-"""Compiled kernels are kept by name."""
+"""Compiled kernels are kept by name, and for each state of their sources."""
 
 from __future__ import annotations
 
 import pytest
 
-from edge_server.fields.common.kernels.jit import kernel
+from edge_server.fields.common.kernels.jit import cache_folder, kernel
 
 
 def test_a_kernel_within_a_function_needs_a_name_of_its_own() -> None:
@@ -15,3 +15,20 @@ def test_a_kernel_within_a_function_needs_a_name_of_its_own() -> None:
 
     with pytest.raises(ValueError, match=r"locals.*needs a __qualname__ of its own"):
         kernel(named)
+
+
+def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path, monkeypatch) -> None:
+    """Or an edit to one file would leave yesterday's code running where it is inlined into another."""
+    source, other = tmp_path / "fields" / "kernels" / "a.py", tmp_path / "fields" / "field.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("x = 1")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    first = cache_folder(tmp_path)
+    assert first.parent == tmp_path / "cache"
+    other.write_text("y = 1")
+    assert cache_folder(tmp_path) == first
+    source.write_text("x = 2")
+    assert cache_folder(tmp_path) != first
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    assert cache_folder(tmp_path).parent == tmp_path / "user" / "freshfield"

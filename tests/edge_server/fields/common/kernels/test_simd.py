@@ -1,0 +1,48 @@
+"""Exponential, logarithm and random numbers of the kernels against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from edge_server.fields.common.kernels.jit import FAST
+from edge_server.fields.common.kernels.simd import exp32, log32, uniform
+
+
+def _of_each(function):
+    @njit(fastmath=FAST)
+    def values(x):
+        out = np.empty_like(x)
+        for k in range(x.size):
+            out[k] = function(x[k])
+        return out
+
+    return values
+
+
+_exp, _log = _of_each(exp32), _of_each(log32)
+
+
+def test_exp32_is_exp() -> None:
+    x = np.linspace(-86.9, 87.9, 100_001).astype(np.float32)
+    np.testing.assert_allclose(_exp(x), np.exp(x.astype(np.float64)), rtol=3e-7)
+    edge = _exp(np.array([-1e30, 1e30, np.nan], np.float32))
+    assert 0 < edge[0] < 1e-37 and 1e38 < edge[1] < np.inf and np.isnan(edge[2])
+
+
+def test_log32_is_log() -> None:
+    x = np.exp(np.linspace(-87.0, 88.0, 100_001)).astype(np.float32)
+    np.testing.assert_allclose(_log(x), np.log(x.astype(np.float64)), rtol=2e-7, atol=1e-8)
+    near = np.linspace(0.99, 1.01, 10_001).astype(np.float32)
+    np.testing.assert_allclose(_log(near), np.log(near.astype(np.float64)), rtol=2e-7, atol=1e-8)
+
+
+@njit
+def _draw(key, count):
+    return np.array([uniform(key, np.uint64(k)) for k in range(count)])
+
+
+def test_uniform_is_uniform_and_streams_differ() -> None:
+    a, b = _draw(np.uint64(1), 20_000), _draw(np.uint64(2), 20_000)
+    assert a.min() >= 0.0 and a.max() < 1.0 and abs(a.mean() - 0.5) < 0.01
+    assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 0.03 and abs(np.corrcoef(a, b)[0, 1]) < 0.03
