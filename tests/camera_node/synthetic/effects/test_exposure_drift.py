@@ -41,14 +41,6 @@ def test_cameras_differ_by_the_spread_and_begin_anywhere():
     assert make(3).phase == drifts[3].phase
 
 
-def test_no_drift_is_no_change_and_the_given_image_stays():
-    image = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
-    kept = image.copy()
-    assert np.array_equal(make(amplitude_stops=0.0, offset_spread_stops=0.0).apply(image, 4, 3.0), image)
-    make(amplitude_stops=2.0).apply(image, 4, 3.0)
-    assert np.array_equal(image, kept)
-
-
 def test_transparency_stays():
     image = np.full((4, 4, 4), 100, np.uint8)
     out = make(amplitude_stops=2.0, offset_spread_stops=1.0).apply(image, 0, 0.3)

@@ -13,7 +13,7 @@ from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Sphere
 from camera_node.synthetic.textures import Plain
-from freshfield.geometry import Pinhole, se3_inverse
+from freshfield.geometry import se3_inverse
 from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
 
 LENS = {"k1": -0.22, "k2": 0.05, "p1": 0.004, "p2": -0.003}
@@ -68,10 +68,3 @@ def test_two_distortions_are_refused():
     scene = make_scene("room", {"width": 32, "height": 32, "distortion": [-0.1, 0.0, 0.0, 0.0]})
     with pytest.raises(EffectError, match="have a distortion already: drop one"):
         made().extend(scene)
-
-
-def test_no_coefficients_are_no_lens():
-    scene = make_scene("tile", {"width": 24, "height": 24, "supersample": 1})
-    straight = made(k1=0.0, k2=0.0, p1=0.0, p2=0.0).extend(scene)
-    assert np.array_equal(straight.render("cam02", 0.0), scene.render("cam02", 0.0))
-    assert isinstance(straight.cameras["cam02"][0], Pinhole) and not straight.cameras["cam02"][0].distorted

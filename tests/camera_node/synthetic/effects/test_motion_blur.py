@@ -37,12 +37,6 @@ def test_bright_images_do_not_overflow():
     assert (make(samples=64).expose(TimedRenderer(lambda t: white), 0.0) == 255).all()
 
 
-def test_one_sample_is_the_instant_itself():
-    scene = make_scene("room", {"width": 32, "height": 32, "supersample": 1})
-    renderer = scene.renderer("cam00")
-    assert np.array_equal(make(samples=1).expose(renderer, 1.0), renderer.image(1.0))
-
-
 def test_only_what_moves_is_blurred():
     scene = make_scene("room", {"width": 64, "height": 64, "supersample": 1, "speed_m_per_s": 4.0})
     render = scene.renderer("cam00").image

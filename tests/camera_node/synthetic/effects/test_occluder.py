@@ -56,8 +56,3 @@ def test_every_camera_count_sees_the_same_arm():
     """Nothing about the one body depends on who looks: entries of different runs may be shared."""
     few, many = (make().extend(make_scene("room", {**SMALL, "count": n})) for n in (2, 19))
     assert np.array_equal(few.render("cam01", 0.9), many.render("cam01", 0.9))
-
-
-def test_no_sweep_stands_still():
-    seen = make(sweep_deg=0.0).extend(make_scene("tile", SMALL))
-    assert np.array_equal(seen.render("cam03", 0.0), seen.render("cam03", 1.7))

@@ -43,13 +43,6 @@ def test_a_row_is_that_of_a_global_shutter_at_the_row_s_instant(name):
     assert np.abs(image.astype(int) - view.image(0.2)).max() > 30  # it does matter
 
 
-def test_no_readout_is_a_global_shutter_and_so_is_a_scene_at_rest():
-    moving = make_scene("room", {"width": 24, "height": 24, "supersample": 1}).renderer("cam00")
-    assert np.array_equal(make(readout_ms=0.0).expose(moving, 0.7), moving.image(0.7))
-    still = make_scene("tile", {"width": 24, "height": 24, "supersample": 1}).renderer("cam00")
-    assert np.array_equal(make(readout_ms=500.0).expose(still, 0.7), still.image(0.7))
-
-
 def test_several_rows_at_once_are_wrong_by_no_more_than_said():
     fine = make(readout_ms=100.0).expose(TimedRenderer(clock, CAMERA), 0.1).astype(int)
     renderer = TimedRenderer(clock, CAMERA)

@@ -14,6 +14,8 @@ from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere,
 from camera_node.synthetic.textures import Checker
 from freshfield.geometry import Pinhole, look_at
 
+pytestmark = pytest.mark.stability
+
 SHAPES = [
     Sphere(0.5),
     Box((0.5, 0.3, 0.7)),

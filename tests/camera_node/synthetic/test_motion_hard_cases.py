@@ -10,6 +10,8 @@ from camera_node.synthetic.effects import NAMES, load_effects
 from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pinhole, Pose, look_at
 
+pytestmark = pytest.mark.stability
+
 SMALL = {"width": 40, "height": 40, "supersample": 1}
 # Every effect there is, with what is slow by default made coarser.
 EFFECTS = {

@@ -13,6 +13,8 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pose
 
+pytestmark = pytest.mark.stability
+
 SCENE = {"width": 16, "height": 12, "supersample": 1, "speed_m_per_s": 8.0}
 # The ends of the ranges that the docstrings and messages promise.
 EXTREMES: dict[str, list[dict]] = {
