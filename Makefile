@@ -19,7 +19,7 @@ PORT ?= 8080
 # Folder of recorded data, for scenarios that stream it (fox, lego, kitchen).
 DATA ?=
 
-# Options of `make bench`, for edge-server bench: --quick, or --resume to go on where Ctrl-C stopped it.
+# Options of `make bench`, for edge-server bench, such as --quick.
 BENCH ?=
 
 # Options of `make figures`: studies (names, or groups as edge-server study has them), processes, and more for each
@@ -92,10 +92,10 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/check_report.py deploy/freshfield_up
 
-bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, runs/bench-*; DATA=FOLDER BENCH=--quick
+bench: .venv/.ok-test  ## measure this machine, hours: runs/bench, docs/results; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs
-	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all $(if $(DATA),peer) \
-	  --json $(if $(findstring --quick,$(BENCH)),runs/quick,docs/results)/field.json $(BENCH)
+	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all --out runs/bench $(BENCH)
+	$(if $(findstring --quick,$(BENCH)),,cp runs/bench/*.json runs/bench/*.md runs/bench/*.png docs/results)
 	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick

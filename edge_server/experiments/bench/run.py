@@ -1,8 +1,7 @@
-"""Code shared by the parts of the bench: their request, the recordings, the settings of a result."""
+"""Code shared by the parts of the bench: their request, the recordings, names of options."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.engine import Engine
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
-from edge_server.fields.registry import settings_of
+from edge_server.fields.registry import field_names, settings_of
 
 # Recordings: path below the data folder, and held-out views.
 RECORDINGS = {
@@ -32,43 +31,33 @@ class BenchError(RuntimeError):
 class BenchRun:
     """The request to one part of the bench; a part uses what it needs.
 
+    engine: measures the points, and keeps them.
     quick: fewer repetitions.
-    folder: an empty folder for temporary files.
-    lpips: folder of LPIPS weights; None: from the environment.
     fields: the representations to measure; empty: all.
-    store: results of this part, including those of an earlier run.
     scenes: the scenes to measure; empty: the part's default.
     options: options of the representations.
-    only: names of the options (or of the parts of surface) to measure; empty: all.
-    model: a YOLO ONNX file; None: the shipped ones.
+    lpips: folder of LPIPS weights; None: from the environment.
     """
 
-    quick: bool
-    folder: Path = Path()
-    lpips: Path | None = None
+    engine: Engine = field(default_factory=Engine)
+    quick: bool = False
     fields: tuple[str, ...] = ()
-    store: ResultStore = field(default_factory=ResultStore)
     scenes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
-    only: tuple[str, ...] = ()
-    model: Path | None = None
+    lpips: Path | None = None
 
-
-def result_settings(workload: Any, name: str, options: Mapping[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    """The settings with which a result is stored: of the workload and of the representation.
-
-    workload: a dataclass.
-    name, options: name and options of the representation.
-    """
-    return {**dataclasses.asdict(workload), "defaults": settings_digest(name, options), **more}
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The representations to measure."""
+        return self.fields or field_names()
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:
-    """Options of a representation as text, without those at their defaults. Raises ValueError for unknown
+    """A representation and its options as text, without those at their defaults. Raises ValueError for unknown
     options or invalid values."""
     usual, chosen = settings_of(name), settings_of(name, options)
     different = {k: v for k, v in options.items() if getattr(usual, k, None) != getattr(chosen, k, v)}
-    return ", ".join(f"{k}={v}" for k, v in different.items()) or "default"
+    return ", ".join([name, *(f"{k}={v}" for k, v in different.items())])
 
 
 def data_file(name: str) -> Path:
@@ -79,7 +68,29 @@ def data_file(name: str) -> Path:
     return Path(data) / name
 
 
+def recorded_files(scene: str) -> list[Path]:
+    """What a result on ``scene`` depends on: the folder of a recording, nothing of a synthetic scene."""
+    return [data_file(RECORDINGS[scene][0].split("/")[0])] if scene in RECORDINGS else []
+
+
 def open_recording(name: str, scale: float) -> MultiviewStill:
     """Open one of ``RECORDINGS``. scale: divides the image sizes. Raises DatasetError."""
     path, holdout = RECORDINGS[name]
     return open_still(str(data_file(path)), holdout=holdout, scale=scale)
+
+
+def available(scenes: tuple[str, ...], asked: bool) -> list[str]:
+    """The scenes whose recordings are there. Raises BenchError for a missing one if it was asked for; otherwise
+    prints why it is left out."""
+    found = []
+    for scene in scenes:
+        try:
+            missing = [str(path) for path in recorded_files(scene) if not path.is_dir()]
+            if missing:
+                raise DatasetError(f"there is no folder {missing[0]}")
+            found.append(scene)
+        except DatasetError as error:
+            if asked:
+                raise BenchError(f"{scene}: {error}") from None
+            print(f"  {scene} left out: {error}", flush=True)
+    return found

@@ -1,6 +1,6 @@
 """Measures meshes of one object: the tile on its bench (scenario ``scan``), segmented in several ways.
 
-The viewpoints are those of the scenario's arm. A field is fitted to whole images, and to images cut by the
+The viewpoints are those of the scenario's arm. A field is fitted to whole images, to images cut by the
 scenario's ``edge.foreground``, and by true masks. Each mesh is compared with the tile's surface, without bench and
 tools: error, the share of the surface within 3 mm of the mesh, and the share of the mesh within 3 mm of the surface.
 From whole images, a mesh is also made within the tile's bounding box, given by hand.
@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from time import perf_counter as _now
 from typing import Any
 
@@ -23,7 +25,6 @@ from edge_server.config import EdgeConfig, read_config
 from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
-from edge_server.experiments.training.detector.mask_quality import found_mask, iou
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 from edge_server.foreground import ForegroundError
@@ -44,6 +45,17 @@ WAYS: tuple[str, ...] = (_WHOLE, "detector", _TRUE)
 Mask = NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Point:
+    """What is measured: a key of ``WAYS``, images of ``size`` pixels a side every ``step_deg`` around the tile, and
+    ``steps`` of fitting."""
+
+    way: str
+    size: int
+    step_deg: float
+    steps: int
+
+
 def measure(run: BenchRun) -> dict[str, Any]:
     """Measure {views, size, steps, rows: {way: facts}}. Raises BenchError if an extra is missing."""
     try:
@@ -51,8 +63,21 @@ def measure(run: BenchRun) -> dict[str, Any]:
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
     size, step_deg, steps = (96, 24.0, 100) if run.quick else (192, 15.0, 400)
-    loaded = load(SCENARIO)
-    edge, source = read_config(loaded), source_config(loaded)
+    points = [Point(way, size, step_deg, steps) for way in WAYS]
+    found = run.engine.run(measure_point, points, "scanned", describe=lambda p, rows: f"{p.way}: {_said(rows[p.way])}")
+    return {
+        "views": len(_bench(size, step_deg)[1]),
+        "size": size,
+        "steps": steps,
+        "field": read_config(load(SCENARIO)).field,
+        "rows": {way: row for rows in found for way, row in rows.items()},
+    }
+
+
+@cache
+def _bench(size: int, step_deg: float) -> tuple[Scene, list[View], list[Mask], Truth]:
+    """The scene, its views, their true masks, and the tile's surface."""
+    source = source_config(load(SCENARIO))
     assert isinstance(source, WorldConfig) and source.arm is not None and source.arm.path is not None
     scene = make_scene(source.scene, {**source.scene_parameters(), "count": 1, "width": size, "height": size})
     lens, path = pinhole(scene.params), source.arm.path
@@ -63,27 +88,23 @@ def measure(run: BenchRun) -> dict[str, Any]:
     ]
     views = [View(f"v{k:02d}", scene.view(lens, p).image(0.0), p, lens) for k, p in enumerate(poses)]
     masks = [scene.object_mask(lens, pose) for pose in poses]
-    truth = surface_truth(Scan(scene, tuple(views)), SPACING_M)
-    load_meter = LoadMeter()
-    rows: dict[str, Any] = {}
-    for way in WAYS:
-        given, facts = _cut(way, views, masks, edge)
-        # Whole images show more than the tile, so the bounds of their field are unknown.
-        field, began = make_field(edge.field, {} if way == _WHOLE else edge.field_options, seed=0), _now()
-        field.fit(given, Budget(steps=steps))
-        maps = make_depth_maps(field.snapshot(), given, MeshSettings())
-        rows[way] = {**facts, **_compared(maps, MeshSettings(), truth), "seconds": _now() - began}
-        if way == _WHOLE:
-            rows[_BY_HAND] = {**_compared(maps, MeshSettings(bounds=_box(scene)), truth), "seconds": _now() - began}
-        print(f"  {way}: {_said(rows[way])}", flush=True)
-    return {
-        "views": len(views),
-        "size": size,
-        "steps": steps,
-        "field": edge.field,
-        "rows": rows,
-        "outside_cores": load_meter.outside_cores(),
-    }
+    return scene, views, masks, surface_truth(Scan(scene, tuple(views)), SPACING_M)
+
+
+def measure_point(point: Point) -> dict[str, dict[str, Any]]:
+    """Measure one way; returns its row, and of whole images also that of the mesh cut by hand. Raises BenchError."""
+    scene, views, masks, truth = _bench(point.size, point.step_deg)
+    edge, way, load_meter = read_config(load(SCENARIO)), point.way, LoadMeter()
+    given, facts = _cut(way, views, masks, edge)
+    # Whole images show more than the tile, so the bounds of their field are unknown.
+    field, began = make_field(edge.field, {} if way == _WHOLE else edge.field_options, seed=0), _now()
+    field.fit(given, Budget(steps=point.steps))
+    maps = make_depth_maps(field.snapshot(), given, MeshSettings())
+    rows = {way: {**facts, **_compared(maps, MeshSettings(), truth), "seconds": _now() - began}}
+    if way == _WHOLE:
+        rows[_BY_HAND] = {**_compared(maps, MeshSettings(bounds=_box(scene)), truth), "seconds": _now() - began}
+    outside = load_meter.outside_cores()
+    return {name: {**row, "outside_cores": outside} for name, row in rows.items()}
 
 
 def _cut(way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfig) -> tuple[list[View], dict[str, Any]]:
@@ -104,9 +125,8 @@ def _cut(way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfi
     out, ious = [], []
     for view, mask in zip(views, masks):
         image = cut.apply(view.camera, view.image)
-        # An image in which nothing is found is used whole.
-        found = found_mask(image, full=True)
-        ious.append(0.0 if found is None else iou(found, mask))
+        # An image in which nothing is found is used whole, and has no alpha.
+        ious.append(iou(image[..., 3] > 0 if image.shape[2] == 4 else np.ones_like(mask), mask))
         out.append(dataclasses.replace(view, image=image))
     status = cut.status()
     return out, {
@@ -115,6 +135,11 @@ def _cut(way: str, views: Sequence[View], masks: Sequence[Mask], edge: EdgeConfi
         "whole": len(views) - cut.counts.masked,
         "ms": status["ms_per_image"],
     }
+
+
+def iou(a: Mask, b: Mask) -> float:
+    """Intersection over union of two masks (H, W)."""
+    return float((a & b).sum() / max(int((a | b).sum()), 1))
 
 
 def _box(scene: Scene) -> tuple[Corner, Corner]:
@@ -141,14 +166,13 @@ def table(figures: dict[str, Any]) -> str:
     """A Markdown table with a row per segmentation."""
     about = (
         f"The tile on the bench of `{SCENARIO}`, {figures['views']} images of {figures['size']} x "
-        f"{figures['size']}, {figures['field']}, {figures['steps']} steps; outside cores: "
-        f"{figures['outside_cores']}."
+        f"{figures['size']}, {figures['field']}, {figures['steps']} steps."
     )
     rows: list[tuple[Any, ...]] = []
     for way, row in figures["rows"].items():
         masks = (number(row.get("iou")), number(row.get("least")), number(row.get("ms")))
         if "failed" in row:
-            rows.append((way, *masks, row["failed"], *[""] * 5))
+            rows.append((way, *masks, row["failed"], *[""] * 6))
             continue
         rows.append(
             (
@@ -160,10 +184,11 @@ def table(figures: dict[str, Any]) -> str:
                 f"{100 * row['complete']:.0f} %",
                 f"{100 * row['precise']:.0f} %",
                 f"{row['seconds']:.0f}",
+                number(row["outside_cores"]),
             )
         )
     head = (
         "cut by|mask IoU|least|ms|chamfer mm|mesh to tile mm|tile to mesh mm|surface within 3 mm|"
-        "mesh within 3 mm|seconds"
+        "mesh within 3 mm|seconds|outside cores"
     )
     return f"{about}\n\n{markdown_table(head.split('|'), rows)}"

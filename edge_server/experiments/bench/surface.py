@@ -6,7 +6,8 @@ by the images (``surface.refine_depth``), with truncated signed distances at sev
 fitted distance function. Row ``exact`` fuses the exact depth, which is the best possible result with images
 of this size and these cameras.
 
-The same is measured from the viewpoints of scenario ``cell``, with its field after ``CELL_STEPS`` steps.
+``measure_cell`` measures the same from the viewpoints of scenario ``cell``, with its field after ``CELL_STEPS``
+steps.
 """
 
 from __future__ import annotations
@@ -15,15 +16,13 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.bench.run import BenchError, BenchRun
-from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.mesh_truth import SPACING_M
 from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, cell_scan, exact_depth, scan, surface_truth
@@ -80,54 +79,67 @@ FULL = Workload(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES), (128, 384
 QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"), (128,))
 
 
+@dataclass(frozen=True)
+class Point:
+    """What is measured: a case (a key of ``CASES``), or exact depth ("")."""
+
+    case: str
+    workload: Workload
+
+
 def measure(run: BenchRun) -> dict[str, Any]:
-    """Measure {cell: {SIZE: {...}}, scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}; only the
-    cell if ``run.only`` says so. Raises BenchError if scikit-image is missing, or for an unknown
-    ``run.only``."""
-    try:
-        import skimage  # noqa: F401 -- checked before the fits, which take minutes
-    except ImportError:
-        raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
-    if set(run.only) - {"cell"}:
-        raise BenchError(f"--only {', '.join(run.only)}: of surface, only cell can be measured alone")
-    workload, store = QUICK if run.quick else FULL, run.store
+    """Measure {scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}. Raises BenchError if scikit-image is
+    missing."""
+    _check_extra()
+    workload = QUICK if run.quick else FULL
     names = workload.cases
     if run.fields:
         names = tuple(n for n, (representation, _) in CASES.items() if representation in run.fields)
-    for size in workload.cell_sizes:
-        about_cell = {"size": size, "steps": CELL_STEPS, "defaults": settings_digest(CELL_FIELD, {})}
-        store.get("cell", str(size), settings=about_cell, compute=partial(_cell, size))
-    if "cell" in run.only:
-        return store.results
-    close = scan(workload.size)
-    truth = surface_truth(close)
-    store.results["scan"] = {
+    points = [Point(name, workload) for name in ("", *names)]
+    exact, *cases = run.engine.run(measure_point, points, "surface", describe=lambda p, _: p.case or "exact depth")
+    close, truth, _ = _scanned(workload.size)
+    facts = {
         "views": len(close.views),
         "size": workload.size,
         "distance_m": DISTANCE_M,
         "truth_points": len(truth.points),
         "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
     }
-    exact = [exact_depth(close.scene, view) for view in close.views]
-    # Results with other settings are measured again; a change of the cases alone keeps them.
-    about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm, "depths": list(DEPTHS)}
-    store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
-    progress = Progress(len(names) * workload.fit_s[-1])
-    for name in names:
-        case = partial(_case, name, workload, close, exact, truth, progress)
-        settings = {**about, "defaults": settings_digest(*CASES[name])}
-        store.get("cases", name, settings=settings, compute=case)
-    return store.results
+    return {"scan": facts, "exact": exact, "cases": dict(zip(names, cases))}
 
 
-def _exact_meshes(
-    workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
-) -> dict[str, Any]:
+def measure_cell(run: BenchRun) -> dict[str, Any]:
+    """Measure {SIZE: figures} of the meshes from the viewpoints of ``cell``. Raises BenchError if scikit-image is
+    missing."""
+    _check_extra()
+    sizes = (QUICK if run.quick else FULL).cell_sizes
+    return {str(size): row for size, row in zip(sizes, run.engine.run(cell_mesh, sizes, "cell"))}
+
+
+def _check_extra() -> None:
+    try:
+        import skimage  # noqa: F401 -- checked before the fits, which take minutes
+    except ImportError:
+        raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
+
+
+@cache
+def _scanned(size: int) -> tuple[Scan, Truth, list[NDArray[np.float64]]]:
+    """The scan, its surface, and the exact depth of its views."""
+    close = scan(size)
+    return close, surface_truth(close), [exact_depth(close.scene, view) for view in close.views]
+
+
+def measure_point(point: Point) -> dict[str, Any]:
+    """Measure one case: fits that each continue the previous one; or the meshes of the exact depth."""
+    close, truth, exact = _scanned(point.workload.size)
+    if point.case:
+        return _case(point.case, point.workload, close, exact, truth)
     maps = _exact_maps(close, exact)
-    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in workload.voxels_mm]}
+    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in point.workload.voxels_mm]}
 
 
-def _cell(size: int) -> dict[str, Any]:
+def cell_mesh(size: int) -> dict[str, Any]:
     """Measure the mesh of ``edge-server export`` from the cell's viewpoints, and the one from exact depth."""
     close = cell_scan(size)
     truth, exact = surface_truth(close, SPACING_M), [exact_depth(close.scene, v) for v in close.views]
@@ -155,9 +167,8 @@ def _exact_maps(close: Scan, exact: Sequence[NDArray[np.float64]]) -> list[Depth
 
 
 def _case(
-    name: str, workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth, progress: Progress
+    name: str, workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
 ) -> dict[str, Any]:
-    """Measure one case: fits that each continue the previous one."""
     representation, options = CASES[name]
     field = make_field(representation, {**close.options, **options})
     field.warm_up()
@@ -180,9 +191,8 @@ def _case(
             fit[depth] = {**_depth_error(maps, exact), **{f"{k}_s": v for k, v in seconds.items()}}
             fit["meshes"] += [_mesh(maps, method, depth, mm, truth) for method, mm in wanted]
         fits.append(fit)
-        progress.advance(until - (fits[-2]["fit_s"] if len(fits) > 1 else 0.0))
         best = min((m["chamfer_mm"] for m in fit["meshes"] if "chamfer_mm" in m), default=float("nan"))
-        progress.report(name, f"{until:g} s", f"{steps} steps, best chamfer {best:.2f} mm")
+        print(f"  {name}, {until:g} s: {steps} steps, best chamfer {best:.2f} mm", flush=True)
     return {"fits": fits, "outside_cores": load.outside_cores()}
 
 
@@ -207,12 +217,11 @@ def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, tr
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Three Markdown tables: depth, meshes, and meshes of the cell."""
-    about = f"Target: {TARGET}."
-    if facts := figures.get("scan"):
-        size = f"{facts['size']} x {facts['size']}"
-        about = f"{facts['views']} images of {size} of `tile` from {facts['distance_m']:g} m. {about}"
-    fits = [(name, fit) for name, case in figures.get("cases", {}).items() for fit in case["fits"]]
+    """Two Markdown tables: depth, and meshes."""
+    facts = figures["scan"]
+    size = f"{facts['size']} x {facts['size']}"
+    about = f"{facts['views']} images of {size} of `tile` from {facts['distance_m']:g} m. Target: {TARGET}."
+    fits = [(name, fit) for name, case in figures["cases"].items() for fit in case["fits"]]
     depths = []
     for name, fit in fits:
         for depth in DEPTHS:
@@ -231,7 +240,7 @@ def table(figures: dict[str, Any]) -> str:
                     seconds,
                 )
             )
-    made = [("exact", "", m) for m in figures.get("exact", {}).get("meshes", [])]
+    made = [("exact", "", m) for m in figures["exact"]["meshes"]]
     made += [(name, f"{fit['fit_s']:g}", m) for name, fit in fits for m in fit["meshes"]]
     meshes = []
     for name, fit_s, m in made:
@@ -255,6 +264,12 @@ def table(figures: dict[str, Any]) -> str:
         "field|fit s|depth|method|voxel mm|chamfer mm|accuracy mm (median)|completeness mm|"
         "within 3 mm: surface, mesh|triangles|seconds"
     )
+    every = ((of_depth, depths), (of_mesh, meshes))
+    return "\n\n".join((about, *(markdown_table(head.split("|"), rows) for head, rows in every)))
+
+
+def table_cell(figures: dict[str, Any]) -> str:
+    """A Markdown table of the meshes of the cell."""
     cells = [
         (
             size,
@@ -265,11 +280,10 @@ def table(figures: dict[str, Any]) -> str:
             f"{100 * c['complete']:.1f} % ({100 * c['exact_complete']:.1f}), {100 * c['precise']:.1f} %",
             f"{c['seconds']:.0f}",
         )
-        for size, c in figures.get("cell", {}).items()
+        for size, c in figures.items()
     ]
     of_cell = (
         "cell at|views|depth, median mm|chamfer mm (exact depth)|accuracy mm (median)|"
         "within 3 mm: surface (exact depth), mesh|seconds"
     )
-    every = ((of_depth, depths), (of_mesh, meshes), (of_cell, cells))
-    return "\n\n".join((about, *(markdown_table(head.split("|"), rows) for head, rows in every if rows)))
+    return f"Target: {TARGET}.\n\n{markdown_table(of_cell.split('|'), cells)}"

@@ -11,22 +11,20 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, data_file, result_settings
-from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.bench.run import RECORDINGS, BenchRun, available, data_file, recorded_files
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.common.tables import number as _db
 from edge_server.experiments.scenes.multiview_sequence import MultiviewSequence, recorded_sequence, synthetic_sequence
 from edge_server.experiments.scenes.multiview_still import mean_baselines
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
-from edge_server.fields.registry import field_names, make_field
+from edge_server.fields.registry import make_field
 from freshfield.machine_load import LoadMeter
 
 NEAR_DB = 0.5
@@ -60,15 +58,20 @@ class Workload:
         """The frames of the fresh fits, evenly spread from the first to the last."""
         return sorted({round(f) for f in np.linspace(0, self.updates, max(2, self.samples))})
 
-    def seconds(self) -> float:
-        """Duration of all fits of one representation on one scene."""
-        return sum(self.update_s) * self.updates + FRESH_S * len(self.sampled())
-
 
 FULL = Workload()
 QUICK = Workload(updates=16, samples=3)
 # For ``drift``: whether the quality of a field that follows a moving scene decreases.
 DRIFT, QUICK_DRIFT = Workload(updates=300), Workload(updates=32, update_s=(0.25,), samples=3)
+
+
+@dataclass(frozen=True)
+class Following:
+    """What is measured: one representation on one scene."""
+
+    scene: str
+    field: str
+    workload: Workload
 
 
 def measure(run: BenchRun) -> dict[str, Any]:
@@ -84,41 +87,43 @@ def measure_drift(run: BenchRun) -> dict[str, Any]:
     return _measured(run, QUICK_DRIFT if run.quick else DRIFT, SCENES[:1])
 
 
-def _measured(run: BenchRun, workload: Workload, scenes: Sequence[str]) -> dict[str, Any]:
+def _measured(run: BenchRun, workload: Workload, usual: Sequence[str]) -> dict[str, Any]:
     workload = replace(workload, options=run.options)
-    names = run.fields or field_names()
-    store, settings = run.store, {n: result_settings(workload, n, workload.options) for n in names}
-    sequences = dict(_sequences(workload, run.scenes or scenes, asked=bool(run.scenes)))
-    todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
-    progress = Progress(workload.seconds() * len(todo))
-    for scene, sequence in sequences.items():
-        of_first = partial(mean_baselines, sequence.training(0), sequence.truth(0))
-        store.get(scene, "baseline", compute=of_first)
-        store.results[scene] |= {"scene": sequence.describe(), "frame_ms": sequence.period_ms}
-        for name in names:
-            follow = partial(_follow, name, sequence, workload, progress)
-            store.get(scene, name, settings=settings[name], compute=follow)
-    return store.results
-
-
-def _sequences(workload: Workload, scenes: Sequence[str], asked: bool) -> Iterable[tuple[str, MultiviewSequence]]:
+    scenes = available(run.scenes or tuple(usual), asked=bool(run.scenes))
+    points = [Following(scene, name, workload) for scene in scenes for name in run.names]
+    rows = run.engine.run(
+        follow,
+        points,
+        "following",
+        files=lambda p: recorded_files(p.scene),
+        describe=lambda p, _: f"{p.field} {p.scene}",
+    )
+    figures: dict[str, Any] = {}
     for scene in scenes:
-        if scene == "room":
-            w = workload
-            made = synthetic_sequence(scene, w.cameras, w.size, w.fps, speed_m_per_s=w.speed_m_per_s)
-            yield scene, made
-            continue
-        path, holdout = RECORDINGS[scene]
-        try:
-            yield scene, replace(recorded_sequence(data_file(path), holdout), name=scene)
-        except DatasetError as error:
-            if asked:
-                raise BenchError(f"{scene}: {error}") from None
-            print(f"  {scene} left out: {error}", flush=True)
+        sequence = _sequence(scene, *_shape(workload))
+        base = mean_baselines(sequence.training(0), sequence.truth(0))
+        figures[scene] = {"baseline": base, "scene": sequence.describe(), "frame_ms": sequence.period_ms}
+    for point, row in zip(points, rows):
+        figures[point.scene][point.field] = row
+    return figures
 
 
-def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress: Progress) -> dict[str, Any]:
+def _shape(workload: Workload) -> tuple[int, int, float, float]:
+    return workload.cameras, workload.size, workload.fps, workload.speed_m_per_s
+
+
+@cache
+def _sequence(scene: str, cameras: int, size: int, fps: float, speed_m_per_s: float) -> MultiviewSequence:
+    if scene not in RECORDINGS:
+        return synthetic_sequence(scene, cameras, size, fps, speed_m_per_s=speed_m_per_s)
+    path, holdout = RECORDINGS[scene]
+    return replace(recorded_sequence(data_file(path), holdout), name=scene)
+
+
+def follow(point: Following) -> dict[str, Any]:
     """Measure one representation on one scene."""
+    name, workload = point.field, point.workload
+    sequence = _sequence(point.scene, *_shape(workload))
     load, scorer = LoadMeter(), Scorer()
     figures: dict[str, Any] = {"fresh": {}}
     make_field(name, workload.options).warm_up()
@@ -137,14 +142,12 @@ def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress
         stayed = _row(sequence.score(start, frame, scorer))
         stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
         figures["fresh"][str(frame)] = {**known[key], **stale}
-        progress.advance(FRESH_S)
-        progress.report(f"{name} {sequence.name}", f"fresh at frame {frame}", _score_text(known[key]))
+        print(f"  {name} {point.scene}, fresh at frame {frame}: {_score_text(known[key])}", flush=True)
     assert start is not None
     warm = start.state()
     for seconds in workload.update_s:
         start.load_state(warm)
-        run = f"{seconds:g}_s"
-        figures[run] = _run(start, sequence, workload, seconds, figures["fresh"], scorer, progress, f"{name} {run}")
+        figures[f"{seconds:g}_s"] = _run(start, sequence, workload, seconds, figures["fresh"], scorer)
     return {**figures, "outside_cores": load.outside_cores()}
 
 
@@ -155,8 +158,6 @@ def _run(
     seconds: float,
     fresh: Mapping[str, Mapping[str, Any]],
     scorer: Scorer,
-    progress: Progress,
-    label: str,
 ) -> dict[str, Any]:
     """Run updates of one duration, frame by frame."""
     rows: list[dict[str, Any]] = []
@@ -164,10 +165,8 @@ def _run(
         report = field.fit(sequence.training(frame), Budget(seconds=seconds))
         score = _row(sequence.score(field, frame, scorer))
         rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
-        progress.advance(seconds)
         if frame % max(1, workload.updates // 10) == 0:
-            at = f"update {frame} of {workload.updates}"
-            progress.report(f"{label} {sequence.name}", at, _score_text(score))
+            print(f"  update {frame} of {workload.updates} of {seconds:g} s: {_score_text(score)}", flush=True)
     return summary(rows, fresh)
 
 
@@ -309,6 +308,9 @@ def table(figures: dict[str, Any]) -> str:
             )
         )
     return markdown_table(head.split("|"), rows)
+
+
+draw_drift, table_drift = draw, table
 
 
 def _length(run: str, found: Mapping[str, Any]) -> str:

@@ -18,12 +18,12 @@ def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(surface, "QUICK", Workload(40, (2.0,), (8.0,), ("splat",), (24,)))
     monkeypatch.setattr(surface, "CELL_STEPS", 20)
     monkeypatch.setattr(surface, "scan", lambda size: scan(size, RASTER_M[4:8]))  # 20 of 60 views
-    words = ["bench", "surface", "--quick", "--json", str(tmp_path / "s.json")]
+    words = ["bench", "surface", "cell", "--quick", "--out", str(tmp_path)]
     assert edge_server(words) == 0
-    found = json.loads((tmp_path / "s.json").read_text())["surface"]
+    found = json.loads((tmp_path / "surface.json").read_text())["surface"]
     (exact,) = found["exact"]["meshes"]
     assert exact["chamfer_mm"] < 3.0 and exact["complete"] > 0.8
-    cell = found["cell"]["24"]
+    cell = json.loads((tmp_path / "cell.json").read_text())["cell"]["24"]
     assert cell["views"] == 51 and 0.0 < cell["exact_chamfer_mm"] < cell["chamfer_mm"]
     (fit,) = found["cases"]["splat"]["fits"]
     assert {(m["depth"], m["method"]) for m in fit["meshes"]} == {
@@ -39,8 +39,5 @@ def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     )
     assert sharpened["chamfer_mm"] < rough["chamfer_mm"]
     assert "| exact |  | exact | tsdf | 8 |" in capsys.readouterr().out
-    assert edge_server([*words, "--resume"]) == 0
-    assert edge_server([*words[:-1], str(tmp_path / "cell.json"), "--only", "cell", "--resume"]) == 0
-    assert json.loads((tmp_path / "cell.json").read_text())["surface"].keys() == {"cell"}
-    again = json.loads((tmp_path / "s.json").read_text())["surface"]
-    assert again["cases"] == found["cases"]
+    assert edge_server(words) == 0
+    assert json.loads((tmp_path / "surface.json").read_text())["surface"] == found

@@ -55,15 +55,18 @@ def flat(monkeypatch: pytest.MonkeyPatch) -> type[Flat]:
 
 
 def bench(path: Path, *words: str) -> int:
-    return edge_server(["bench", "track", "--quick", "--json", str(path), "--scene", "room", *words])
+    return edge_server(["bench", "track", "--quick", "--out", str(path), "--scene", "room", *words])
+
+
+def figures(path: Path) -> Any:
+    return json.loads((path / "track.json").read_text())["track"]["room"]
 
 
 def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(track, "QUICK", replace(TINY, update_s=(0.1,)))
     monkeypatch.setattr(track, "FRESH_S", 0.5)
-    path = tmp_path / "bench.json"
-    assert bench(path, "--field", "ngp", *SMALL_WORDS) == 0
-    found = json.loads(path.read_text())["track"]["room"]["ngp"]
+    assert bench(tmp_path, "--field", "ngp", *SMALL_WORDS) == 0
+    found = figures(tmp_path)["ngp"]
     run = found["0.1_s"]
     assert run["series"]["frame"] == [1, 2, 3] and max(run["series"]["steps"]) >= 1
     assert sorted(found["fresh"]) == ["0", "3"] and found["fresh"]["3"]["steps"] >= 1
@@ -71,8 +74,8 @@ def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_pa
         assert len(set(run["series"][metric])) == 3  # every update was scored on its own
     assert run["whole"]["mean_db"] == pytest.approx(np.mean(run["series"]["psnr_db"]))
 
-    assert (path.parent / "track.png").read_bytes()[:4] == b"\x89PNG"
-    text = path.with_suffix(".md").read_text()
+    assert (tmp_path / "track.png").read_bytes()[:4] == b"\x89PNG"
+    text = (tmp_path / "track.md").read_text()
     assert "![track](track.png)" in text
     row = next(line for line in text.splitlines() if line.startswith("| room | ngp |"))
     cells = [cell.strip() for cell in row.split("|")[1:-1]]
@@ -87,28 +90,16 @@ def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_pa
 def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, monkeypatch, flat):
     """Interpolation is exact at the sampled frames, and every frame is sampled here."""
     monkeypatch.setattr(track, "QUICK", replace(track.QUICK, updates=4, samples=5))
-    assert bench(tmp_path / "bench.json", "--field", "ngp") == 0
-    found = json.loads((tmp_path / "bench.json").read_text())["track"]["room"]["ngp"]
+    assert bench(tmp_path, "--field", "ngp") == 0
+    found = figures(tmp_path)["ngp"]
     assert set(found) >= {"fresh", "1_s", "0.25_s"}
     for kind in ("whole", "moving"):
-        figures = found["1_s"][kind]
-        assert figures["share_near"] == 1.0
-        assert figures["median_db"] == pytest.approx(0.0, abs=1e-12)
-        assert figures["drift_db"] == pytest.approx(0.0, abs=1e-12)
+        gap = found["1_s"][kind]
+        assert gap["share_near"] == 1.0
+        assert gap["median_db"] == pytest.approx(0.0, abs=1e-12)
+        assert gap["drift_db"] == pytest.approx(0.0, abs=1e-12)
     fresh = found["fresh"]["4"]
     assert fresh["psnr_db"] == fresh["not_updated_psnr_db"] and fresh["fitted_s"] == 15.0
-
-
-@pytest.mark.slow  # 9 s of updates
-def test_drift_is_the_same_at_length_and_kept_apart(tmp_path, flat):
-    path = tmp_path / "bench.json"
-    assert bench(path, "--field", "ngp") == 0
-    words = ["bench", "drift", "--quick", "--resume", "--json", str(path), "--field", "ngp"]
-    assert edge_server(words) == 0
-    found = json.loads(path.read_text())
-    assert found["track"]["room"]["ngp"]["1_s"]["updates"] == 3
-    assert list(found["drift"]) == ["room"] and found["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 32
-    assert "![drift](drift.png)" in path.with_suffix(".md").read_text()
 
 
 def test_gaps_are_against_the_interpolated_fresh_fits():
@@ -131,64 +122,30 @@ def test_gaps_are_against_the_interpolated_fresh_fits():
 
 
 def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, monkeypatch, capsys):
-    path = tmp_path / "bench.json"
-    words = ("--field", "ngp", "--field", "tensorf")
+    words = ("--field", "ngp,tensorf")
     flat.interrupt = 2 + 2 * 3 + 2 + 2  # the second update of tensorf's first run
-    assert bench(path, *words) == 130
-    assert "--resume goes on" in capsys.readouterr().out
-    rows = json.loads(path.read_text())["track"]["room"]
-    assert "tensorf" not in rows and "| room | ngp | 1 s (7 steps) | 3 |" in path.with_suffix(".md").read_text()
-    assert (tmp_path / "track.png").is_file()
+    assert bench(tmp_path, *words) == 130
+    assert "the same command goes on" in capsys.readouterr().out
+    (kept,) = map(json.loads, (tmp_path / "results.jsonl").read_text().splitlines())
+    assert kept["inputs"]["field"] == "ngp"
 
     flat.interrupt, flat.fits = None, 0
-    assert bench(path, *words, "--resume") == 0
+    assert bench(tmp_path, *words) == 0
     assert flat.fits == 2 + 2 * 3  # tensorf's alone
-    whole = json.loads(path.read_text())["track"]["room"]
-    assert whole["ngp"] == rows["ngp"] and whole["tensorf"]["0.25_s"]["series"]["frame"] == [1, 2, 3]
+    rows = figures(tmp_path)
+    assert rows["ngp"] == kept["result"] and rows["tensorf"]["0.25_s"]["series"]["frame"] == [1, 2, 3]
 
     # Other settings are other figures.
     monkeypatch.setattr(track, "QUICK", replace(TINY, updates=2))
-    assert bench(path, *words, "--resume") == 0
-    assert json.loads(path.read_text())["track"]["room"]["ngp"]["1_s"]["updates"] == 2
+    assert bench(tmp_path, *words) == 0
+    assert figures(tmp_path)["ngp"]["1_s"]["updates"] == 2
 
 
-def test_resume_refuses_what_was_measured_otherwise(tmp_path, flat, capsys):
-    path = tmp_path / "bench.json"
-    assert bench(path, "--field", "ngp") == 0
-    for words in (["--json", str(path)], []):
-        with pytest.raises(SystemExit):
-            edge_server(["bench", "track", "--resume", *words])
-    told = capsys.readouterr().err
-    assert "was measured with --quick" in told and "--resume needs --json" in told
-    path.write_text("[]")
-    with pytest.raises(SystemExit):
-        bench(path, "--resume")
-    assert "is not what bench writes" in capsys.readouterr().err
-
-
-def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monkeypatch, capsys):
+def test_recordings_are_followed_too(tmp_path, flat, monkeypatch):
     write_recording(tmp_path / "blender_kitchen", cameras=5, instants=4, size=24)
     monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
-    words = ["bench", "track", "--quick", "--field", "ngp", "--scene", "kitchen", "--json"]
-    assert edge_server([*words, str(tmp_path / "bench.json")]) == 0
-    found = json.loads((tmp_path / "bench.json").read_text())["track"]["kitchen"]
+    words = ["bench", "track", "--quick", "--field", "ngp", "--scene", "kitchen", "--out", str(tmp_path / "out")]
+    assert edge_server(words) == 0
+    found = json.loads((tmp_path / "out" / "track.json").read_text())["track"]["kitchen"]
     assert found["scene"] == "kitchen: 4 views of 24 x 24" and found["ngp"]["1_s"]["updates"] == 3
     assert found["baseline"]["mean_colour_db"] > 0.0
-    monkeypatch.delenv("FRESHFIELD_DATA")
-    assert edge_server([*words, str(tmp_path / "none.json")]) == 1
-    assert "kitchen: set FRESHFIELD_DATA" in capsys.readouterr().err
-
-
-def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
-    with pytest.raises(SystemExit):
-        edge_server(["bench", "limits", "--scene", "room"])
-    assert "--scene is for field, track, drift, shown; asked for: limits" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        edge_server(["bench", "track", "--field", "tensorf", "--option", "upsample=64"])
-    assert "tensorf: upsample must be a list" in capsys.readouterr().err
-
-
-def test_an_unknown_scene_is_refused(flat, capsys):
-    with pytest.raises(SystemExit):
-        edge_server(["bench", "track", "--quick", "--scene", "attic"])
-    assert "--scene" in capsys.readouterr().err

@@ -7,23 +7,30 @@ processor time is measured; then it is charged, and updates take in no more fram
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.bench.run import BenchRun
-from edge_server.experiments.bench.shown.rows import FIRST_SEED, Row
-from edge_server.experiments.bench.shown.runs import LAYERS_RUN
-from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table, mean_or_none, number
 from edge_server.experiments.virtual.costs import UpdateCosts, beside_s
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, load, parse
 
 FREE_S, SETTLING_S, SCORED_S = 7.0, 1.0, 4.0
-SETTINGS = replace(LAYERS_RUN, steps=5)  # of the static field, about as many as another core does meanwhile
+SEED = 7
+# Steps of the static field: about as many as another core does meanwhile.
+SETTINGS = RunSettings(steps=5, epoch_ms=20.0, score_every_ms=None, shown_every_ms=50.0)
+# One thread, because the charged costs are those of one core.
+EDGE = {
+    "field": "splat",
+    "field_options": {"layers": True, "threads": 1},
+    "policy": {"name": "all"},
+    "updates": "arrivals",
+    "lpips": "none",
+    "grace_ms": 1000.0,
+}
 _SHED, _BUSY = 0.01, 0.9  # share of shed frames and following cores above which a point is saturated
 _SCORES = ("psnr_db", "psnr_moving_db", "psnr_still_db")
 _COSTS = ("update_ms", "view_ms", "following_cores", "static_cores")
@@ -50,82 +57,88 @@ _TEXT = (
 )
 
 
+@dataclass(frozen=True)
+class Point:
+    """A point. values: those of ``_FACTORS``, by name. free_s, settling_s, scored_s: seconds of its three parts."""
+
+    values: Mapping[str, float] = field(default_factory=dict)
+    free_s: float = FREE_S
+    settling_s: float = SETTLING_S
+    scored_s: float = SCORED_S
+
+
 def measure(run: BenchRun) -> dict[str, Any]:
     """Measure {FACTOR: {POINT: figures}}; a point that is in several factors is measured once."""
     seconds = (1.0, 0.2, 0.5) if run.quick else (FREE_S, SETTLING_S, SCORED_S)
-    done: dict[str, Any] = {}
-    for factor, points in POINTS.items():
-        for point in points:
-            values, scenario = {**dict(zip(_FACTORS, _ROOM)), **point}, _scenario(point)
-            sections = {key: getattr(scenario, key) for key in ("phase", "source", "channel", "edge")}
-            settings = {
-                "seconds": seconds,
-                "cameras": len(scenario.cameras),
-                **sections,
-                "run": asdict(SETTINGS),
-                "defaults": settings_digest(scenario.edge["field"], scenario.edge["field_options"]),
-            }
-            name = ", ".join(f"{values[key]:g}" for key in _FACTORS)
-            if name not in done:
-                done[name] = run.store.get(
-                    factor, name, settings=settings, compute=partial(_run, values, scenario, SETTINGS, *seconds)
-                )
-            found = run.store.put(factor, name, result=done[name])
-            print(
-                f"  {factor}: {name}: {number(found['psnr_db'])} / {number(found['psnr_moving_db'])} dB, "
-                f"{number(found['age_ms'], 0)} ms, {found['following_cores']:.2f} cores, "
-                f"shed {found['shed']:.0%}",
-                flush=True,
-            )
-    return run.store.results
+    room = dict(zip(_FACTORS, _ROOM))
+    points = {factor: [Point(room | point, *seconds) for point in of] for factor, of in POINTS.items()}
+    every = [point for of in points.values() for point in of]
+    found = iter(run.engine.run(measure_point, every, "growth", describe=_describe))
+    return {
+        factor: {", ".join(f"{v:g}" for v in point.values.values()): next(found) for point in of}
+        for factor, of in points.items()
+    }
 
 
-def _scenario(point: Mapping[str, float]) -> Scenario:
-    value = dict(zip(_FACTORS, _ROOM)) | dict(point)
+def _describe(point: Point, row: Mapping[str, Any]) -> str:
+    values = ", ".join(f"{v:g}" for v in point.values.values())
+    return (
+        f"{values}: {number(row['psnr_db'])} / {number(row['psnr_moving_db'])} dB, {number(row['age_ms'], 0)} ms, "
+        f"{row['following_cores']:.2f} cores, shed {row['shed']:.0%}"
+    )
+
+
+def _scenario(value: Mapping[str, float]) -> Scenario:
+    base = load("room", SEED)
     source = {
+        **base.source,
         "width": int(value["width"]),
         "height": int(value["height"]),
         "fps": value["fps"],
         "speed_m_per_s": value["speed, m/s"],
         "params": {"people": int(value["people"])},
     }
-    cameras = {"count": int(value["cameras"]) + 1, "phase": "spread"}
-    return Row("room", changes={"source": source, "cameras": cameras}).scenario(FIRST_SEED, "layers")
+    return parse(
+        {
+            "name": "room",
+            "seed": SEED,
+            "cameras": {"count": int(value["cameras"]) + 1, "held_out": list(base.held_out), "phase": "spread"},
+            "source": source,
+            "channel": dict(base.channel),
+            "edge": EDGE,
+        },
+        base.path,
+    )
 
 
-def _run(
-    point: Mapping[str, float],
-    scenario: Scenario,
-    settings: RunSettings,
-    free_s: float,
-    settling_s: float,
-    scored_s: float,
-) -> dict[str, Any]:
+def measure_point(point: Point) -> dict[str, Any]:
+    """Run one deployment; returns its scores, ages and costs."""
+    scenario, settings = _scenario(point.values), SETTINGS
     costs = UpdateCosts()
     deployment = build_deployment(
-        scenario, settings, on_published=lambda p: costs.published(deployment.updates, p.t_s >= free_s * 2 / 3)
+        scenario, settings, on_published=lambda p: costs.published(deployment.updates, p.t_s >= point.free_s * 2 / 3)
     )
     updates = deployment.updates
     costs.watch(updates.field)
-    deployment.run(free_s)
+    deployment.run(point.free_s)
     cost = costs.measured(deployment.with_images(tuple(updates.buffer.newest().values())))
     compute = replace(settings.compute, ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
     deployment.settings = replace(settings, compute=compute)
-    deployment.run(settling_s)
+    deployment.run(point.settling_s)
     shed, arrivals, beside = updates.buffer.shed, updates.buffer.arrivals, beside_s(updates.field)
     first = len(deployment.shown)
-    publications = deployment.run(scored_s)
+    publications = deployment.run(point.scored_s)
     shown = deployment.shown[first:]
     return {
         **{name: mean_or_none([getattr(score, name) for score in shown]) for name in _SCORES},
         "age_ms": mean_or_none(deployment.shown_age_ms[first:]),
         "instants": len(shown),
-        "updates_per_s": len(publications) / scored_s,
-        "following_cores": sum(p.update_ms for p in publications) / (1e3 * scored_s),
-        "static_cores": (beside_s(updates.field) - beside) / scored_s,
+        "updates_per_s": len(publications) / point.scored_s,
+        "following_cores": sum(p.update_ms for p in publications) / (1e3 * point.scored_s),
+        "static_cores": (beside_s(updates.field) - beside) / point.scored_s,
         "shed": (updates.buffer.shed - shed) / max(updates.buffer.arrivals - arrivals, 1),
         **cost,
-        "point": point,
+        "point": dict(point.values),
     }
 
 
