@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+
+import grpc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.clock_offset import OffsetEstimator
+from camera_node import clock_offset
+from camera_node.clock_offset import ClockSync, OffsetEstimator
+from freshfield.clock import WallClock
+from freshfield.v1 import clock_pb2 as pb
+from freshfield.v1 import clock_pb2_grpc as rpc
 
 MS = 1_000_000
 
@@ -44,3 +51,49 @@ def test_impossible_exchanges_are_ignored():
     for absurd in (-(2**63), 2**63 - 1):  # no frame's header has room for the offset
         estimator.add(10**18, absurd, absurd, 10**18 + 5)
     assert estimator.estimate(100) is None
+
+
+class _Peer(rpc.ClockServiceServicer):
+    """Answers at once by a right clock, fails once, then answers late by a clock that is an hour ahead."""
+
+    def __init__(self) -> None:
+        self.answers = 0
+
+    async def Exchange(self, request, context):
+        self.answers += 1
+        if self.answers == 6:
+            await context.abort(grpc.StatusCode.UNAVAILABLE, "restarting")
+        ahead_ns = 3600 * 10**9 if self.answers > 6 else 0
+        now_ns = WallClock().now_ns() + ahead_ns
+        answer = pb.ExchangeResponse(
+            client_sent_ns=request.client_sent_ns, server_received_ns=now_ns, server_sent_ns=now_ns
+        )
+        if ahead_ns:
+            await asyncio.sleep(0.05)
+        return answer
+
+
+def test_the_offset_follows_a_peer_that_comes_back_with_another_clock(monkeypatch):
+    """What the old peer answered, however promptly, says nothing about the new one's clock."""
+    monkeypatch.setattr(clock_offset, "PERIOD_S", 0.2)
+    monkeypatch.setattr(clock_offset, "_FIRST_PERIOD_S", 0.01)
+
+    async def offsets() -> list[float]:
+        server, peer = grpc.aio.server(), _Peer()
+        rpc.add_ClockServiceServicer_to_server(peer, server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        await server.start()
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+            sync = ClockSync(channel, (), WallClock())
+            running = asyncio.ensure_future(sync.run())
+            found = []
+            for answers in (5, 11):
+                while peer.answers < answers:
+                    await asyncio.sleep(0.01)
+                found.append(sync.offset().offset_ns / 1e9)
+            running.cancel()
+        await server.stop(None)
+        return found
+
+    before, after = asyncio.run(offsets())
+    assert abs(before) < 1.0 and abs(after - 3600.0) < 1.0
