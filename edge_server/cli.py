@@ -33,7 +33,6 @@ In the help of a command, [x] after an option is its default.
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
   edge-server simulate room --seconds 10
-  edge-server chaos --seeds 0..99 --jobs 2
   edge-server viewpoints tile --budget 8
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
@@ -83,16 +82,12 @@ _COMMANDS = {
         "experiments.virtual.costs",
         "measure the time that a scenario's updates take on this machine, for virtual time",
     ),
-    "chaos": (
-        "experiments.virtual.chaos",
-        "run small deployments in virtual time with random faults, and check invariants",
-    ),
     "viewpoints": (
         "experiments.viewpoints.command",
         "choose where a camera goes next around an object, within a budget of views or meters",
     ),
     "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
-    "bench": ("experiments.bench.command", "measure speed and quality on this machine: field, track, ingest and more"),
+    "bench": ("experiments.bench.command", "measure speed and quality on this machine: field, track, growth and more"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
     "export": ("export.command", "write a run's mesh, splats, points, cameras and poses as files for other programs"),
     "train-detector": (

@@ -43,6 +43,7 @@ _SIDE_BY_SIDE = (
     "channel_emu/estimate",
     "channel_emu/model",
     "channel_emu/virtual",
+    "chaos/test_seeds.py",
     "deploy/test_check_report.py",
     "deploy/test_docs.py",
     "deploy/test_scenarios.py",
@@ -65,6 +66,13 @@ _SIDE_BY_SIDE = (
     "test_architecture.py",
     "test_lazy_imports.py",
 )
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--seeds", default="2,4,7,11,23,89", metavar="A..B", help="seeds of -m chaos, or numbers [%(default)s]"
+    )
+    parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,62 +1,36 @@
-"""``edge-server chaos``: runs deployments in virtual time with faults drawn from seeds, and checks
-invariants."""
+"""Runs small deployments in virtual time, each with faults drawn from its seed, and checks invariants.
+
+After each run: every frame is accounted for as it really ended (ledgers against what happened), queues and memory are
+within their bounds, no number is NaN, every camera and the field are up to date again within 2 s of the last fault, and
+a second run has the same digest. The queue discipline of a shared line may starve cameras: of these one must be up to
+date. For a seed that fails, a minimal set of its faults is found, and the command that repeats the failure is told.
+"""
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import logging
 import tempfile
-import time
 import traceback
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera_node.capture import Camera
-from edge_server.experiments.common.arguments import at_least, command_parser
-from edge_server.experiments.common.result_store import ResultStore, content_key, processor
-from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.worker import WorkerContext, end_at_once, init_worker
-from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
-from edge_server.experiments.virtual.fault_plan import (
-    FAULTS_OVER_S,
-    QUEUE_LIMIT,
-    SECONDS,
-    Fault,
-    draw_faults,
-    scenario_of,
-)
 from edge_server.experiments.virtual.from_scenario import training_cameras
 from edge_server.experiments.virtual.simulate import digest
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.report.frame_accounting import FrameCounts, account_frames
-from freshfield.files import out_file
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA
-from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario
+from tests.chaos.chaos_deployment import ChaosDeployment
+from tests.chaos.fault_plan import FAULTS_OVER_S, QUEUE_LIMIT, SECONDS, Fault, draw_faults, scenario_of
 
-DESCRIPTION = """\
-Run small deployments in virtual time, each with faults drawn from its seed: processes that crash and stall,
-full and slow disks, cameras that go away, clocks that step, hostile messages, switched policies, resumed
-checkpoints.
-
-  edge-server chaos --seeds 0..99 --jobs 2
-  edge-server chaos --seeds 0..9999 --out runs/chaos.jsonl     # resumes where it was stopped
-  edge-server chaos --seeds 17 --faults 2,5                    # one seed, only these of its faults
-
-After each run: every frame is accounted for as it really ended (ledgers against what happened), queues and
-memory are within their bounds, no number is NaN, every camera and the field are up to date again within 2 s
-of the last fault, and a second run has the same digest. The queue discipline of a shared line may starve
-cameras: of these one must be up to date. For a seed that fails, a minimal set of its faults is found, and the
-command that repeats the failure is printed.
-"""
-_SETTINGS = RunSettings(
+SETTINGS = RunSettings(
     steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0, epoch_ms=100.0, score_every_ms=None
 )
 RECOVERY_S = 2.0
@@ -88,14 +62,14 @@ def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
 
 def _run(scenario: Scenario, cameras: list[Camera], faults: Sequence[Fault]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, _warnings_are_expected():
-        deployment = ChaosDeployment(scenario, cameras, _SETTINGS, faults, Path(folder))
+        deployment = ChaosDeployment(scenario, cameras, SETTINGS, faults, Path(folder))
         deployment.run(SECONDS)
         deployment.end()
         account = account_frames(Path(folder))
         recovery_ms = _recovery_ms(deployment, faults)
         text = json.dumps([sorted(deployment.really.items()), account.as_dict()])
         return {
-            "problems": [*_accounting(deployment, account), *_state(deployment), *_recovery(recovery_ms)],
+            "problems": [*accounting(deployment, account), *_state(deployment), *_recovery(recovery_ms)],
             "digest": hashlib.sha256((digest(deployment) + text).encode()).hexdigest(),
             "recovery_ms": recovery_ms,
             "counts": account.total.as_dict(),
@@ -117,7 +91,7 @@ def _warnings_are_expected() -> Iterator[None]:
             log.setLevel(level)
 
 
-def _accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
+def accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
     """Problems of the ledgers' accounting, compared with what really happened."""
     if account.contradictions and not deployment.lines_lost:
         yield f"contradiction: {account.contradictions[0]}"
@@ -207,51 +181,7 @@ def _kind(problem: str) -> str:
     return "".join(c for c in problem.partition("(")[0] if not c.isdigit())[:40]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit status: 1 where a seed fails."""
-    parser = command_parser("chaos", DESCRIPTION)
-    add = parser.add_argument
-    add("--seeds", type=_seeds, required=True, metavar="A..B", help="random seeds A to B, or A alone")
-    add("--faults", type=_numbers, metavar="K,...", help="numbers of the seeds' faults to inject [all]")
-    add("--jobs", type=at_least(1), default=1, metavar="N", help="number of worker processes [%(default)s]")
-    add("--out", type=out_file, metavar="FILE", help="keep results in FILE; seeds in it are not run again")
-    args = parser.parse_args(argv)
-    began, failed, slowest = time.monotonic(), 0, 0.0
-    store = ResultStore.in_lines(args.out) if args.out else ResultStore()
-    for number, found in enumerate(_results(args, store), 1):
-        slowest = max(slowest, found.get("recovery_ms") or 0.0)
-        if found["problems"]:
-            failed += 1
-            print(_failure(found, args.faults), flush=True)
-        if number % 100 == 0:
-            print(f"  {number} seeds, {failed} failed, {time.monotonic() - began:.0f} s", flush=True)
-    print(
-        f"{len(args.seeds)} seeds, {failed} failed; slowest recovery {slowest:.0f} ms; "
-        f"{time.monotonic() - began:.0f} s on {processor()}"
-    )
-    return 1 if failed else 0
-
-
-def _results(args: argparse.Namespace, store: ResultStore) -> Iterator[dict[str, Any]]:
-    """Each seed's result, in order; those that are not known are computed."""
-    keys = {seed: content_key([source_digest(), seed, args.faults]) for seed in args.seeds}
-    wanted = [seed for seed in args.seeds if store.find(keys[seed]) is None]
-    jobs = min(args.jobs, len(wanted))
-    share = (max(1, usable_cores() // max(1, jobs)),)
-    context = WorkerContext()
-    with ProcessPoolExecutor(jobs, context, init_worker, share) if jobs > 1 else nullcontext() as pool:
-        try:
-            each = map if pool is None else pool.map
-            computed = each(run_seed, wanted, [args.faults] * len(wanted))
-            for seed in args.seeds:
-                yield store.find(keys[seed]) or store.put(keys[seed], result=next(computed))
-        except BaseException:
-            if pool is not None:
-                end_at_once(pool)
-            raise
-
-
-def _failure(found: dict[str, Any], only: Sequence[int] | None) -> str:
+def failure(found: dict[str, Any], only: Sequence[int] | None = None) -> str:
     """Text with the problems of a seed, the faults needed for them, and the command that repeats them."""
     seed, problems = found["seed"], found["problems"]
     numbers = [f.number for f in draw_faults(seed, scenario_of(seed).training) if only is None or f.number in only]
@@ -264,20 +194,6 @@ def _failure(found: dict[str, Any], only: Sequence[int] | None) -> str:
             *(f"  {problem}" for problem in problems),
             f"  it takes {len(kept)} of its {len(numbers)} faults:",
             *faults,
-            f"  edge-server chaos --seeds {seed} --faults {words}",
+            f"  python -m pytest tests/chaos/test_seeds.py -m chaos --seeds {seed} --faults {words}",
         ]
     )
-
-
-def _seeds(text: str) -> range:
-    first, dots, last = text.partition("..")
-    if not first.isdigit() or (dots and not last.isdigit()) or int(last or first) < int(first):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected A..B, such as 0..99, or one seed")
-    return range(int(first), int(last or first) + 1)
-
-
-def _numbers(text: str) -> list[int]:
-    words = [] if text == "none" else text.split(",")
-    if not all(word.isdigit() for word in words):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected numbers of faults, such as 2,5, or none")
-    return sorted({int(word) for word in words})

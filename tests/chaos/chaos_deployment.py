@@ -27,7 +27,6 @@ from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import read_config
-from edge_server.experiments.virtual.fault_plan import ROLES, Fault
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment, WakeCondition
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
@@ -38,6 +37,7 @@ from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_re
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, seed_sequence
 from freshfield.v1 import frames_pb2 as pb
+from tests.chaos.fault_plan import ROLES, Fault
 
 # On a slow disk a checkpoint takes as long as this many lines.
 _CHECKPOINT_LINES = 20

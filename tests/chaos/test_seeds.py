@@ -1,4 +1,4 @@
-"""``edge-server chaos``: fixed seeds hold; what is broken on purpose is found, reduced and repeatable."""
+"""Deployments with faults drawn from seeds: ``pytest -m chaos --seeds 0..99``; what is broken on purpose is found."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_server.experiments.virtual import chaos, chaos_deployment
-from edge_server.experiments.virtual.chaos_deployment import ChaosDeployment
-from edge_server.experiments.virtual.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
 from edge_server.report import frame_accounting
 from freshfield.frame import checksum, from_request
+from tests.chaos import chaos_deployment, seeds
+from tests.chaos.chaos_deployment import ChaosDeployment
+from tests.chaos.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 
 
-@pytest.mark.parametrize("seed", [2, 4, 7, 11, 23, 89])
-def test_a_seed_holds(seed: int) -> None:
-    found = chaos.run_seed(seed)
-    assert found["problems"] == [] and found["counts"]["delivered"] > 20
+@pytest.mark.chaos
+def test_a_seed_holds(seed: int, faults: list[int] | None) -> None:
+    found = seeds.run_seed(seed, faults)
+    assert found["problems"] == [], seeds.failure(found, faults)
+    assert found["counts"]["delivered"] > 20
 
 
 def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
@@ -38,7 +39,7 @@ CRASHES = tuple(Fault(k, "crash", 500.0 + 200 * k, 150.0, role) for k, role in e
 
 def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeployment:
     scenario = scenario_of(seed)
-    deployment = ChaosDeployment(scenario, chaos.training_cameras(scenario), chaos._SETTINGS, faults, tmp_path)
+    deployment = ChaosDeployment(scenario, seeds.training_cameras(scenario), seeds.SETTINGS, faults, tmp_path)
     deployment.run(2.0)
     deployment.end()
     return deployment
@@ -51,7 +52,7 @@ def test_what_a_crashed_process_held_is_gone_and_accounted_for(tmp_path: Path) -
     assert sessions == {"restart-1"}
     assert deployment.really["broken"] > 0, "the edge was away"
     assert deployment.updates.start_ns > 10**9 > deployment.publications[0].published_ns
-    assert list(chaos._accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
+    assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
 
 
 def test_an_edge_goes_on_from_its_checkpoint_if_it_is_told_to(tmp_path: Path) -> None:
@@ -69,7 +70,7 @@ def test_an_edge_goes_on_from_its_checkpoint_if_it_is_told_to(tmp_path: Path) ->
 def test_hostile_messages_are_refused_by_many_reasons_and_counted_apart(tmp_path: Path) -> None:
     deployment = run(tmp_path, (Fault(0, "hostile", 600.0, value=300.0),))
     assert len(deployment.rejected) >= 8 and deployment.really["strangers"] > 20
-    assert list(chaos._accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
+    assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
 
 
 def test_a_full_disk_keeps_the_account_from_closing(tmp_path: Path) -> None:
@@ -85,7 +86,7 @@ def test_a_process_waits_for_its_slow_disk_and_loses_no_frame_unsaid(tmp_path: P
     for line_ms in (0.0, 100.0):
         (folder := tmp_path / str(line_ms)).mkdir()
         deployment = run(folder, (Fault(0, "slow_disk", 500.0, 1000.0, role, line_ms),))
-        assert list(chaos._accounting(deployment, frame_accounting.account_frames(folder))) == []
+        assert list(seeds.accounting(deployment, frame_accounting.account_frames(folder))) == []
         delivered.append(deployment.really["delivered"])
     assert delivered[1] < 0.9 * delivered[0]
 
@@ -171,34 +172,19 @@ def break_a_part(patch: pytest.MonkeyPatch) -> None:
         (learn_what_is_no_number, 2, "the field's params is not finite", None),
         (check_no_checksum, 6, "with a wrong checksum were taken in", "hostile"),
         (draw_without_seed, 2, "a second run has another digest", None),
-        (break_a_part, 7, "KeyError in test_chaos.py, policy: 'omega'", "policy"),
+        (break_a_part, 7, "KeyError in test_seeds.py, policy: 'omega'", "policy"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
 def test_what_is_broken_is_found_and_its_faults_are_reduced(
-    broken, seed: int, says: str, kind: str | None, monkeypatch: pytest.MonkeyPatch, capsys
+    broken, seed: int, says: str, kind: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken(monkeypatch)
-    assert chaos.main(["--seeds", str(seed)]) == 1
-    out = capsys.readouterr().out
-    assert says in out
-    kept = [line for line in out.splitlines() if line.startswith("    ")]
+    found = seeds.run_seed(seed)
+    told = seeds.failure(found).splitlines()
+    assert any(says in line for line in told)
+    kept = [line for line in told if line.startswith("    ")]
     assert len(kept) == (kind is not None) and (kind is None or kind in kept[0])
-    command = out.splitlines()[-2].split()
-    assert command[:4] == ["edge-server", "chaos", "--seeds", str(seed)]
-    assert chaos.main(command[2:]) == 1 and says in capsys.readouterr().out
-
-
-def test_known_results_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    words = ["--seeds", "2..3", "--out", str(tmp_path / "chaos.jsonl")]
-    assert chaos.main(words) == 0
-    monkeypatch.setattr(chaos, "run_seed", lambda *_: pytest.fail("it is known"))
-    assert chaos.main(words) == 0
-    assert capsys.readouterr().out.count("2 seeds, 0 failed") == 2
-
-
-@pytest.mark.parametrize("words", [["--seeds", "3..1"], ["--seeds", "a"], ["--seeds", "1", "--faults", "x"], []])
-def test_wrong_words_are_refused(words: list[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        chaos.main(words)
-    assert ended.value.code == 2
+    words = told[-1].partition("--faults ")[2]
+    again = seeds.run_seed(seed, [] if words == "none" else [int(word) for word in words.split(",")])
+    assert any(says in problem for problem in again["problems"])

@@ -1,4 +1,4 @@
-"""Deployments and faults drawn from a seed: what ``edge-server chaos`` runs."""
+"""Deployments and faults drawn from a seed."""
 
 from __future__ import annotations
 
