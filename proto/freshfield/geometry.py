@@ -131,13 +131,19 @@ def so3_log(rotation: ArrayLike) -> Array:
     return (2.0 * np.arctan2(s, q[0]) / s) * q[1:]
 
 
-def se3_inverse(transform: ArrayLike) -> Array:
-    """Inverse of a rigid transform (4, 4)."""
-    t = np.asarray(transform, dtype=np.float64)
-    out = np.eye(4)
-    out[:3, :3] = t[:3, :3].T
-    out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
+def se3(rotation: ArrayLike, translation_m: ArrayLike) -> Array:
+    """Rigid transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation_m, dtype=np.float64)
+    out = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = r, t, 1.0
     return out
+
+
+def se3_inverse(transform: ArrayLike) -> Array:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    t = np.asarray(transform, dtype=np.float64)
+    rotation = np.swapaxes(t[..., :3, :3], -1, -2)
+    return se3(rotation, -(rotation @ t[..., :3, 3:])[..., 0])
 
 
 def cross_matrix(w: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 # Defaults of the hand-eye calibration, here because the command line shows them without scipy.
 DEFAULT_METHOD = "refined"
-MAX_GAP_S = 0.05  # between a target pose and the nearest hand pose that it is paired with
+MAX_GAP_S = 0.05  # between a target pose and the nearest flange pose that it is paired with
 WANT_MM = 0.5  # a guided session ends when the standard deviation of the translation is below this
 
 

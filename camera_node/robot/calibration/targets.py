@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.square_corners import square_corners
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, se3
 
 Array = NDArray[np.float64]
 GrayImage = NDArray[np.uint8]
 
-SPELLINGS = "charuco:7x5:30mm:22mm, chessboard:9x6:23.6mm, apriltag:36h11:0:80mm or qr:60mm"
+NOTATIONS = "charuco:7x5:30mm:22mm, chessboard:9x6:23.6mm, apriltag:36h11:0:80mm or qr:60mm"
 # With fewer corners of a board, its orientation is too uncertain.
 _MIN_CORNERS = 6
 # Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
@@ -42,23 +42,6 @@ class Corners:
 
     pixels: Array
     points: Array
-
-
-@dataclass(frozen=True)
-class TargetPose:
-    """Pose of a target in one image.
-
-    pose: (4, 4) target in camera.
-    error_px: root mean square of the reprojection errors.
-    unit_covariance: (6, 6) of rotation (radians, target axes) and translation (meters, camera axes) for one
-        pixel of noise in each coordinate of a corner.
-    corners: those that it was estimated from.
-    """
-
-    pose: Array
-    error_px: float
-    unit_covariance: Array
-    corners: Corners
 
 
 @dataclass(frozen=True)
@@ -81,21 +64,21 @@ class Target:
     pattern_m: tuple[float, float]
 
 
-def parse_target(spelling: str) -> Target:
+def parse_target(spec: str) -> Target:
     """The target of a SPEC (see above). Raises CalibrationError."""
-    kind, *rest = spelling.split(":")
+    kind, *rest = spec.split(":")
     try:
         if kind not in _MAKERS:
             raise ValueError(f"no kind {kind!r}")
-        return _MAKERS[kind](spelling, *rest)
+        return _MAKERS[kind](spec, *rest)
     except (TypeError, ValueError, AttributeError) as error:
         why = f" ({error})" if isinstance(error, ValueError) else ""
-        raise CalibrationError(f"target {spelling!r}: expected for example {SPELLINGS}{why}") from None
+        raise CalibrationError(f"target {spec!r}: expected for example {NOTATIONS}{why}") from None
 
 
-def estimate_pose(corners: Corners, lens: Pinhole) -> TargetPose:
-    """Pose of a flat target from its corners. Raises CalibrationError if none is found or two are equally
-    likely (a small target seen straight on)."""
+def estimate_pose(corners: Corners, lens: Pinhole) -> Array:
+    """Pose (4, 4) of a flat target in the camera from its corners. Raises CalibrationError if none is found or two
+    are equally likely (a small target seen straight on)."""
     matrix, distortion = opencv_lens(lens)
     # OpenCV's origin is the center of the first pixel.
     pixels = np.ascontiguousarray(corners.pixels - 0.5)
@@ -108,16 +91,7 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> TargetPose:
     if count > 1 and len(corners.points) < 12 and errors[1] < _AMBIGUOUS * max(float(errors[0]), 0.05):
         raise CalibrationError("the target is seen so straight on that it may be tilted either way")
     turn, shift = cv2.solvePnPRefineLM(corners.points, pixels, matrix, distortion, turns[0], shifts[0])
-    again, slopes = cv2.projectPoints(corners.points, turn, shift, matrix, distortion)
-    off = again.reshape(-1, 2) - pixels
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    # By a shift, and by a rotation about the target's own axes instead of OpenCV's rotation vector.
-    by_shift = slopes[:, 3:6].reshape(-1, 2, 3)
-    by_turn = np.cross(corners.points[:, None], by_shift @ pose[:3, :3])
-    slopes = np.concatenate([by_turn, by_shift], axis=2).reshape(-1, 6)
-    error_px = float(np.sqrt(np.mean((off**2).sum(axis=1))))
-    return TargetPose(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
+    return se3(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
 def opencv_lens(lens: Pinhole) -> tuple[Array, Array]:
@@ -143,8 +117,8 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
     detector = cv2.aruco.CharucoDetector(board)
     places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
 
-    def find(picture: GrayImage) -> Corners | None:
-        pixels, numbers, _, _ = detector.detectBoard(picture)
+    def find(image: GrayImage) -> Corners | None:
+        pixels, numbers, _, _ = detector.detectBoard(image)
         if numbers is None or len(numbers) < _MIN_CORNERS:
             return None
         points = places[numbers.ravel()]
@@ -168,20 +142,20 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
     points = np.stack([x, y, np.zeros_like(x)], axis=1)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
-    def find(picture: GrayImage) -> Corners | None:
-        found, pixels = cv2.findChessboardCorners(picture, (across, down), flags=flags)
+    def find(image: GrayImage) -> Corners | None:
+        found, pixels = cv2.findChessboardCorners(image, (across, down), flags=flags)
         if not found:
             return None
         pixels = pixels.reshape(down, across, 2)
         # A third of the distance to the nearest neighbor, so that the window holds no other corner.
         steps = [np.linalg.norm(np.diff(pixels, axis=k), axis=2).min() for k in (0, 1)]
         window = int(np.clip(min(steps) / 3, 2, 11))
-        pixels = cv2.cornerSubPix(picture, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
+        pixels = cv2.cornerSubPix(image, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
         pixels = pixels.reshape(down, across, 2).astype(np.float64)
         # The detector may start at either end: of the two end squares, the one at the first corner is darker.
         first = pixels[:2, :2].mean(axis=(0, 1))
         last = pixels[-2:, -2:].mean(axis=(0, 1))
-        if _mean_level(picture, first) > _mean_level(picture, last):
+        if _mean_level(image, first) > _mean_level(image, last):
             pixels = pixels[::-1, ::-1]
         return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), points)
 
@@ -204,12 +178,12 @@ def _apriltag(name: str, family: str, number: str, size: str) -> Target:
         raise ValueError(f"family {family} has numbers 0 to {len(dictionary.bytesList) - 1}")
     detector = cv2.aruco.ArucoDetector(dictionary)
 
-    def find(picture: GrayImage) -> Corners | None:
-        pixels, numbers, _ = detector.detectMarkers(picture)
+    def find(image: GrayImage) -> Corners | None:
+        pixels, numbers, _ = detector.detectMarkers(image)
         at = [] if numbers is None else np.flatnonzero(numbers.ravel() == wanted)
         if len(at) != 1:  # absent, or ambiguous because the tag appears twice
             return None
-        return _refined_square(picture, pixels[int(at[0])], side)
+        return _refined_square(image, pixels[int(at[0])], side)
 
     def draw(width: int) -> GrayImage:
         return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
@@ -221,11 +195,11 @@ def _qr(name: str, size: str, *text: str) -> Target:
     side, wanted = _meters(size), ":".join(text)
     detector = cv2.QRCodeDetector()
 
-    def find(picture: GrayImage) -> Corners | None:
-        said, pixels, _ = detector.detectAndDecode(picture)
+    def find(image: GrayImage) -> Corners | None:
+        said, pixels, _ = detector.detectAndDecode(image)
         if not said or pixels is None or (wanted and said != wanted):
             return None
-        return _refined_square(picture, pixels, side)
+        return _refined_square(image, pixels, side)
 
     code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
     # Remove the encoder's quiet zone of two modules: it does not belong to the code's size.
@@ -246,14 +220,14 @@ _MAKERS: dict[str, Callable[..., Target]] = {
 }
 
 
-def _refined_square(picture: GrayImage, pixels: NDArray[Any], side: float) -> Corners:
+def _refined_square(image: GrayImage, pixels: NDArray[Any], side: float) -> Corners:
     points = np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
-    return Corners(square_corners(picture, pixels.reshape(4, 2).astype(np.float64)) + 0.5, points)
+    return Corners(square_corners(image, pixels.reshape(4, 2).astype(np.float64)) + 0.5, points)
 
 
-def _mean_level(picture: GrayImage, at: Array) -> float:
+def _mean_level(image: GrayImage, at: Array) -> float:
     x, y = np.rint(at).astype(int)
-    return float(picture[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
+    return float(image[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angles, inverse, transform_of
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angle_deg, distance_mm
+from freshfield.geometry import se3
 
 METHODS = {
     "tsai": cv2.CALIB_HAND_EYE_TSAI,
@@ -22,11 +22,12 @@ METHODS = {
 MAX_CLOSED_FORM = 60
 # Random subsets for the start of the refinement: some of them contain no outlier.
 _SUBSETS, _SUBSET_SIZE = 24, 5
+_LEVER_MM = 330.0
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Distances of each sample's target from the mean of all, in the frame where it is at rest.
+    """Distances of each sample's target from a center, in the frame where it is at rest.
 
     mm, deg: (N,) of translation and rotation.
     """
@@ -34,18 +35,30 @@ class Residuals:
     mm: Array
     deg: Array
 
-    @property
-    def rms_mm(self) -> float:
-        return float(np.sqrt(np.mean(self.mm**2)))
+    @staticmethod
+    def of(samples: Samples, x: Array, center: Array | None = None) -> Residuals:
+        """Residuals of any X (4, 4). center: (4, 4); None: the chordal mean of rotations and the mean of
+        translations."""
+        places = target_at_rest(samples, x)
+        if center is None:
+            rotation = Rotation.from_matrix(places[:, :3, :3]).mean().as_matrix()
+            center = se3(rotation, places[:, :3, 3].mean(axis=0))
+        return Residuals(distance_mm(center, places), angle_deg(center, places))
 
     @property
-    def rms_deg(self) -> float:
-        return float(np.sqrt(np.mean(self.deg**2)))
+    def rms(self) -> tuple[float, float]:
+        """Root mean squares of mm and deg."""
+        return float(np.sqrt(np.mean(self.mm**2))), float(np.sqrt(np.mean(self.deg**2)))
 
     @property
     def medians(self) -> tuple[float, float]:
         """Medians of mm and deg."""
         return float(np.median(self.mm)), float(np.median(self.deg))
+
+    @property
+    def score_mm(self) -> float:
+        """Median over the samples, where a rotation counts as the motion of a point at a third of a meter."""
+        return float(np.median(self.mm + np.deg2rad(self.deg) * _LEVER_MM))
 
 
 def solve(samples: Samples, method: str) -> Array:
@@ -63,42 +76,15 @@ def solve(samples: Samples, method: str) -> Array:
         )
     except cv2.error as error:
         raise CalibrationError(f"{method}: found no solution ({error.err})") from None
-    found = transform_of(np.asarray(rotation), np.asarray(translation).ravel())
-    if not np.isfinite(found).all():
+    if not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         raise CalibrationError(f"{method}: found no solution (the motions do not determine one)")
-    u, _, vt = np.linalg.svd(found[:3, :3])
-    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return found
+    u, _, vt = np.linalg.svd(np.asarray(rotation))
+    return se3(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, np.ravel(translation))
 
 
 def target_at_rest(samples: Samples, x: Array) -> Array:
     """(N, 4, 4): each sample's target pose in the frame where it is at rest, G_i X T_i."""
     return np.asarray(samples.moved @ x @ samples.target)
-
-
-def _mean_transform(transforms: Array) -> Array:
-    """Chordal mean of rotations and mean of translations."""
-    rotation = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
-    return transform_of(np.asarray(rotation), transforms[:, :3, 3].mean(axis=0))
-
-
-def residuals(samples: Samples, x: Array) -> Residuals:
-    """Residuals of any X (4, 4)."""
-    places = target_at_rest(samples, x)
-    return _residuals_from(places, _mean_transform(places))
-
-
-def _residuals_from(places: Array, center: Array) -> Residuals:
-    turned = angles(center[:3, :3].T @ places[:, :3, :3])
-    off = np.linalg.norm(places[:, :3, 3] - center[:3, 3], axis=1)
-    return Residuals(off * 1e3, np.degrees(turned))
-
-
-def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
-    """Hand poses in base (N, 4, 4) that follow from X, Y and the target poses."""
-    if samples.setup == EYE_IN_HAND:
-        return np.asarray(y @ inverse(samples.target) @ inverse(x))
-    return np.asarray(x @ samples.target @ inverse(y))
 
 
 def robust_start(samples: Samples) -> tuple[Array, Array]:
@@ -109,22 +95,18 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
     subsets = []
     if len(few) > _SUBSET_SIZE + 1:
         subsets = [rng.choice(len(few), _SUBSET_SIZE, replace=False) for _ in range(_SUBSETS)]
-    tried = [(few, "park"), (few, "daniilidis"), *((few.take(s), "park") for s in subsets)]
     best: tuple[float, Array, Array] | None = None
-    for chosen, method in tried:
+    for chosen, method in [(few, "park"), (few, "daniilidis"), *((few.take(s), "park") for s in subsets)]:
         try:
             x = solve(chosen, method)
         except CalibrationError:
             continue
-        places = target_at_rest(few, x)
-        y = _median_transform(places)
-        off = _residuals_from(places, y)
-        # A rotation counts as the motion of a point at a third of a meter.
-        score = float(np.median(off.mm + np.deg2rad(off.deg) * 330.0))
+        y = _median_transform(target_at_rest(few, x))
+        score = Residuals.of(few, x, y).score_mm
         if best is None or score < best[0]:
             best = score, x, y
     if best is None:
-        raise CalibrationError("no closed form finds a solution: are the poses those of one hand and target?")
+        raise CalibrationError("no closed form finds a solution: are the poses those of one flange and target?")
     return best[1], best[2]
 
 

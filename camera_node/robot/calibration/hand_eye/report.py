@@ -10,9 +10,9 @@ import yaml
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
-from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
-from camera_node.robot.calibration.hand_eye.samples import rotation_vectors
+from camera_node.robot.calibration.hand_eye.calibrate import Calibration
+from camera_node.robot.calibration.hand_eye.closed_form import Residuals, target_at_rest
+from camera_node.robot.calibration.hand_eye.samples import Array, angle_deg, distance_mm, rotation_vectors
 from freshfield import files
 from freshfield.untrusted import YamlWriter
 
@@ -21,32 +21,28 @@ _BLUE, _RED = "#0072B2", "#D55E00"
 
 def show(found: Calibration) -> str:
     """Format all methods' residuals, the result, its uncertainty and the warnings."""
-    what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
+    what = "camera in flange" if found.samples.setup == EYE_IN_HAND else "camera in base"
     spread = found.diversity
     x, y, z = found.transform[:3, 3]
+    turn = ", ".join(f"{v:.5f}" for v in rotation_vectors(found.transform[:3, :3]))
     lines = [
         f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
         f"degrees, axes spread by {spread.axis_spread_deg:.0f} degrees "
         "(35 where they point everywhere alike)",
         "",
         f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
-        *(_row(row) for row in found.rows),
+        *(_row(found, name, x) for name, x in found.results.items()),
         "",
-        f"{what} ({found.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned {_turn(found)}",
+        f"{what} ({found.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned ({turn}) rad",
         f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees",
         f"  the arm's noise, estimated: {found.refined.arm_noise_m * 1e3:.3f} mm, "
         f"{np.degrees(found.refined.arm_noise_rad):.4f} degrees an axis",
     ]
-    if found.exact_arm is not None and found.exact_arm.transform is not None:
-        lines.append(
-            f"  were the arm taken as exact, it would come out {found.exact_arm.from_refined_mm:.2f} mm, "
-            f"{found.exact_arm.from_refined_deg:.3f} degrees elsewhere"
-        )
     if found.timed is not None:
         lines.append(
             f"time offset: {found.timed.offset_s * 1e3:.3f} ms (standard deviation "
-            f"{found.timed.std_s * 1e3:.3f} ms) to add to the camera's stamps to have the arm's; correlation "
-            f"of the angular speeds {found.timed.correlation:.3f}"
+            f"{found.refined.offset_std_s * 1e3:.3f} ms) to add to the camera's stamps to have the arm's; "
+            f"correlation of the angular speeds {found.timed.correlation:.3f}"
         )
     return "\n".join([*lines, *(f"note: {warning}" for warning in found.warnings)])
 
@@ -126,14 +122,9 @@ def _plot_places(found: Calibration, places: Any) -> None:
     places.figure.colorbar(drawn, ax=places, label="z (mm)")
 
 
-def _row(row: MethodResult) -> str:
-    if row.residuals is None:
-        return f"{row.method:12} {row.error}"
-    return (
-        f"{row.method:12} {row.residuals.rms_mm:12.3f} {row.residuals.rms_deg:9.4f}   "
-        f"{row.from_refined_mm:16.3f} {row.from_refined_deg:9.4f}"
-    )
-
-
-def _turn(found: Calibration) -> str:
-    return f"({', '.join(f'{v:.5f}' for v in rotation_vectors(found.transform[:3, :3]))}) rad"
+def _row(found: Calibration, method: str, x: Array | str) -> str:
+    if isinstance(x, str):
+        return f"{method:12} {x}"
+    mm, deg = Residuals.of(found.samples, x).rms
+    away_mm, away_deg = distance_mm(found.refined.x, x), angle_deg(found.refined.x, x)
+    return f"{method:12} {mm:12.3f} {deg:9.4f}   {away_mm:16.3f} {away_deg:9.4f}"

@@ -1,8 +1,8 @@
 """Samples of a hand-eye calibration, their relative motions (4.4), (4.5), and whether they suffice.
 
-Both setups are one problem, G_i X T_i = Y, with T_i the target in the camera: for eye-in-hand G_i = H_i (hand
-in base), X = camera in hand, Y = target in base; for eye-to-hand G_i = H_i^-1, X = camera in base, Y = target
-in hand.
+Both setups are one problem, G_i X T_i = Y, with T_i the target in the camera: for eye-in-hand G_i = H_i (flange
+in base), X = camera in flange, Y = target in base; for eye-to-hand G_i = H_i^-1, X = camera in base, Y = target
+in flange.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
+from freshfield.geometry import se3_inverse
 
 Array = NDArray[np.float64]
 
@@ -32,35 +33,33 @@ _MAX_SAMPLES = 80  # have 3160 pairs
 class Samples:
     """Samples of one setup.
 
-    hand: (N, 4, 4) hand in base.
+    flange: (N, 4, 4) flange in base.
     target: (N, 4, 4) target in camera.
-    covariance: (N, 6, 6) of the target's rotation (radians, about its own axes) and translation (meters,
-        camera axes); None: exact.
     names: for messages.
+    Raises CalibrationError for other shapes and for numbers that are not finite.
     """
 
-    hand: Array
+    flange: Array
     target: Array
     setup: str = EYE_IN_HAND
-    covariance: Array | None = None
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.setup not in SETUPS:
             raise CalibrationError(f"setup: expected {' or '.join(SETUPS)}, got {self.setup!r}")
-        for name, value in (("hand", self.hand), ("target", self.target)):
+        for name, value in (("flange", self.flange), ("target", self.target)):
             if value.ndim != 3 or value.shape[1:] != (4, 4) or not np.isfinite(value).all():
                 raise CalibrationError(f"{name}: expected finite 4 x 4 matrices, got shape {value.shape}")
-        if len(self.hand) != len(self.target):
-            raise CalibrationError(f"{len(self.hand)} poses of the hand, {len(self.target)} of the target")
+        if len(self.flange) != len(self.target):
+            raise CalibrationError(f"{len(self.flange)} poses of the flange, {len(self.target)} of the target")
 
     def __len__(self) -> int:
-        return len(self.hand)
+        return len(self.flange)
 
     @property
     def moved(self) -> Array:
-        """G_i (N, 4, 4): hand in base, or base in hand."""
-        return self.hand if self.setup == EYE_IN_HAND else inverse(self.hand)
+        """G_i (N, 4, 4): flange in base, or base in flange."""
+        return self.flange if self.setup == EYE_IN_HAND else se3_inverse(self.flange)
 
     def name(self, index: int) -> str:
         return self.names[index] if self.names else f"pose {index + 1}"
@@ -68,9 +67,8 @@ class Samples:
     def take(self, chosen: Sequence[int] | NDArray[np.intp]) -> Samples:
         """The samples with these indices."""
         at = np.asarray(chosen, dtype=np.intp)
-        covariance = None if self.covariance is None else self.covariance[at]
         names = tuple(self.names[i] for i in at) if self.names else ()
-        return replace(self, hand=self.hand[at], target=self.target[at], covariance=covariance, names=names)
+        return replace(self, flange=self.flange[at], target=self.target[at], names=names)
 
     def subsample(self, most: int) -> Samples:
         """At most ``most`` samples, evenly spaced over the recording."""
@@ -80,6 +78,22 @@ class Samples:
 def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
     """At most ``most`` of ``count`` indices, evenly spaced."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+
+
+def rotation_vectors(rotations: Array) -> Array:
+    """Rotation vectors (..., 3) of one or N rotation matrices (..., 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+
+
+def angle_deg(a: Array, b: Array) -> Array:
+    """Angles (...) between the rotations of transforms (..., 4, 4)."""
+    turns = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]
+    return np.asarray(np.degrees(np.linalg.norm(rotation_vectors(turns), axis=-1)))
+
+
+def distance_mm(a: Array, b: Array) -> Array:
+    """Distances (...) between the origins of transforms (..., 4, 4) in meters."""
+    return np.asarray(np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1) * 1e3)
 
 
 @dataclass(frozen=True)
@@ -99,37 +113,6 @@ class Diversity:
     reason: str | None
 
 
-def inverse(transforms: Array) -> Array:
-    """Inverses of rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(transforms)
-    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    out[..., :3, :3] = rotation
-    out[..., :3, 3] = -(rotation @ transforms[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
-
-
-def transform_of(rotation: Array, translation_m: Array) -> Array:
-    """Transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
-    out = np.zeros((*rotation.shape[:-2], 4, 4))
-    out[..., :3, :3] = rotation
-    out[..., :3, 3] = translation_m
-    out[..., 3, 3] = 1.0
-    return out
-
-
-def rotation_vectors(rotations: Array) -> Array:
-    """Rotation vectors (..., 3) of one or N rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
-
-
-def angles(rotations: Array) -> Array:
-    """Angles (N,) in radians of rotation matrices (N, 3, 3), from the chord: cheaper than rotation vectors
-    and exact for small angles, but with half of the digits near half a turn."""
-    chord = np.linalg.norm(rotations - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
-    return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
-
-
 def diversity(samples: Samples) -> Diversity:
     """Examine the motions between all pairs of samples (of at most 80)."""
     chosen = samples.subsample(_MAX_SAMPLES)
@@ -145,28 +128,24 @@ def diversity(samples: Samples) -> Diversity:
     # The mean of u u^T treats axes u and -u as one. Its second eigenvalue is sin^2 of the half angle of the
     # fan in which the axes lie, and 1/3 if they are uniform.
     values = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))[0]
-    axis_spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0)))))
+    spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0)))))
+    reason: str | None = None
     if len(samples) < MIN_POSES:
-        reason: str | None = _too_few(len(samples))
-    elif usable.sum() >= 2 and axis_spread_deg >= MIN_SPREAD_DEG:
-        reason = None
-    elif usable.sum() >= 2:
+        reason = _too_few(len(samples))
+    elif usable.sum() >= 2 and spread_deg < MIN_SPREAD_DEG:
         reason = (
-            f"the hand has turned about parallel axes only (they spread by {axis_spread_deg:.1f} degrees, at "
-            f"least {MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt the "
-            "hand about another axis too"
+            f"the flange has turned about parallel axes only (they spread by {spread_deg:.1f} degrees, at least "
+            f"{MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt it about another "
+            "axis too"
         )
-    elif half.sum() >= small.sum():
+    elif usable.sum() < 2 and half.sum() >= small.sum():
+        reason = "turns are near 180 degrees, where the axis' sign is lost; add poses turned by 20 to 90 degrees"
+    elif usable.sum() < 2:
         reason = (
-            f"{_all_but(int(usable.sum()))} turns are near 180 degrees, where the axis' sign is lost; add "
-            "poses turned by 20 to 90 degrees"
-        )
-    else:
-        reason = (
-            f"the hand has hardly turned (by {angles_deg.max():.1f} degrees at most, {MIN_TURN_DEG:g} are "
+            f"the flange has hardly turned (by {angles_deg.max():.1f} degrees at most, {MIN_TURN_DEG:g} are "
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
-    return Diversity(len(angles_deg), int(half.sum()), float(angles_deg.max()), axis_spread_deg, reason)
+    return Diversity(len(angles_deg), int(half.sum()), float(angles_deg.max()), spread_deg, reason)
 
 
 def require_diversity(samples: Samples) -> Diversity:
@@ -175,10 +154,6 @@ def require_diversity(samples: Samples) -> Diversity:
     if found.reason is not None:
         raise CalibrationError(found.reason)
     return found
-
-
-def _all_but(count: int) -> str:
-    return f"all but {count} of the" if count else "all"
 
 
 def _too_few(count: int) -> str:

@@ -1,71 +1,148 @@
-"""A guided hand-eye calibration: collects images and hand poses, and tells what to do next and when to stop.
-The caller provides camera, arm and clock."""
+"""``camera-node calibrate hand-eye --live``: a guided session that says which poses are missing.
+
+With a moving arm both streams are recorded, flange poses and detected target poses, each with its own stamps, and
+``time_offset`` estimates the offset between them (camera delay, transport of the joint states) from the motion.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import argparse
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.calibration import WANT_MM, CalibrationError
-from camera_node.robot.calibration.files import to_samples
-from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
+from camera_node.config import ArmConfig, SourceConfig, source_config
+from camera_node.pose.providers import PoseProvider, Trajectory, read_samples
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix
+from camera_node.robot.arm.joint_states import ArmStream
+from camera_node.robot.calibration import WANT_MM, CalibrationError, guided
+from camera_node.robot.calibration.guided import KEPT, Image, Step
+from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
+from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
-    Diversity,
     Samples,
-    angles,
+    angle_deg,
+    distance_mm,
     diversity,
     rotation_vectors,
 )
-from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose, to_gray
-from freshfield.geometry import Pinhole
+from camera_node.robot.calibration.inputs import Track, pairs_json, read_pairs, sorted_track
+from camera_node.robot.calibration.targets import Corners, Target, estimate_pose, to_gray
+from camera_node.sources.base import Source
+from freshfield import files, scenario
+from freshfield.clock import WallClock
+from freshfield.geometry import Pinhole, se3_inverse
 
 MIN_POSES, GOOD_SPREAD_DEG = 10, 15.0
 # A pose rotated by less from a kept one adds little information.
 NEW_DEG = 8.0
 # Largest motion between two frames at rest: for more, stamps that are a few milliseconds off would matter.
 STILL_MM, STILL_DEG = 0.5, 0.1
+MIN_SECONDS = 10.0
+"""Motion with the target in sight that a time offset needs; its deviation falls with the root of it."""
+_GAP_NS = 125_000_000  # longest gap between two detections that counts as motion
 _MIN_TO_SOLVE = 4
-KEPT, MOVING = "kept", "hand moving"
+MOVING = "arm moving"
 
 
-@dataclass(frozen=True)
-class HandEyeStep:
-    """Result of one image.
+def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
+    """Run a session with a scenario's camera and calibrate from its samples. Ctrl-C ends the session early.
 
-    outcome: ``kept``, or why not.
-    count: number of samples kept.
-    std_mm, std_deg: standard deviations of the current calibration, if there is one.
-    enough: whether to stop.
-    advice: what to do next.
+    board, lens: the target, and a lens that replaces the camera's own.
+    setup: eye-in-hand or eye-to-hand.
+    Raises CalibrationError, and the errors of what it opens: scenario, files, camera, arm.
     """
+    if not args.want_mm > 0:
+        raise CalibrationError("--want-mm: expected a positive number")
+    loaded = guided.load_scenario(args)
+    config = source_config(loaded)
+    arm: ArmConfig | None = None if args.hand is not None else getattr(config, "arm", None)
+    to_base = np.eye(4) if arm is None else _base_from_world(loaded, arm, args.camera)
+    flanges = None
+    if args.hand is not None:
+        times_ns, poses = read_samples(args.hand)
+        first = np.unique(times_ns, return_index=True)[1]
+        columns = [times_ns[k] for k in first], [poses[k] for k in first]
+        flanges = Trajectory(*columns, max_gap_ns=round(args.max_gap_ms * 1e6))
+    before = read_pairs(args.samples, setup) if args.samples is not None and args.samples.exists() else None
 
-    outcome: str
-    count: int
-    diversity: Diversity
-    std_mm: float | None
-    std_deg: float | None
-    enough: bool
-    advice: str
+    def keep(samples: Samples) -> None:
+        if args.samples is not None:
+            files.write_json(args.samples, pairs_json(samples))
 
-    @property
-    def line(self) -> str:
-        sure = "" if self.std_mm is None else f", sure to {self.std_mm:.2f} mm {self.std_deg:.3f} degrees"
-        spread = f"axes spread by {self.diversity.axis_spread_deg:.0f} degrees"
-        return f"{self.count} poses, {spread}{sure}; {self.outcome}: {self.advice}"
+    session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
+    streams = StreamRecorder() if args.moving and arm is not None else None
+    source = guided.open_source(loaded, config, args)
+    with contextlib.ExitStack() as stack:
+        stack.callback(source.release)
+        if streams is not None and arm is not None:
+            stack.callback(streams.follow_arm(loaded, arm).stop)
+        pace = guided.Pace(float(source.fps), args.seconds)
+        guided.guide(session_steps(session, source, config, pace, lens, flanges, to_base, streams), args.preview)
+    if streams is None:
+        return calibrate(session.samples, args.method)
+    return calibrate_tracks(streams.flange(), streams.target(), setup, args.method, args.max_gap_ms / 1e3)
+
+
+def session_steps(
+    session: HandEyeSession,
+    source: Source,
+    config: SourceConfig,
+    pace: Callable[[int], bool],
+    lens: Pinhole | None = None,
+    flanges: PoseProvider | None = None,
+    to_base: Array | None = None,
+    streams: StreamRecorder | None = None,
+) -> Iterator[tuple[Image, Corners | None, Step]]:
+    """Offer a source's shots to a session. Yields each image, the corners found, and the step.
+
+    pace: see ``guided.read_shots``.
+    lens: replaces the source's own.
+    flanges: flange poses by time since the first shot; None: the shots' poses are the flange's.
+    to_base: base-from-world (4, 4), if the shots' poses are in the world.
+    streams: records the target poses and decides when there is enough.
+    """
+    begin_ns: int | None = None
+    for t_ns, shot, image in guided.read_shots(source, config.codec, pace):
+        begin_ns = t_ns if begin_ns is None else begin_ns
+        try:
+            pose = shot.pose if flanges is None else flanges.at(t_ns - begin_ns)[0]
+        except ValueError as error:
+            guided.report_skipped(error)
+            continue
+        flange = pose.matrix() if to_base is None else to_base @ pose.matrix()
+        step = session.offer(image, lens or shot.intrinsics, flange)
+        if streams is not None:
+            if session.target_pose is not None:
+                streams.add_target(t_ns, session.target_pose)
+            step = streams.advise(step, session)
+        yield image, session.corners, step
+
+
+def _base_from_world(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
+    """Base-from-world (4, 4), because the arm's poses are in the world and the calibration needs them in its
+    base. Raises CalibrationError."""
+    if camera not in arm.cameras or arm.cameras[camera] is not None:
+        raise CalibrationError(
+            f"{loaded.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "
+            "that stands): its poses are then the flange's"
+        )
+    return se3_inverse(base_matrix(arm))
 
 
 class HandEyeSession:
     """Collects samples until the standard deviation of the translation is at most ``want_mm``.
 
-    moving: also take images while the hand moves; its poses must then be exact in time.
+    moving: also take images while the arm moves; its poses must then be exact in time.
     before: samples of an earlier session to continue.
     kept: called with all samples after each new one.
+    samples: all that were kept.
+    corners, target_pose: found in the last image.
+    refined: current calibration, if there is one.
     """
 
     def __init__(
@@ -77,125 +154,122 @@ class HandEyeSession:
         before: Samples | None = None,
         kept: Callable[[Samples], None] = lambda samples: None,
     ) -> None:
-        self._target, self._setup, self._want_mm, self._moving = target, setup, want_mm, moving
-        self._before, self._kept = before, kept
-        self._seen: list[TargetPose] = []
-        self._hands: list[Array] = []
-        self._last: Array | None = None
-        self._refined: Refinement | None = None
-        self._diversity = diversity(self.samples())
+        self.samples = before or Samples(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), setup)
         self.corners: Corners | None = None
-        """Found in the last image."""
-        self.seen: TargetPose | None = None
-        """The target in the last image, if its pose could be estimated."""
+        self.target_pose: Array | None = None
+        self.refined: Refinement | None = None
+        self._target, self._want_mm, self._moving, self._kept = target, want_mm, moving, kept
+        self._last: Array | None = None
         self._solve()
 
-    def samples(self) -> Samples:
-        """All kept samples, with the target's covariance unless some are from an earlier session."""
-        names = [f"pose {k + 1}" for k in range(len(self._seen))]
-        new = to_samples(self._seen, self._hands, names, self._setup)
-        if self._before is None:
-            return new
-        hand = np.concatenate([self._before.hand, new.hand])
-        target = np.concatenate([self._before.target, new.target])
-        return Samples(hand, target, self._setup)
+    @property
+    def varied(self) -> bool:
+        """Whether there are enough poses, turned about different axes."""
+        return len(self.samples) >= MIN_POSES and self._diversity.axis_spread_deg >= GOOD_SPREAD_DEG
 
-    def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> HandEyeStep:
-        """Process an image (H, W, 3) taken with the hand at ``hand`` (4, 4), in base."""
-        last, self._last = self._last, hand
-        self.corners = self.seen = None
-        if not self._moving and (last is None or _motion(last, hand) > 1.0):
+    def offer(self, image: NDArray[np.uint8], lens: Pinhole, flange: Array) -> Step:
+        """Process an image (H, W, 3) taken with the flange at ``flange`` (4, 4), in base."""
+        last, self._last = self._last, flange
+        self.corners = self.target_pose = None
+        still = last is not None and distance_mm(last, flange) <= STILL_MM and angle_deg(last, flange) <= STILL_DEG
+        if not (still or self._moving):
             return self._step(MOVING, "hold still")
         self.corners = self._target.find(to_gray(image))
         if self.corners is None:
             return self._step("target not found", "bring all of it into the picture, well lit")
         try:
-            self.seen = seen = estimate_pose(self.corners, lens)
+            self.target_pose = estimate_pose(self.corners, lens)
         except CalibrationError as error:
             return self._step("target unclear", str(error))
-        like = self._nearest_kept(hand)
-        if like is not None:
-            return self._step(f"like pose {like + 1}", self._advice())
-        self._seen.append(seen)
-        self._hands.append(hand)
-        self._diversity = diversity(self.samples())
+        turned_deg = angle_deg(self.samples.flange, flange)
+        if len(turned_deg) and turned_deg.min() < NEW_DEG:
+            return self._step(f"like pose {int(np.argmin(turned_deg)) + 1}")
+        both = ((self.samples.flange, flange), (self.samples.target, self.target_pose))
+        flanges, targets = (np.concatenate([earlier, new[None]]) for earlier, new in both)
+        self.samples = replace(self.samples, flange=flanges, target=targets)
         self._solve()
-        self._kept(self.samples())
-        return self._step(KEPT, self._advice())
+        self._kept(self.samples)
+        return self._step(KEPT)
 
     def _solve(self) -> None:
-        samples = self.samples()
-        self._refined = None
-        if self._diversity.reason is None and len(samples) >= _MIN_TO_SOLVE:
-            self._refined = refine(samples)
+        self._diversity = diversity(self.samples)
+        solvable = self._diversity.reason is None and len(self.samples) >= _MIN_TO_SOLVE
+        self.refined = refine(self.samples) if solvable else None
 
-    def _nearest_kept(self, hand: Array) -> int | None:
-        hands = self.samples().hand
-        if not len(hands):
-            return None
-        turned_deg = np.degrees(angles(np.swapaxes(hands[:, :3, :3], 1, 2) @ hand[:3, :3]))
-        nearest = int(np.argmin(turned_deg))
-        return nearest if turned_deg[nearest] < NEW_DEG else None
-
-    @property
-    def _enough(self) -> bool:
-        return (
-            self._refined is not None
-            and len(self._hands) + (0 if self._before is None else len(self._before)) >= MIN_POSES
-            and self._diversity.axis_spread_deg >= GOOD_SPREAD_DEG
-            and self._refined.std_mm <= self._want_mm
-        )
-
-    def _advice(self) -> str:
-        if self._enough:
-            return "enough"
-        return missing_turn(self.samples().hand)
-
-    def _step(self, outcome: str, advice: str) -> HandEyeStep:
-        found = self._refined
-        return HandEyeStep(
-            outcome,
-            len(self.samples()),
-            self._diversity,
-            None if found is None else found.std_mm,
-            None if found is None else found.std_deg,
-            self._enough,
-            advice,
-        )
+    def _step(self, outcome: str, advice: str | None = None) -> Step:
+        progress = f"{len(self.samples)} poses, axes spread by {self._diversity.axis_spread_deg:.0f} degrees"
+        if self.refined is not None:
+            progress += f", sure to {self.refined.std_mm:.2f} mm {self.refined.std_deg:.3f} degrees"
+        enough = self.varied and self.refined is not None and self.refined.std_mm <= self._want_mm
+        return Step(outcome, progress, enough, advice or ("enough" if enough else missing_turn(self.samples.flange)))
 
 
-def missing_turn(hands: Array) -> str:
+def missing_turn(flanges: Array) -> str:
     """Instruction to an operator: the axis about which poses (N, 4, 4) differ least from the first."""
-    if not len(hands):
+    if not len(flanges):
         return "bring the target into the picture"
-    turns = rotation_vectors(hands[0, :3, :3].T @ hands[:, :3, :3])
+    turns = rotation_vectors(flanges[0, :3, :3].T @ flanges[:, :3, :3])
     axis = int(np.argmin((turns**2).sum(axis=0)))
     sign = "-" if turns[:, axis].sum() > 0 else "+"
     return f"turn the flange by 20 to 40 degrees about its {sign}{'xyz'[axis]}, the target in sight"
 
 
-def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:
-    """The image as (H + 40, W, 3) RGB, with the corners that were found, and the step below it."""
-    lines = f"{step.count} poses", f"{step.outcome}: {step.advice}"
-    return draw_corners(to_gray(image), corners, lines, step.outcome == KEPT)
+class StreamRecorder:
+    """Records poses (4, 4) with their stamps (ns). One thread may add flanges while another adds targets."""
+
+    def __init__(self) -> None:
+        self._flanges: list[tuple[int, Array]] = []
+        self._targets: list[tuple[int, Array]] = []
+        self._seen_ns = 0
+
+    def follow_arm(self, loaded: scenario.Scenario, arm: ArmConfig) -> ArmStream:
+        """Record the scenario's arm, as flange poses in its base, until the stream is stopped. Raises
+        ScenarioError and ArmError."""
+        model = arm_model(loaded, arm)
+        stream = ArmStream(
+            arm.host,
+            WallClock(),
+            arm.frequency_hz,
+            on_sample=lambda t_ns, joints: self.add_flange(t_ns, model.forward(joints)),
+        )
+        stream.start()
+        return stream
+
+    def add_flange(self, t_ns: int, pose: Array) -> None:
+        """pose: flange in base."""
+        self._flanges.append((t_ns, pose))
+
+    def add_target(self, t_ns: int, pose: Array) -> None:
+        """pose: target in camera."""
+        if self._targets:
+            gap_ns = t_ns - self._targets[-1][0]
+            self._seen_ns += gap_ns if 0 < gap_ns <= _GAP_NS else 0
+        self._targets.append((t_ns, pose))
+
+    @property
+    def seen_s(self) -> float:
+        """Seconds with the target in sight."""
+        return self._seen_ns / 1e9
+
+    def advise(self, step: Step, session: HandEyeSession) -> Step:
+        """The step with advice for recording streams. The deviation does not count, because it contains the
+        unknown offset."""
+        if not session.varied:
+            return replace(step, enough=False)
+        left_s = MIN_SECONDS - self.seen_s
+        if left_s <= 0.0:
+            return replace(step, enough=True, advice="enough")
+        return replace(step, enough=False, advice=f"keep moving, irregularly, the target in sight: {left_s:.0f} s more")
+
+    def flange(self) -> Track:
+        """The flange's stream. Raises CalibrationError for fewer than two poses."""
+        return _track(self._flanges, "joint states")
+
+    def target(self) -> Track:
+        """The target's stream. Raises CalibrationError for fewer than two poses."""
+        return _track(self._targets, "sightings of the target")
 
 
-def draw_corners(
-    plain: NDArray[np.uint8], corners: Corners | None, lines: tuple[str, str], kept: bool
-) -> NDArray[np.uint8]:
-    """A gray image as (H + 40, W, 3) RGB, with circles at its corners and two lines of text below it."""
-    out = np.zeros((plain.shape[0] + 40, max(plain.shape[1], 320), 3), dtype=np.uint8)
-    out[: plain.shape[0], : plain.shape[1]] = plain[..., None]
-    if corners is not None:
-        for x, y in corners.pixels:
-            cv2.circle(out, (round(x - 0.5), round(y - 0.5)), 4, (0, 158, 115), 1, cv2.LINE_AA)
-    color = (0, 158, 115) if kept else (213, 94, 0)
-    for line, text in enumerate(lines):
-        at = (6, plain.shape[0] + 15 + 17 * line)
-        cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
-    return out
-
-
-def _motion(a: Array, b: Array) -> float:
-    """Motion between two hand poses, as a multiple of the largest that counts as at rest."""
-    return max(distance_mm(a, b) / STILL_MM, angle_deg(a, b) / STILL_DEG)
+def _track(rows: list[tuple[int, Array]], what: str) -> Track:
+    rows = list(rows)
+    return sorted_track([t_ns for t_ns, _ in rows], [pose for _, pose in rows], what)

@@ -1,5 +1,5 @@
-"""A simulated hand with a camera over a target, with known truth, to measure calibration and pairing.
-Everything is within half a meter of the base, as on the table of a UR3e."""
+"""A simulated arm with a camera over a target, with known truth: X is CAMERA_IN_FLANGE, Y TARGET_IN_BASE. Everything
+is within half a meter of the base, as on the table of a UR3e."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.calibration.files import Track
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, inverse, transform_of
-from freshfield.geometry import look_at, so3_exp
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation
+from camera_node.robot.calibration.inputs import Track
+from freshfield.geometry import look_at, se3, se3_inverse, so3_exp
 
 # The arm's noise in the project's results.
 ARM_RAD, ARM_M = 0.002, 0.0005
@@ -20,26 +20,26 @@ _DETECTION_RAD, _DETECTION_M = 0.0005, 0.0003
 
 
 def _rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> Array:
-    return transform_of(so3_exp(turn), np.array(shift))
+    return se3(so3_exp(turn), np.array(shift))
 
 
 # The target lies on the table with its pattern upwards, so its z points into the table.
-CAMERA_IN_HAND = _rigid((0.02, -0.03, 1.55), (0.055, -0.035, 0.045))
+CAMERA_IN_FLANGE = _rigid((0.02, -0.03, 1.55), (0.055, -0.035, 0.045))
 TARGET_IN_BASE = _rigid((np.pi, 0.0, 0.0), (0.14, 0.02, 0.0))
 TARGET_MIDDLE = (0.22, -0.04, 0.0)
 
 
-def random_hands(count: int, rng: np.random.Generator, tilt_deg: float = 50.0) -> Array:
-    """Hands in base (N, 4, 4), with the camera looking at the target from all sides and with any roll.
+def random_flanges(count: int, rng: np.random.Generator, tilt_deg: float = 50.0) -> Array:
+    """Flanges in base (N, 4, 4), with the camera looking at the target from all sides and with any roll.
     tilt_deg: largest angle of view from the vertical."""
     out: list[Array] = []
     while len(out) < count:
         azimuth, slope = rng.uniform(-np.pi, np.pi), np.deg2rad(tilt_deg) * np.sqrt(rng.uniform())
         camera = _camera(azimuth, slope, rng.uniform(0.17, 0.30), rng.uniform(-0.9, 0.9))
         camera[:3, 3] += rng.normal(0.0, 0.01, 3)
-        hand = camera @ inverse(CAMERA_IN_HAND)
-        if np.linalg.norm(hand[:3, 3]) < REACH_M:
-            out.append(hand)
+        flange = camera @ se3_inverse(CAMERA_IN_FLANGE)
+        if np.linalg.norm(flange[:3, 3]) < REACH_M:
+            out.append(flange)
     return np.array(out)
 
 
@@ -51,21 +51,21 @@ def _camera(azimuth: float, slope: float, distance_m: float, roll: float) -> Arr
     return out
 
 
-def observed_targets(hands: Array) -> Array:
+def observed_targets(flanges: Array) -> Array:
     """Exact targets in camera (N, 4, 4)."""
-    return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
+    return np.asarray(se3_inverse(CAMERA_IN_FLANGE) @ se3_inverse(flanges) @ TARGET_IN_BASE)
 
 
 def add_noise(poses: Array, rng: np.random.Generator, rad: float, meters: float) -> Array:
     """Poses with Gaussian noise: a rotation vector about the body's own axes, and a translation."""
     turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
     shifts = rng.normal(0.0, meters, (len(poses), 3))
-    return transform_of(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
+    return se3(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A hand that moves over the target along incommensurate sines, so that the motion never repeats.
+    """A flange that moves over the target along incommensurate sines, so that the motion never repeats.
 
     speed_m_per_s: mean speed of the camera, along the same path at every speed.
     """
@@ -75,9 +75,9 @@ class Sweep:
     # Mean speed at rate 1, measured over ten minutes.
     _NATURAL_M_PER_S = 0.1036
 
-    def hands(self, t_s: NDArray[np.float64]) -> Array:
-        """Hand in base (N, 4, 4) at instants (N,)."""
-        return np.asarray(self.cameras(t_s) @ inverse(CAMERA_IN_HAND))
+    def flanges(self, t_s: NDArray[np.float64]) -> Array:
+        """Flange in base (N, 4, 4) at instants (N,)."""
+        return np.asarray(self.cameras(t_s) @ se3_inverse(CAMERA_IN_FLANGE))
 
     def cameras(self, t_s: NDArray[np.float64]) -> Array:
         """Camera in base (N, 4, 4) at instants (N,)."""
@@ -93,11 +93,11 @@ class Sweep:
 def streams(sweep: Sweep, seconds: float, offset_s: float, rng: np.random.Generator) -> tuple[Track, Track]:
     """Tracks of the flange at 125 Hz and of the target at 15 Hz, both noisy, with ``offset_s`` between their
     stamps."""
-    hand_s = np.arange(0.0, seconds, 1 / 125.0)
+    flange_s = np.arange(0.0, seconds, 1 / 125.0)
     seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
-    hands = add_noise(sweep.hands(hand_s), rng, ARM_RAD, ARM_M)
-    targets = observed_targets(sweep.hands(seen_s))
+    flanges = add_noise(sweep.flanges(flange_s), rng, ARM_RAD, ARM_M)
+    targets = observed_targets(sweep.flanges(seen_s))
     targets = add_noise(targets, rng, _DETECTION_RAD, _DETECTION_M)
-    hand_ns = np.round((hand_s + offset_s) * 1e9).astype(np.int64)
+    flange_ns = np.round((flange_s + offset_s) * 1e9).astype(np.int64)
     seen_ns = np.round(seen_s * 1e9).astype(np.int64)
-    return Track(hand_ns, hands), Track(seen_ns, targets)
+    return Track(flange_ns, flanges), Track(seen_ns, targets)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,19 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import find_corners
 from camera_node.robot.calibration.hand_eye.samples import Array
-from camera_node.robot.calibration.targets import Corners, Target, opencv_lens
+from camera_node.robot.calibration.targets import Corners, estimate_pose, opencv_lens
 from freshfield.geometry import Pinhole
 
 MIN_VIEWS = 4
 # With all views parallel to the sensor, focal length and distance cannot be told apart.
 MIN_TILT_DEG = 10.0
 MIN_CORNERS = 6
+_HOLD_OUT_EVERY = 4
 _OUTLIER = 4.0
 # Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if
 # the images do not determine a lens.
 _SHORTEST, _LONGEST = 0.2, 8.0
+_UNDETERMINED = "the pictures do not determine a lens: show the target larger, tilted, everywhere"
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class LensCalibration:
     pinhole: in this project's convention (corner origin).
     std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
     error_px: root mean square of the reprojection errors; views: the same by image.
+    held_out_px: the same in every fourth image, with a lens from the others; None: too few images.
     tilt_deg: largest angle between the target's tilts in two views.
     covered: share of a 6 x 6 grid over the image in which corners were seen.
     unused: reason for every unused image.
@@ -43,11 +44,12 @@ class LensCalibration:
     std: tuple[float, ...]
     error_px: float
     views: Mapping[str, float]
+    held_out_px: float | None
     tilt_deg: float
     covered: float
     unused: Mapping[str, str]
 
-    def calibration(self, camera: str) -> dict[str, Any]:
+    def to_json(self, camera: str) -> dict[str, Any]:
         """The calibration JSON that the video source and --lens read."""
         matrix, distortion = opencv_lens(self.pinhole)
         return {
@@ -57,15 +59,17 @@ class LensCalibration:
                 "K": matrix.tolist(),
                 "dist_k1k2p1p2": distortion.tolist(),
                 "error_px": self.error_px,
+                "held_out_px": self.held_out_px,
                 "std_fx_fy_cx_cy_k1_k2_p1_p2": list(self.std),
             }
         }
 
     def show(self) -> str:
         p, s = self.pinhole, self.std
+        held_out = "" if self.held_out_px is None else f", {self.held_out_px:.3f} px in pictures held out"
         lines = [
-            f"{len(self.views)} pictures of {p.width} x {p.height}; reprojection {self.error_px:.3f} px; the "
-            f"target tilted by up to {self.tilt_deg:.0f} degrees between them; corners over "
+            f"{len(self.views)} pictures of {p.width} x {p.height}; reprojection {self.error_px:.3f} px{held_out}; "
+            f"the target tilted by up to {self.tilt_deg:.0f} degrees between them; corners over "
             f"{100 * self.covered:.0f} % of the picture",
             f"fx {p.fx:.2f} +- {s[0]:.2f}  fy {p.fy:.2f} +- {s[1]:.2f}  cx {p.cx:.2f} +- {s[2]:.2f}  "
             f"cy {p.cy:.2f} +- {s[3]:.2f} px (corner origin)",
@@ -79,73 +83,41 @@ class LensCalibration:
         return "\n".join(lines)
 
 
-def calibrate_folder(files: Sequence[Path], target: Target, progress: Callable[[int], None]) -> LensCalibration:
-    """Calibrate from image files; see ``find_corners``. Raises CalibrationError."""
-    found, unused, size = find_corners(files, target, None, progress)
-    return calibrate(found, size, unused)
-
-
-def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> LensCalibration:
+def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> LensCalibration:
     """Calibrate from corners by image name.
 
     size: width and height of the images in pixels.
     unused: reasons for images without corners.
     Raises CalibrationError if the corners do not determine a lens.
     """
-    usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
-    dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
-    unused = {**unused, **dropped}
+    usable = {name: c for name, c in views.items() if len(c.points) >= MIN_CORNERS}
+    unused = {**unused, **{name: f"only {len(c.points)} corners" for name, c in views.items() if name not in usable}}
     if len(usable) < MIN_VIEWS:
         raise CalibrationError(
-            f"too few pictures show the target: {len(usable)} of {len(views) + len(unused) - len(dropped)}, "
+            f"too few pictures show the target: {len(usable)} of {len(usable) + len(unused)}, "
             f"at least {MIN_VIEWS} are needed and 10 to 20 are good"
         )
-    lens, std, turns, errors = _solve(usable, size)
+    lens, std, normals, errors = _solve(usable, size)
     limit = _OUTLIER * float(np.median(errors))
     bad = [name for name, error in zip(usable, errors) if error > limit]
     if bad and len(usable) - len(bad) >= MIN_VIEWS:
-        unused = {**unused, **{n: "does not fit the others, left out" for n in bad}}
-        usable = {n: c for n, c in usable.items() if n not in bad}
-        lens, std, turns, errors = _solve(usable, size)
-    numbers = [lens.fx, lens.fy, *lens.distortion, *std]
+        unused = {**unused, **{name: "does not fit the others, left out" for name in bad}}
+        usable = {name: c for name, c in usable.items() if name not in bad}
+        lens, std, normals, errors = _solve(usable, size)
     possible = all(_SHORTEST < f / max(size) < _LONGEST for f in (lens.fx, lens.fy))
-    if not (np.isfinite(numbers).all() and possible and std[0] < 0.2 * lens.fx):
-        raise CalibrationError("the pictures do not determine a lens: show the target larger, tilted, everywhere")
-    normals = np.array([cv2.Rodrigues(t)[0][:, 2] for t in turns])
+    if not (np.isfinite([lens.fx, lens.fy, *lens.distortion, *std]).all() and possible and std[0] < 0.2 * lens.fx):
+        raise CalibrationError(_UNDETERMINED)
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
     if tilt_deg < MIN_TILT_DEG:
         raise CalibrationError(
             f"the target was held the same way in all pictures (tilts differ by {tilt_deg:.1f} degrees, at "
             f"least {MIN_TILT_DEG:g} are needed): focal length and distance cannot be told apart; tilt it"
         )
-    weights = [len(c.points) for c in usable.values()]
-    error_px = float(np.sqrt(np.average(np.square(errors), weights=weights)))
+    counts = [len(c.points) for c in usable.values()]
+    error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
     covered = float(coverage_grid(usable.values(), size).mean())
-    return LensCalibration(lens, std, error_px, dict(zip(usable, errors)), tilt_deg, covered, unused)
-
-
-def _solve(
-    views: Mapping[str, Corners], size: tuple[int, int]
-) -> tuple[Pinhole, tuple[float, ...], list[Array], list[float]]:
-    points = [c.points.astype(np.float32) for c in views.values()]
-    pixels = [(c.pixels - 0.5).astype(np.float32) for c in views.values()]
-    try:
-        _, matrix, distortion, turns, _, std, _, errors = cv2.calibrateCameraExtended(
-            points, pixels, size, np.eye(3), np.zeros(4), flags=cv2.CALIB_FIX_K3
-        )
-    except cv2.error as error:
-        raise CalibrationError(f"the pictures do not determine a lens ({error.err})") from None
-    k1, k2, p1, p2 = map(float, distortion.ravel()[:4])
-    lens = Pinhole(
-        *size,
-        float(matrix[0, 0]),
-        float(matrix[1, 1]),
-        float(matrix[0, 2]) + 0.5,
-        float(matrix[1, 2]) + 0.5,
-        (k1, k2, p1, p2),
-    )
-    vectors: list[Array] = [np.asarray(t, dtype=np.float64) for t in turns]
-    return lens, tuple(map(float, std.ravel()[:8])), vectors, [float(e) for e in errors.ravel()]
+    found = dict(zip(usable, errors.tolist()))
+    return LensCalibration(lens, std, error_px, found, _held_out_error(usable, size), tilt_deg, covered, unused)
 
 
 def coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -155,3 +127,49 @@ def coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np
         at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)
         cells[at[:, 1], at[:, 0]] = True
     return cells
+
+
+def reprojection_errors(corners: Corners, lens: Pinhole) -> Array:
+    """Distances (N,) in pixels of corners from where the target's estimated pose puts them. Raises
+    CalibrationError."""
+    pose = estimate_pose(corners, lens)
+    off = lens.project(corners.points @ pose[:3, :3].T + pose[:3, 3]) - corners.pixels
+    return np.asarray(np.linalg.norm(off, axis=1))
+
+
+def _held_out_error(views: Mapping[str, Corners], size: tuple[int, int]) -> float | None:
+    names = list(views)
+    held_out = names[_HOLD_OUT_EVERY - 1 :: _HOLD_OUT_EVERY]
+    training = {name: corners for name, corners in views.items() if name not in held_out}
+    if not held_out or len(training) < MIN_VIEWS:
+        return None
+    try:
+        lens = _solve(training, size)[0]
+        errors = np.concatenate([reprojection_errors(views[name], lens) for name in held_out])
+    except CalibrationError:
+        return None
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def _solve(views: Mapping[str, Corners], size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], Array, Array]:
+    """Lens, its deviations, the target's normals (V, 3) in camera axes, and the reprojection errors (V,)."""
+    points = [c.points.astype(np.float32) for c in views.values()]
+    # OpenCV's origin is the center of the first pixel.
+    pixels = [(c.pixels - 0.5).astype(np.float32) for c in views.values()]
+    try:
+        _, matrix, distortion, turns, _, std, _, errors = cv2.calibrateCameraExtended(
+            points, pixels, size, np.eye(3), np.zeros(4), flags=cv2.CALIB_FIX_K3
+        )
+    except cv2.error as error:
+        raise CalibrationError(f"{_UNDETERMINED} ({error.err})") from None
+    k1, k2, p1, p2 = map(float, distortion.ravel()[:4])
+    lens = Pinhole(
+        *size,
+        float(matrix[0, 0]),
+        float(matrix[1, 1]),
+        float(matrix[0, 2]) + 0.5,
+        float(matrix[1, 2]) + 0.5,
+        (k1, k2, p1, p2),
+    )
+    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    return lens, tuple(map(float, std.ravel()[:8])), normals, np.asarray(errors, dtype=np.float64).ravel()

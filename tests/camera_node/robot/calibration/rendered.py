@@ -1,4 +1,4 @@
-"""Input of calibrations with known truth: pictures of a ChArUco board, samples, pose files."""
+"""Input of calibrations with known truth: rendered images of a ChArUco board, samples, pose files."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse, transform_of
+from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import GrayImage, Target, parse_target
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Quad
 from camera_node.synthetic.textures import Plain
-from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, se3_inverse, so3_exp
-from tests.camera_node.robot.calibration import known_truth as simulated
+from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, se3, se3_inverse, so3_exp
+from tests.camera_node.robot.calibration import known_truth
 
 BOARD = "charuco:7x5:24mm:18mm"
 LENS = Pinhole.from_fov(320, 240, 65.0)
@@ -32,10 +32,10 @@ _PLATE_MARGIN_M = 0.02
 
 @lru_cache(maxsize=1)
 def taken(count: int = 12) -> tuple[list[np.ndarray], np.ndarray]:
-    """Gray pictures, and the hand's true poses (N, 4, 4)."""
-    hands = simulated.random_hands(count, np.random.default_rng(3))
+    """Gray pictures, and the flange's true poses (N, 4, 4)."""
+    flanges = known_truth.random_flanges(count, np.random.default_rng(3))
     board = parse_target(BOARD)
-    return [render(board, LENS, camera_in_target(h), 2) for h in hands], hands
+    return [render(board, LENS, camera_in_target(h), 2) for h in flanges], flanges
 
 
 def write_scenario(
@@ -67,17 +67,17 @@ def write_poses(file: Path, times_ns: NDArray[np.int64], poses: Array) -> None:
 def noisy_samples(
     count: int,
     rng: np.random.Generator,
-    rad: float = simulated.ARM_RAD,
-    meters: float = simulated.ARM_M,
+    rad: float = known_truth.ARM_RAD,
+    meters: float = known_truth.ARM_M,
     setup: str = EYE_IN_HAND,
 ) -> Samples:
-    """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
+    """Samples with arm noise. For eye-to-hand, flange and base change places: X is the same (4, 4), then the
     camera in the base."""
-    hands = simulated.random_hands(count, rng)
-    targets = simulated.observed_targets(hands)
+    flanges = known_truth.random_flanges(count, rng)
+    targets = known_truth.observed_targets(flanges)
     if setup != EYE_IN_HAND:
-        hands = inverse(hands)
-    return Samples(simulated.add_noise(hands, rng, rad, meters), targets, setup)
+        flanges = se3_inverse(flanges)
+    return Samples(known_truth.add_noise(flanges, rng, rad, meters), targets, setup)
 
 
 def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
@@ -85,7 +85,7 @@ def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: 
     width, height = target.size_m
     picture = target.draw(max(256, round(width / 0.0002)))
     # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
-    flip = transform_of(so3_exp((np.pi, 0.0, 0.0)), np.array([width / 2, height / 2, 0.0]))
+    flip = se3(so3_exp((np.pi, 0.0, 0.0)), np.array([width / 2, height / 2, 0.0]))
     parts = []
     for depth_m, margin_m, texture in (
         (0.0, 0.0, _ImageTexture(picture, width, height)),
@@ -102,9 +102,9 @@ def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: 
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def camera_in_target(hand: Array) -> Array:
-    """(4, 4) for ``render``, of a hand in base."""
-    return np.asarray(se3_inverse(simulated.TARGET_IN_BASE) @ hand @ simulated.CAMERA_IN_HAND)
+def camera_in_target(flange: Array) -> Array:
+    """(4, 4) for ``render``, of a flange in base."""
+    return np.asarray(se3_inverse(known_truth.TARGET_IN_BASE) @ flange @ known_truth.CAMERA_IN_FLANGE)
 
 
 @dataclass(frozen=True)

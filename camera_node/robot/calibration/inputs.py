@@ -1,79 +1,46 @@
-"""Read calibration input: ViSP's folders, pose pairs as JSON, time-stamped poses as CSV."""
+"""Input of a calibration: images with a target, ViSP's folders, pose pairs as JSON, stamped poses as CSV, lenses."""
 
 from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.pairing import PairingCounts, sort_samples
 from camera_node.pose.providers import read_samples
 from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose
+from camera_node.robot.calibration.targets import Corners, Target, estimate_pose
 from camera_node.sources.datasets.imaging import decode_file
 from camera_node.sources.datasets.records import read_json
 from camera_node.sources.rig_calibration import load_calibration
-from freshfield.geometry import Pinhole, so3_exp
+from freshfield.geometry import Pinhole, se3, so3_exp
 from freshfield.untrusted import read_yaml
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-# Lower bound in pixels, so that perfect (rendered) images do not make a corner exact.
-_MIN_PIXEL_NOISE = 0.02
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True)
 class Track:
-    """A stream of poses.
-
-    times_ns: (N,), increasing.
-    poses: (N, 4, 4).
-    counts: what was sorted or dropped.
-    """
+    """A stream of poses. times_ns: (N,), increasing. poses: (N, 4, 4)."""
 
     times_ns: NDArray[np.int64]
     poses: Array
-    counts: PairingCounts = field(default_factory=PairingCounts)
 
 
 def sorted_track(times_ns: Sequence[int], poses: Sequence[Array], what: str) -> Track:
-    """Sort poses (4, 4) by stamp into a track. what: name of the poses in messages. Raises CalibrationError
-    for fewer than two."""
-    times_ns, poses, counts = sort_samples(times_ns, poses)
-    if len(times_ns) < 2:
-        raise CalibrationError(f"{len(times_ns)} {what}: a time offset needs many of a moving hand")
-    return Track(np.array(times_ns, dtype=np.int64), np.array(poses), counts)
-
-
-def read_pairs(file: Path, setup: str) -> Samples:
-    """Samples from a JSON list of [end-effector in base, target in camera], each 4 x 4. Raises
-    DatasetError and CalibrationError."""
-    data = read_json(file)
-    if not isinstance(data, list):
-        raise CalibrationError(f"{file}: expected a list of pairs of 4 x 4 matrices")
-    hands, targets = [], []
-    for k, pair in enumerate(data):
-        try:
-            hand, target = pair
-            hands.append(rigid_transform(hand))
-            targets.append(rigid_transform(target))
-        except (ValueError, TypeError, OverflowError) as error:
-            raise CalibrationError(
-                f"{file}: pair {k + 1}: expected [hand in base, target in camera]: {error}"
-            ) from None
-    return Samples(_stacked(hands), _stacked(targets), setup)
-
-
-def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
-    """The JSON that ``read_pairs`` reads."""
-    return [[h.tolist(), t.tolist()] for h, t in zip(samples.hand, samples.target)]
+    """Sort poses (4, 4) by stamp into a track; of equal stamps the first counts. what: name of the poses in
+    messages. Raises CalibrationError for fewer than two."""
+    times, first = np.unique(np.array(times_ns, dtype=np.int64), return_index=True)
+    if len(times) < 2:
+        raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving arm")
+    return Track(times, np.array(poses)[first])
 
 
 def read_track(file: Path) -> Track:
@@ -83,20 +50,41 @@ def read_track(file: Path) -> Track:
     return sorted_track(times, [pose.matrix() for pose in poses], f"poses in {file}")
 
 
+def read_pairs(file: Path, setup: str) -> Samples:
+    """Samples from a JSON list of [flange in base, target in camera], each 4 x 4. Raises DatasetError and
+    CalibrationError."""
+    data = read_json(file)
+    if not isinstance(data, list):
+        raise CalibrationError(f"{file}: expected a list of pairs of 4 x 4 matrices")
+    flanges, targets = [], []
+    for k, pair in enumerate(data):
+        try:
+            flange, target = pair
+            flanges.append(rigid_transform(flange))
+            targets.append(rigid_transform(target))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise CalibrationError(
+                f"{file}: pair {k + 1}: expected [flange in base, target in camera]: {error}"
+            ) from None
+    return Samples(np.reshape(flanges, (-1, 4, 4)), np.reshape(targets, (-1, 4, 4)), setup)
+
+
+def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
+    """The JSON that ``read_pairs`` reads."""
+    return [[flange.tolist(), target.tolist()] for flange, target in zip(samples.flange, samples.target)]
+
+
 def read_visp_pose(file: Path) -> Array:
     """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in meters and radians. Raises
     CalibrationError."""
     try:
-        data = read_yaml(file.read_text())
-        values = np.array(data["data"], dtype=np.float64).ravel()
+        values = np.array(read_yaml(file.read_text())["data"], dtype=np.float64).ravel()
         if values.shape != (6,) or not np.isfinite(values).all():
             raise ValueError(f"{values.size} numbers")
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = " ".join(str(error).split())
         raise CalibrationError(f"{file}: expected ViSP's YAML of a pose, data: tx ty tz and theta u: {why}") from None
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = so3_exp(values[3:]), values[:3]
-    return out
+    return se3(so3_exp(values[3:]), values[:3])
 
 
 def read_lens(file: Path) -> Pinhole:
@@ -132,20 +120,13 @@ def read_lens(file: Path) -> Pinhole:
         ) from None
 
 
-def _read_gray_image(file: Path) -> NDArray[np.uint8]:
-    picture = decode_file(file, cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise CalibrationError(f"{file}: cannot be read as a picture, or is larger than OpenCV's limit")
-    return np.asarray(picture, dtype=np.uint8)
-
-
 def list_images(folder: Path) -> list[Path]:
     """Image files in the order of the numbers in their names. Raises CalibrationError if there are none."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such folder")
-    found = [f for f in folder.iterdir() if f.suffix.lower() in PICTURES]
+    found = [f for f in folder.iterdir() if f.suffix.lower() in IMAGES]
     if not found:
-        raise CalibrationError(f"{folder}: has no pictures ({', '.join(PICTURES)})")
+        raise CalibrationError(f"{folder}: has no pictures ({', '.join(IMAGES)})")
     return sorted(found, key=lambda f: (_number(f) is None, _number(f) or 0, f.name))
 
 
@@ -162,12 +143,14 @@ def find_corners(
     found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
     for k, file in enumerate(files):
-        picture = _read_gray_image(file)
-        height, width = picture.shape
+        image = decode_file(file, cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise CalibrationError(f"{file}: cannot be read as a picture, or is larger than OpenCV's limit")
+        height, width = image.shape
         size = size or (width, height)
         if (width, height) != size:
             raise CalibrationError(f"{file}: is {width} x {height}, expected {size[0]} x {size[1]}")
-        corners = target.find(picture)
+        corners = target.find(np.asarray(image, dtype=np.uint8))
         if corners is None:
             unused[file.name] = f"{target.name} not found"
         else:
@@ -176,33 +159,10 @@ def find_corners(
     return found, unused, size or (0, 0)
 
 
-def _pixel_noise(seen: Sequence[TargetPose]) -> float:
-    """Standard deviation (pixels) of a corner coordinate, from all reprojections with six degrees of freedom
-    fitted per image."""
-    squares = sum(s.error_px**2 * len(s.corners.points) for s in seen)
-    freedom = sum(2 * len(s.corners.points) - 6 for s in seen)
-    return max(float(np.sqrt(squares / max(freedom, 1))), _MIN_PIXEL_NOISE)
-
-
-def to_samples(seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str) -> Samples:
-    """Samples with the target's covariance from the noise of its corners.
-
-    seen, hands, names: target poses, hand poses in base (4, 4), and names for messages.
-    """
-    noise = _pixel_noise(seen)
-    return Samples(
-        _stacked(list(hands)),
-        _stacked([s.pose for s in seen]),
-        setup,
-        np.array([s.unit_covariance * noise**2 for s in seen]).reshape(-1, 6, 6),
-        tuple(names),
-    )
-
-
 def read_visp_folder(
     folder: Path, target: Target, lens: Pinhole | None, setup: str, progress: Callable[[int], None]
 ) -> tuple[Samples, dict[str, str]]:
-    """Samples from pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number.
+    """Samples from images ``*-N.png`` with poses ``*_N.yaml`` of the flange, matched by number.
 
     lens: None reads the folder's XML file.
     progress: see ``find_corners``.
@@ -219,21 +179,18 @@ def read_visp_folder(
     if not paired:
         raise CalibrationError(f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)")
     found, unused, _ = find_corners(paired, target, (lens.width, lens.height), progress)
-    seen: dict[str, TargetPose] = {}
+    unused |= {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
+    seen: dict[str, Array] = {}
     for name, corners in found.items():
         try:
             seen[name] = estimate_pose(corners, lens)
         except CalibrationError as error:
             unused[name] = str(error)
-    unused |= {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
-    hands = [read_visp_pose(poses[_number(f)]) for f in paired if f.name in seen]
-    return to_samples(list(seen.values()), hands, list(seen), setup), unused
+    flanges = [read_visp_pose(poses[_number(f)]) for f in paired if f.name in seen]
+    targets = list(seen.values())
+    return Samples(np.reshape(flanges, (-1, 4, 4)), np.reshape(targets, (-1, 4, 4)), setup, tuple(seen)), unused
 
 
 def _number(file: Path) -> int | None:
     match = re.search(r"(\d+)$", file.stem)
     return int(match.group(1)) if match else None
-
-
-def _stacked(matrices: list[Array]) -> Array:
-    return np.array(matrices, dtype=np.float64).reshape(-1, 4, 4)

@@ -1,1 +1,0 @@
-"""Intrinsic calibration of a lens from pictures of a target."""
