@@ -25,8 +25,6 @@ class View:
     camera_to_world: float64 (4, 4), OpenCV axes, meters.
     generated_ns: capture time, edge clock.
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
-    carried_to_ns: the instant that the image has been carried forward to since its capture
-    (``treatments.flow_warp``); None: it shows the instant of its capture.
     whole: where ``image`` was decoded smaller (``Field.most_pixels``), decodes the same frame at its full
     resolution and returns that view, or None if the frame is damaged.
     """
@@ -37,13 +35,7 @@ class View:
     intrinsics: Pinhole
     generated_ns: int = 0
     weight: NDArray[np.float32] | None = None
-    carried_to_ns: int | None = None
     whole: Callable[[], View | None] | None = field(default=None, compare=False, repr=False)
-
-    @property
-    def shows_ns(self) -> int:
-        """The instant that the image shows: motion and weights by age go by it, reported ages by capture."""
-        return self.generated_ns if self.carried_to_ns is None else self.carried_to_ns
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,7 @@ class FitReport:
     """What one fit did: optimizer steps, wall seconds, mean loss of the last steps, rays and samples.
 
     dropped: rays and gradients that were not finite and were left out.
-    refused: cameras whose view was left out as an outlier (``common.view_outliers``).
+    refused: cameras whose view contradicts the others' background, and was left out (``splat`` in layers).
     note: why nothing was done, if so.
     """
 

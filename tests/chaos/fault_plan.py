@@ -20,16 +20,7 @@ SECONDS = 4.5
 _FAULTS_BEGIN_S = (0.3, 2.0)
 FAULTS_OVER_S = 2.5
 _SMALL: dict[str, dict[str, Any]] = {
-    "ngp": {
-        "device": "cpu",
-        "levels": 4,
-        "log2_table": 12,
-        "finest_resolution": 64,
-        "batch_samples": 4096,
-        "rays": 512,
-        "samples": 32,
-        "cells": 32,
-    },
+    "ngp": {"levels": 4, "log2_table": 12, "batch_samples": 4096, "rays": 512, "samples": 32},
     "splat": {"gaussians": 300, "start": 200, "seed_cells": 12},
 }
 

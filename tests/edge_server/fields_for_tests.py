@@ -7,16 +7,11 @@ from edge_server.fields.registry import make_field
 TINY = {
     "levels": 2,
     "log2_table": 10,
-    "base_resolution": 4,
-    "finest_resolution": 8,
-    "hidden": 8,
     "rays": 256,
     "batch_samples": 4096,
     "samples": 24,
-    "cells": 8,
     "centre_m": [0.0, 0.0, 0.0],
     "radius_m": 1.0,
-    "device": "cpu",
 }
 
 

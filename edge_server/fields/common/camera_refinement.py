@@ -183,7 +183,7 @@ class CameraRefinement:
 
     @property
     def enabled(self) -> bool:
-        """Whether anything is to be learned. If so, a view that looks wrong may not be an outlier."""
+        """Whether anything is to be learned."""
         return self.exposures is not None or self.poses is not None
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:

@@ -27,22 +27,17 @@ class OccupancyGrid:
 
     density: float32, per scene unit. seen: uint16, how many cameras see each cell. occupied: uint8, whether
     it gets samples; coarse: the same of blocks of COARSE^3 cells. needed: cameras that must see a cell.
-    unknown: density of what was never sampled; with ``EMPTY`` the first sample decides.
     """
 
-    def __init__(self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY) -> None:
-        self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
-        self.density = np.full(cells**3, unknown, np.float32)
+    def __init__(self, cells: int, min_views: int, box: SceneBox | None) -> None:
+        """A grid that knows nothing yet of the scene in ``box``: the first sample of a cell decides."""
+        self.cells, self.min_views = cells, min_views
+        self.contracted, self.near = (box.contracted, box.near_m / box.radius_m) if box else (False, 0.1)
+        self.density = np.full(cells**3, EMPTY, np.float32)
         self.seen = np.zeros(cells**3, np.uint16)
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
         self.needed = 1
-
-    @classmethod
-    def for_box(cls, cells: int, min_views: int, box: SceneBox | None, unknown: float = EMPTY) -> OccupancyGrid:
-        """A grid that knows nothing yet of the scene in ``box``."""
-        near = box.near_m / box.radius_m if box else 0.1
-        return cls(cells, box.contracted if box else False, near, min_views, unknown)
 
     def space(self, step: float) -> Space:
         """The grid as kernels read it, without copies."""
@@ -56,12 +51,11 @@ class OccupancyGrid:
             np.float32(self.near),
         )
 
-    def recount_views(self, pool: Pool, store: ViewStore, empty: float = EMPTY) -> NDArray[np.bool_] | None:
+    def recount_views(self, pool: Pool, store: ViewStore) -> None:
         """Count anew which cells the known cameras see, and occupy those where something moved.
 
         Something moved where most cameras that see a cell see it change: the visual hull of the changed
         pixels. Otherwise a moving body could not appear where space was known to be empty.
-        empty: density below which a cell gets no samples. Returns the cells (cells^3,) opened, if any.
         """
         assert store.box is not None
         views = pack_cameras(store.views, store.box)
@@ -86,12 +80,10 @@ class OccupancyGrid:
             marked,
         )
         self.needed = min(self.min_views, len(store.memory))
-        moving = None
         if length:
             moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
-            np.maximum(self.density, np.float32(1.5 * empty), out=self.density, where=moving)
-        self.update_occupied(empty)
-        return moving
+            np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
+        self.update_occupied()
 
     def refresh(
         self,
@@ -124,9 +116,9 @@ class OccupancyGrid:
         )
         self.update_occupied()
 
-    def update_occupied(self, empty: float = EMPTY) -> None:
-        """Give samples to the cells with a density of ``empty`` or more."""
-        threshold(self.density, self.seen, self.needed, empty, self.cells, self.occupied, self.coarse)
+    def update_occupied(self) -> None:
+        """Give samples to the cells with a density of ``EMPTY`` or more."""
+        threshold(self.density, self.seen, self.needed, EMPTY, self.cells, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

@@ -1,9 +1,7 @@
-"""An immutable copy of a trained field: renders from any thread while the field itself trains on."""
+"""An immutable copy of a field with rays: renders from any thread while the field itself trains on."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -21,25 +19,40 @@ from freshfield.geometry import Pinhole
 
 SOLID = 0.5  # opacity from which on a ray has met a surface
 
-
 Pixels = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Color (N, 3), depth (N,) in meters and opacity (N,) at N image points."""
 
 
-class PixelSnapshot(ABC):
-    """An immutable copy of a field that knows no motion, rendered pixel by pixel."""
+@dataclass(frozen=True)
+class RaySnapshot:
+    """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made.
 
+    settings: of the field. levels: how many levels of the encoding are in use. background: float32 (3,).
+    cameras: the newest view of each camera. step: of the field.
+    """
+
+    settings: Any
+    box: SceneBox
+    encoding: Any
+    levels: int
+    net: Net
+    space: Space
+    background: NDArray[np.float32]
     cameras: tuple[View, ...]
-
-    @abstractmethod
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> Pixels:
-        """What a camera sees at image points (N, 2)."""
+    pool: Pool
+    step: int
 
     def at(self, present_ns: int) -> Self:
-        """Itself."""
+        """Itself: it knows no motion."""
         return self
+
+    def copied(self) -> Self:
+        """See ``stepped_field.StepSnapshot``."""
+        space = self.space._replace(
+            occupied=self.space.occupied.copy(), coarse=self.space.coarse.copy(), density=np.zeros(0, np.float32)
+        )
+        encoding = self.encoding._replace(table=self.encoding.table.copy())
+        return replace(self, encoding=encoding, net=Net(self.net.widths, self.net.params.copy()), space=space)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render a camera."""
@@ -69,81 +82,28 @@ class PixelSnapshot(ABC):
             colors.append(color[solid])
         return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
 
-
-def run_by_pixel(
-    pool: Pool,
-    kernel: Callable[..., None],
-    box: SceneBox,
-    camera_to_world: NDArray[np.float64],
-    intrinsics: Pinhole,
-    pixels: NDArray[np.float64],
-    *args: Any,
-) -> Pixels:
-    """Run a kernel that renders image points.
-
-    kernel: takes a lens row, rotation, origin (scene units) and image points, then ``args``, then arrays for
-        color, depth (scene units) and opacity to write into.
-    """
-    pose = np.asarray(camera_to_world, dtype=np.float64)
-    n = len(pixels)
-    color, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    pool.run(
-        kernel,
-        np.array(lens_row(intrinsics), dtype=np.float64),
-        np.ascontiguousarray(pose[:3, :3]),
-        box.normalise(pose[:3, 3]),
-        np.ascontiguousarray(pixels, dtype=np.float64),
-        *args,
-        color,
-        depth,
-        opacity,
-    )
-    depth *= np.float32(box.radius_m)
-    return color, depth, opacity
-
-
-@dataclass(frozen=True)
-class RaySnapshot(PixelSnapshot):
-    """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made."""
-
-    box: SceneBox
-    encoding: Any
-    levels: int
-    net: Net
-    harmonics: int
-    space: Space
-    background: NDArray[np.float32]
-    cameras: tuple[View, ...]
-    pool: Pool
-    step: int
-
-    def copied(self) -> Self:
-        """See ``stepped_field.StepSnapshot``."""
-        space = self.space._replace(
-            occupied=self.space.occupied.copy(), coarse=self.space.coarse.copy(), density=np.zeros(0, np.float32)
-        )
-        encoding = self.encoding._replace(table=self.encoding.table.copy())
-        return replace(self, encoding=encoding, net=Net(self.net.widths, self.net.params.copy()), space=space)
-
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
     ) -> Pixels:
-        """See ``PixelSnapshot``."""
-        room, workers = TILE * ROUND, self.pool.threads
-        return run_by_pixel(
-            self.pool,
-            render_tiles,
-            self.box,
-            camera_to_world,
-            intrinsics,
-            pixels,
-            self.space,
-            self.encoding,
-            self.levels,
-            self.net,
-            self.harmonics,
-            self.background,
-            np.empty((workers, int(self.net.widths.sum()), room), np.float32),
-            np.empty((workers, 3, room), np.float32),
-            np.empty((workers, 2, room), np.float32),
-        )
+        """What a camera sees at image points (N, 2)."""
+        pose = np.asarray(camera_to_world, dtype=np.float64)
+        lens, rotation = np.array(lens_row(intrinsics), dtype=np.float64), np.ascontiguousarray(pose[:3, :3])
+        camera = lens, rotation, self.box.normalise(pose[:3, 3]), np.ascontiguousarray(pixels, dtype=np.float64)
+        n = len(pixels)
+        out = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+        self._run(camera, out)
+        color, depth, opacity = out
+        depth *= np.float32(self.box.radius_m)
+        return color, depth, opacity
+
+    def _run(self, camera: tuple[NDArray[np.float64], ...], out: Pixels) -> None:
+        """Run the kernel that renders ``camera`` (lens row, rotation, origin in scene units, image points) into
+        ``out``, with depth in scene units."""
+        model = self.space, self.encoding, self.levels, self.net, self.settings.harmonics, self.background
+        self.pool.run(render_tiles, *camera, *model, *self._scratch(TILE * ROUND, 2), *out)
+
+    def _scratch(self, samples: int, rows: int) -> Pixels:
+        """Memory of a rendering kernel's workers: activations, points and ``rows`` numbers of ``samples`` samples."""
+        shapes = (int(self.net.widths.sum()), samples), (3, samples), (rows, samples)
+        acts, x, line = (np.empty((self.pool.threads, *shape), np.float32) for shape in shapes)
+        return acts, x, line

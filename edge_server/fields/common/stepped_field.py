@@ -95,8 +95,7 @@ class SteppedField(ABC, Generic[S]):
             step_budget.end_step()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        refused = self._refused_among(views)
-        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped, refused)
+        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render a camera from the present parameters."""
@@ -177,7 +176,3 @@ class SteppedField(ABC, Generic[S]):
     @abstractmethod
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         """Take over the counters and arrays of a state."""
-
-    def _refused_among(self, views: Sequence[View]) -> tuple[str, ...]:
-        """Cameras whose view is left out as an outlier."""
-        return self.view_store.refused_among(views)

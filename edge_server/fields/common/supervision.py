@@ -28,12 +28,10 @@ class CameraMemory:
     """The newest view of one camera.
 
     moved: bool (H, W), the pixels that moved since the view before; None where that is unknown.
-    refusals_left: remaining number of contradicting views to refuse (``view_outliers.find_outliers``).
     """
 
     view: View
     moved: NDArray[np.bool_] | None = None
-    refusals_left: int = 0
 
 
 def lens_row(camera: Pinhole) -> list[float]:
@@ -120,11 +118,9 @@ def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bo
         if known is not None:
             # The same frame decoded once more is no news; an equal but newer one says that nothing moved.
             # Otherwise pixels that one wrong picture changed would count as moving while the scene stands.
-            again = known.view.shows_ns == view.shows_ns
-            same = again and np.array_equal(known.view.image, view.image)
+            same = known.view.generated_ns == view.generated_ns and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
-        # A camera that moved may see what no other has seen: that is no reason to refuse it.
-        memory[view.camera] = CameraMemory(view, moved, known.refusals_left if known is not None and stood else 0)
+        memory[view.camera] = CameraMemory(view, moved)
     return news
 
 
@@ -143,16 +139,10 @@ def pack_cameras(views: Sequence[View], box: SceneBox) -> Views:
     )
 
 
-def pack_views(
-    views: Sequence[View],
-    box: SceneBox,
-    memory: dict[str, CameraMemory],
-    weights: Sequence[NDArray[np.float32]] | None = None,
-) -> Views:
+def pack_views(views: Sequence[View], box: SceneBox, memory: dict[str, CameraMemory]) -> Views:
     """Everything one fit reads. Opaque and transparent pictures may be mixed.
 
     memory: camera -> its newest view, and which of its pixels moved.
-    weights: float32 (H, W) of each view (``view_outliers.pixel_weights``); None: all 1.
     """
     packed = pack_cameras(views, box)
     channels = max(v.image.shape[2] for v in views)
@@ -165,32 +155,20 @@ def pack_views(
         if known is not None and known.view is view and known.moved is not None:
             changed.append(a + np.flatnonzero(known.moved))
     moved = np.concatenate(changed) if changed else np.zeros(0, np.int64)
-    if weights is None:
-        return packed._replace(pixels=pixels, changed=moved)
-    weight = np.concatenate([w.reshape(-1) for w in weights])
-    return _weighted(packed._replace(pixels=pixels, changed=moved), weight)
-
-
-def without_views(data: Views, refused: NDArray[np.bool_]) -> Views:
-    """``data`` with weight 0 for the pixels of the refused views, bool (V,)."""
-    if not refused.any():
-        return data
-    weight = data.weight.copy() if data.weight.size else np.ones(len(data.pixels), np.float32)
-    for k in np.flatnonzero(refused):
-        weight[data.first[k] : data.first[k + 1]] = 0.0
-    return _weighted(data, weight)
+    packed = packed._replace(pixels=pixels, changed=moved)
+    if all(v.weight is None or bool((v.weight == 1.0).all()) for v in views):
+        return packed
+    ones = [np.ones(v.image.shape[:2], np.float32) if v.weight is None else v.weight for v in views]
+    weight = np.concatenate([w.reshape(-1) for w in ones])
+    drawn = np.flatnonzero(weight)
+    return packed._replace(
+        changed=moved[weight[moved] > 0],
+        weight=weight,
+        drawn=drawn if drawn.size < weight.size else np.zeros(0, np.int64),
+    )
 
 
 def supervising_views(data: Views) -> list[int]:
     """The numbers of the views that have pixels of weight above 0."""
     spans = zip(data.first[:-1], data.first[1:])
     return [k for k, (a, b) in enumerate(spans) if not data.weight.size or data.weight[a:b].any()]
-
-
-def _weighted(data: Views, weight: NDArray[np.float32]) -> Views:
-    drawn = np.flatnonzero(weight)
-    return data._replace(
-        changed=data.changed[weight[data.changed] > 0],
-        weight=weight,
-        drawn=drawn if drawn.size < weight.size else np.zeros(0, np.int64),
-    )

@@ -71,10 +71,7 @@ class TrainedField(SteppedField[RaySnapshot]):
                 self._occupancy.recount_views(self.pool, self.view_store)
             assert self.view_store.box is not None
             box, cameras = self.view_store.box, self._cameras
-            data = update.data
-            if not cameras.enabled:
-                data = self.view_store.without_outliers(views, update, self.step, self._live())
-            data = cameras.corrected(views, data, box)
+            data = cameras.corrected(views, update.data, box)
             data = self._add_depth_guide(views, data, box, step_budget, update.has_new_images)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
@@ -91,11 +88,11 @@ class TrainedField(SteppedField[RaySnapshot]):
 
     def _live(self) -> RaySnapshot:
         return RaySnapshot(
+            settings=self.settings,
             box=self.view_store.box or UNIT_BOX,
             encoding=self._encoding,
             levels=self._levels(),
             net=self._net,
-            harmonics=self.settings.harmonics,
             space=self._occupancy.space(step_length(self.settings, self.step)),
             background=self.view_store.background(),
             cameras=self.view_store.views,
@@ -209,7 +206,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = OccupancyGrid.for_box(s.cells, s.min_views, self.view_store.box)
+        self._occupancy = OccupancyGrid(s.cells, s.min_views, self.view_store.box)
         self._cameras = CameraRefinement(s.exposure, s.refine_m, s.refine_deg)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())
@@ -284,11 +281,10 @@ class TrainedField(SteppedField[RaySnapshot]):
             beta2=np.float32(BETA2),
             epsilon=np.float32(s.epsilon),
             scale=np.float32(NOMINAL_RAYS / rays),
-            decay=np.float32(s.decay),
             correct1=np.float32(1.0 / (1.0 - BETA1_FIELD**self._updates)),
             correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
         )
-        rule_net = rule._replace(rate=np.float32(s.rate_net * fall), decay=np.float32(0.0))
+        rule_net = rule._replace(rate=np.float32(s.rate_net * fall))
         self.pool.run(
             adam,
             (self._net.params, self._net_m, self._net_v, self._net_g),

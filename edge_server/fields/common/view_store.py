@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,13 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
-from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views, without_views
+from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views
 from edge_server.fields.common.trainer_settings import FieldSettings
-from edge_server.fields.common.view_outliers import RenderPoints, find_outliers, pixel_weights
 from freshfield.geometry import Pinhole
-
-if TYPE_CHECKING:
-    from edge_server.fields.common.ray_snapshot import PixelSnapshot
 
 Arrays = dict[str, NDArray[Any]]
 
 FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
-SETTLED_STEPS = 100  # steps after which a field may refuse views
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,6 @@ class ViewStore:
         self.memory: dict[str, CameraMemory] = {}
         self.auto_background = np.full(3, 0.5, np.float32)
         self.background_is_plain = False  # whether that is the color of a plain background
-        self.refused_cameras: set[str] = set()  # cameras whose newest view is refused
         self._box_cameras = 0
         self._packed: tuple[tuple[View, ...], Views] | None = None
 
@@ -78,42 +72,15 @@ class ViewStore:
             self.auto_background, self.background_is_plain = _find_background(views)
         if has_new_images and any(m.moved is not None for m in self.memory.values()):
             visibility_changed = True
-        weights = pixel_weights(views, self.memory, self.settings)
-        data = pack_views(views, self.box, self.memory, weights)
+        data = pack_views(views, self.box, self.memory)
         self._packed = (tuple(views), data)
         return PackedUpdate(data, box_changed, visibility_changed or box_changed, has_new_images)
 
     def _is_new(self, view: View) -> bool:
         known = self.memory.get(view.camera)
         return known is None or (
-            known.view.shows_ns != view.shows_ns or not np.array_equal(known.view.image, view.image)
+            known.view.generated_ns != view.generated_ns or not np.array_equal(known.view.image, view.image)
         )
-
-    def without_outliers(self, views: Sequence[View], update: PackedUpdate, step: int, field: PixelSnapshot) -> Views:
-        """``update.data`` without the views that contradict ``field``, which has learned for ``step`` steps.
-        Pictures that were known already are not judged again."""
-
-        def render_points(views: Sequence[View], points: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float32]]:
-            return [
-                field.render_pixels(view.camera_to_world, view.intrinsics, where)[0]
-                for view, where in zip(views, points)
-            ]
-
-        if update.has_new_images:
-            flags = self.find_outliers(views, step, render_points)
-            given = {view.camera for view in views}
-            refused = {view.camera for view, flag in zip(views, flags) if flag}
-            self.refused_cameras = (self.refused_cameras - given) | refused
-        return without_views(update.data, np.array([view.camera in self.refused_cameras for view in views]))
-
-    def refused_among(self, views: Sequence[View]) -> tuple[str, ...]:
-        """The cameras of ``views`` that are refused."""
-        return tuple(view.camera for view in views if view.camera in self.refused_cameras)
-
-    def find_outliers(self, views: Sequence[View], step: int, render_points: RenderPoints) -> NDArray[np.bool_]:
-        """Which views contradict a field that has learned for ``step`` steps: see ``view_outliers``."""
-        settled = step >= SETTLED_STEPS
-        return find_outliers(views, self.memory, self.settings.refuse_beyond, settled, render_points)
 
     def background(self) -> NDArray[np.float32]:
         """The color (3,) behind everything that is rendered."""
@@ -130,15 +97,8 @@ class ViewStore:
             "box": asdict(self.box) if self.box else None,
             "box_cameras": self._box_cameras,
             "plain": self.background_is_plain,
-            "left_out": sorted(self.refused_cameras),
             "cameras": [
-                {
-                    "camera": m.view.camera,
-                    "generated_ns": m.view.generated_ns,
-                    "carried_to_ns": m.view.carried_to_ns,
-                    "credit": m.refusals_left,
-                    **asdict(m.view.intrinsics),
-                }
+                {"camera": m.view.camera, "generated_ns": m.view.generated_ns, **asdict(m.view.intrinsics)}
                 for m in self.memory.values()
             ],
         }
@@ -158,7 +118,6 @@ class ViewStore:
         self._packed, self.memory = None, {}
         self._box_cameras = int(meta["box_cameras"])
         self.background_is_plain = bool(meta.get("plain", False))
-        self.refused_cameras = set(meta.get("left_out", ()))
         box = meta["box"]
         self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
         if self.box is not None:
@@ -169,22 +128,13 @@ class ViewStore:
         for k, entry in enumerate(meta["cameras"]):
             known = dict(entry)
             camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
-            refusals_left = int(known.pop("credit", 0))
-            carried_to_ns = known.pop("carried_to_ns", None)
             known["distortion"] = tuple(known["distortion"])
-            view = View(
-                camera,
-                arrays[f"image_{k}"],
-                arrays[f"pose_{k}"],
-                Pinhole(**known),
-                generated_ns,
-                carried_to_ns=carried_to_ns,
-            )
+            view = View(camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns)
             check_view(view)
             moved = arrays.get(f"moved_{k}")
             if moved is not None and (moved.dtype != np.bool_ or moved.shape != view.image.shape[:2]):
                 raise ValueError(f"camera {camera}: the pixels that moved are not those of its image")
-            self.memory[camera] = CameraMemory(view, moved, refusals_left)
+            self.memory[camera] = CameraMemory(view, moved)
 
 
 def same_views(a: Sequence[View], b: Sequence[View]) -> bool:

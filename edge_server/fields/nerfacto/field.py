@@ -7,26 +7,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, RaySampling
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.model_layout import init_net, make_grid
-from edge_server.fields.common.ray_snapshot import Pixels, RaySnapshot, run_by_pixel
+from edge_server.fields.common.ray_snapshot import Pixels, RaySnapshot
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.common.trained_field import TINY, TrainedField
-from edge_server.fields.common.training_schedule import active_levels, smoothing
 from edge_server.fields.nerfacto.appearance import CameraAppearance
 from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling, scatter_proposal
 from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, render_with_proposal
 from edge_server.fields.nerfacto.kernels.train import ProposalGradients, ProposalScratch, train_with_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
-from freshfield.geometry import Pinhole
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import STATE_SHAPE
 
 
 @dataclass(frozen=True)
@@ -35,52 +35,29 @@ class NerfactoSnapshot(RaySnapshot):
 
     sampling: ProposalSampling
 
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> Pixels:
-        """See ``PixelSnapshot``."""
-        workers = self.pool.threads
-        return run_by_pixel(
-            self.pool,
-            render_with_proposal,
-            self.box,
-            camera_to_world,
-            intrinsics,
-            pixels,
-            self.sampling,
-            self.space,
-            self.encoding,
-            self.levels,
-            self.net,
-            self.harmonics,
-            self.background,
-            np.empty((workers, int(self.net.widths.sum()), SAMPLE_BATCH), np.float32),
-            np.empty((workers, 3, SAMPLE_BATCH), np.float32),
-            np.empty((workers, 3, SAMPLE_BATCH), np.float32),
-        )
+    def _run(self, camera: tuple[NDArray[np.float64], ...], out: Pixels) -> None:
+        model = self.space, self.encoding, self.levels, self.net, self.settings.harmonics, self.background
+        scratch = self._scratch(SAMPLE_BATCH, 3)
+        self.pool.run(render_with_proposal, *camera, self.sampling, *model, *scratch, *out)
 
 
-class NerfactoField(TrainedField):
-    """A hash grid, a proposal and a small network. See ``fields.Field`` for the protocol."""
+class NerfactoField(NgpField):
+    """The hash grid of ``NgpField``, and a proposal. See ``fields.Field`` for the protocol."""
 
-    name = "nerfacto"
-    shape = (
-        "levels",
-        "log2_table",
-        "base_resolution",
-        "finest_resolution",
-        "hidden",
-        "hidden_layers",
-        "harmonics",
-        "cells",
+    name = NerfactoSettings.name
+    shape: ClassVar[tuple[str, ...]] = (
+        *(option for option in STATE_SHAPE if option != "samples"),
         "proposal_cells",
         "appearance",
     )
-    settings: NerfactoSettings
     _cameras: CameraAppearance
 
     def __init__(self, settings: NerfactoSettings | None = None, pool: Pool | None = None) -> None:
         super().__init__(settings or NerfactoSettings(), pool)
+
+    def _grid(self) -> Grid:
+        e = self._encoding
+        return Grid(e.resolution, e.first, e.dense, e.table)
 
     def _make(self, rng: np.random.Generator) -> tuple[ProposalGrid, Net]:
         s = self.settings
@@ -92,10 +69,7 @@ class NerfactoField(TrainedField):
         return ProposalGrid(grid.resolution, grid.first, grid.dense, table, s.proposal_cells), net
 
     def _tiny(self) -> NerfactoSettings:
-        return replace(self.settings, **TINY, log2_table=10, proposal_cells=8)
-
-    def _levels(self) -> int:
-        return active_levels(self.settings, self.step)
+        return replace(super()._tiny(), proposal_cells=8)
 
     def _forget_parameters(self) -> None:
         super()._forget_parameters()
@@ -154,12 +128,9 @@ class NerfactoField(TrainedField):
         cameras.gradient, cameras.rays = bins.d_embeddings, int(self._batch.rays.sum())
 
     def _gather(self, levels: int, scale: float) -> None:
-        batch, bins, e = self._batch, self._proposal_gradients, self._encoding
-        grid = Grid(e.resolution, e.first, e.dense, e.table)
-        self.pool.run(scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
-        if weight := smoothing(self.settings, self.step):
-            self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
-        self.pool.run(scatter_proposal, e, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)
+        super()._gather(levels, scale)
+        bins = self._proposal_gradients
+        self.pool.run(scatter_proposal, self._encoding, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)
 
     def _live(self) -> NerfactoSnapshot:
         live = super()._live()

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import init_net, make_grid
@@ -25,40 +25,31 @@ class NgpField(TrainedField):
     """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
 
     name = NgpSettings.name
-    shape = STATE_SHAPE
-    settings: NgpSettings
+    shape: ClassVar[tuple[str, ...]] = STATE_SHAPE
+    settings: Any
 
-    def __init__(self, settings: NgpSettings | None = None, pool: Pool | None = None) -> None:
+    def __init__(self, settings: Any = None, pool: Pool | None = None) -> None:
         super().__init__(settings or NgpSettings(), pool)
 
-    @property
     def _grid(self) -> Grid:
         grid: Grid = self._encoding
         return grid
 
-    def _make(self, rng: np.random.Generator) -> tuple[Grid, Net]:
-        return make_grid(self.settings, self.view_store.box, rng), init_net(
-            FEATURES * self.settings.levels, self.settings, rng
-        )
+    def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:
+        inputs = FEATURES * self.settings.levels
+        return make_grid(self.settings, self.view_store.box, rng), init_net(inputs, self.settings, rng)
 
-    def _tiny(self) -> NgpSettings:
+    def _tiny(self) -> Any:
         return replace(self.settings, **TINY, log2_table=10)
 
     def _levels(self) -> int:
         return active_levels(self.settings, self.step)
 
     def _gather(self, levels: int, scale: float) -> None:
-        batch = self._batch
-        self.pool.run(scatter, self._grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
+        batch, grid = self._batch, self._grid()
+        self.pool.run(scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
         if weight := smoothing(self.settings, self.step):
-            self.pool.run(smooth_grid, self._grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
+            self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
 
 
-def make(settings: NgpSettings) -> Field:
-    """A field on the CPU, or with ``device: cuda`` on the GPU. Raises ValueError for ``cuda`` if torch finds
-    no such device, or for an option that only the CPU kernels implement."""
-    if settings.device == "cuda":
-        from edge_server.fields.ngp.torch_field import NgpTorchField  # torch is imported only here
-
-        return NgpTorchField(settings, "cuda")
-    return NgpField(settings)
+make = NgpField

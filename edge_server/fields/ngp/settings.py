@@ -23,10 +23,9 @@ STATE_SHAPE = (
 
 @dataclass(frozen=True)
 class NgpSettings(HashGridSettings):
-    """What can be chosen about an ``NgpField``. Lengths in meters; None means: found from the cameras."""
+    """What can be chosen about an ``NgpField``."""
 
     name = "ngp"
-    has_cuda = True
 
 
 SETTINGS = NgpSettings

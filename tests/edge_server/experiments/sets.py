@@ -13,16 +13,7 @@ from camera_node.synthetic import make_scene
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
 
 # Enough of a field to learn a small scene in a second; results do not depend on threads.
-SMALL: dict[str, Any] = {
-    "device": "cpu",
-    "levels": 4,
-    "log2_table": 12,
-    "finest_resolution": 64,
-    "batch_samples": 8192,
-    "rays": 2048,
-    "samples": 64,
-    "cells": 32,
-}
+SMALL: dict[str, Any] = {"levels": 4, "log2_table": 12, "batch_samples": 8192, "rays": 2048, "samples": 64}
 SMALL_WORDS = [word for key, value in SMALL.items() for word in ("--option", f"{key}={value}")]
 
 

@@ -20,7 +20,7 @@ from freshfield.geometry import Pose, look_at
 from tests.work import MOST_MS, work_ms
 
 OPTIONS = {"splat": {"gaussians": 512, "start": 256, "seed_cells": 16}}
-SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48, "cells": 16}
+SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48}
 
 
 def saved(folder, name: str, steps: int = 30):

@@ -10,21 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget, Field
+from edge_server.fields import Budget
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small import NAMES, SMALL, small
+from tests.edge_server.fields.small import every_field, small
 
 VIEWS = ring(5, size=24)
 State = dict[str, Any]
-
-
-def _make(name: str) -> Field:
-    if name != "ngp in torch":
-        return small(name)
-    pytest.importorskip("torch", reason="torch is not installed")
-    from edge_server.fields.ngp.torch_field import NgpTorchField
-
-    return NgpTorchField(replace(SMALL["ngp"], rays=64), device="cpu")
 
 
 def _without(name: str) -> Callable[[State], None]:
@@ -89,9 +80,9 @@ DAMAGE: dict[str, Callable[[State], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", [*NAMES, "ngp in torch"])
+@every_field
 def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
-    field, other = _make(name), _make(name)
+    field, other = small(name), small(name)
     field.fit(VIEWS, Budget(steps=3))
     other.fit(VIEWS[:4], Budget(steps=1))
     other.fit([replace(v, image=255 - v.image) for v in VIEWS], Budget(steps=1))
@@ -107,7 +98,7 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
         assert after.keys() == before.keys(), damage
         assert all(np.array_equal(after[key], before[key]) for key in before), damage
     np.testing.assert_array_equal(shown, field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color)
-    twin = _make(name)
+    twin = small(name)
     twin.load_state(before)
     for either in (field, twin):  # nothing that a state does not hold was lost or gained either
         either.fit(VIEWS, Budget(steps=2))

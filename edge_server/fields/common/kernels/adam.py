@@ -18,15 +18,14 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 class Rule(NamedTuple):
-    """One step's hyperparameters, float32. scale: factor on gradients. decay: pull of parameters towards 0,
-    times the rate. correct1, correct2: the bias corrections 1 / (1 - beta^t)."""
+    """One step's hyperparameters, float32. scale: factor on gradients. correct1, correct2: the bias
+    corrections 1 / (1 - beta^t)."""
 
     rate: np.float32
     beta1: np.float32
     beta2: np.float32
     epsilon: np.float32
     scale: np.float32
-    decay: np.float32
     correct1: np.float32
     correct2: np.float32
 
@@ -50,7 +49,7 @@ def _update(rule, p, g, m, v):
         m1 = rule.beta1 * m0 + (_F1 - rule.beta1) * d
         v1 = rule.beta2 * v0 + (_F1 - rule.beta2) * d * d
         root = np.sqrt(v1 * rule.correct2) + rule.epsilon
-        q = p[k] - rule.rate * (m1 * rule.correct1 / root + rule.decay * p[k])
+        q = p[k] - rule.rate * (m1 * rule.correct1 / root)
         m[k] = m1 if use else m0
         v[k] = v1 if use else v0
         q = q if use else p[k]

@@ -258,7 +258,7 @@ class LayeredField:
         """Plates and foregrounds of the views not seen before. Returns these views."""
         begun = self.now()
         if self.origin_ns is None:
-            self.origin_ns = min(view.shows_ns for view in views)
+            self.origin_ns = min(view.generated_ns for view in views)
         news = {(v.generated_ns, v.camera): v for v in views if not self._has_seen(v)}
         for _, view in sorted(news.items()):
             self._take(view)
@@ -290,7 +290,7 @@ class LayeredField:
         self.refused -= {view.camera}
         self.observations.add(
             Observation(
-                (view.shows_ns - self.origin_ns) / 1e9,
+                (view.generated_ns - self.origin_ns) / 1e9,
                 view.camera,
                 replace(view, camera_to_world=camera.view.camera_to_world),
                 foreground,
@@ -494,6 +494,6 @@ def _newest_of_each(views: Sequence[View]) -> list[View]:
     """The newest view of each camera, in the order of the cameras' first appearance."""
     newest: dict[str, View] = {}
     for view in views:
-        if view.camera not in newest or view.shows_ns > newest[view.camera].shows_ns:
+        if view.camera not in newest or view.generated_ns > newest[view.camera].generated_ns:
             newest[view.camera] = view
     return list(newest.values())

@@ -93,12 +93,7 @@ def unpack(field: Any, state: Arrays) -> None:
         arrays = _under(f"camera_{k}.", state)
         lens = {**facts["intrinsics"], "distortion": tuple(facts["intrinsics"]["distortion"])}
         view = View(
-            facts["camera"],
-            np.array(arrays["image"]),
-            np.array(arrays["pose"]),
-            Pinhole(**lens),
-            facts["generated_ns"],
-            carried_to_ns=facts["carried_to_ns"],
+            facts["camera"], np.array(arrays["image"]), np.array(arrays["pose"]), Pinhole(**lens), facts["generated_ns"]
         )
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
@@ -135,7 +130,6 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         field.cameras[facts["camera"]].view,
         image=found["image"],
         generated_ns=facts["generated_ns"],
-        carried_to_ns=facts["carried_to_ns"],
         weight=found.get("given"),
     )
     row = None
@@ -159,7 +153,7 @@ def _half(weight: NDArray[np.float32]) -> NDArray[Any]:
 
 
 def _facts(view: View) -> dict[str, Any]:
-    return {"camera": view.camera, "generated_ns": view.generated_ns, "carried_to_ns": view.carried_to_ns}
+    return {"camera": view.camera, "generated_ns": view.generated_ns}
 
 
 def _number(value: float | int | bool | None) -> float | int | bool | None:

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.still_field import StillField
 
 Arrays = dict[str, NDArray]
@@ -46,9 +44,6 @@ class StaticField(StillField):
     of the learning rates, however many fits it is spread over. Afterwards the number of Gaussians stays and
     parameters are averaged, over rounds of steps.
     """
-
-    def __init__(self, settings: SplatSettings, pool: Pool | None = None) -> None:
-        super().__init__(replace(settings, age_tau_ms=0.0, mask_stale_ms=0.0), pool)
 
     def reset(self) -> None:
         """Forget everything, the schedule included."""

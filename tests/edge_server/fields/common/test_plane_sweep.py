@@ -12,7 +12,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide
 from edge_server.fields.common.scene_box import SceneBox, scene_box
-from edge_server.fields.common.supervision import pack_views, without_views
+from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
 from tests.edge_server.fields.scenes import ring, seen
 from tests.edge_server.fields.small import SEEN, SMALL, cut_out, same_state, score, small
@@ -68,21 +68,21 @@ def test_pictures_of_one_color_have_no_depth(level: int) -> None:
     assert (_guide(views, data, box) == 0).all()
 
 
-def test_two_views_have_none_and_refused_ones_no_say() -> None:
-    data, box = _packed(SEEN)
+def _silent(view: View) -> View:
+    return replace(view, weight=np.zeros(view.image.shape[:2], np.float32))
+
+
+def test_two_views_have_none_and_those_of_no_weight_no_say() -> None:
     two, where = _packed(SEEN[:2])
     assert _guide(SEEN[:2], two, where).size == 0
-    refused = np.ones(len(SEEN), bool)
-    refused[:2] = False
-    assert _guide(SEEN, without_views(data, refused), box).size == 0
-    # What a refused picture shows changes nothing for the others.
-    refused[:] = False
-    refused[3] = True
-    wrong = [*SEEN[:3], replace(SEEN[3], image=255 - SEEN[3].image), *SEEN[4:]]
-    np.testing.assert_array_equal(
-        _guide(SEEN, without_views(data, refused), box)[: data.first[3]],
-        _guide(wrong, without_views(_packed(wrong)[0], refused), box)[: data.first[3]],
-    )
+    most = [*SEEN[:2], *map(_silent, SEEN[2:])]
+    assert _guide(most, *_packed(most)).size == 0
+    # What a picture of no weight shows changes nothing for the others.
+    silent = [_silent(v) if k == 3 else v for k, v in enumerate(SEEN)]
+    wrong = [replace(v, image=255 - v.image) if k == 3 else v for k, v in enumerate(silent)]
+    data, box = _packed(silent)
+    found = [_guide(views, _packed(views)[0], box)[: data.first[3]] for views in (silent, wrong)]
+    np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize("name", GUIDED)

@@ -16,8 +16,8 @@ from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.nerfacto.field import NerfactoField, NerfactoSnapshot
 from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, TILE, render_with_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
-from edge_server.fields.ngp.torch_model import encode, mlp, ray_weights, shade, to_torch
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.torch_model import encode, mlp, ray_weights, shade, to_torch
 
 VIEWS = ring(6, size=24)
 SETTINGS = NerfactoSettings(

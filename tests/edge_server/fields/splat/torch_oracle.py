@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN
-from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
 from edge_server.fields.splat.kernels.project import COLOR, OPACITY, QUATERNION, SCALE
+from tests.edge_server.fields.torch_model import harmonics as harmonics_of
 
 # Written out: an oracle that imported them could not see them change.
 LOW_PASS = 0.3  # pixels squared

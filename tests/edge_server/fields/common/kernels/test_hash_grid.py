@@ -10,8 +10,8 @@ from torch import Tensor
 
 from edge_server.fields.common.kernels.hash_grid import SEGMENT, Grid, encode, scatter, smooth_grid
 from edge_server.fields.common.model_layout import make_grid
-from edge_server.fields.ngp import torch_model
 from edge_server.fields.ngp.settings import NgpSettings
+from tests.edge_server.fields import torch_model
 
 SETTINGS = NgpSettings(levels=5, log2_table=10, base_resolution=4, finest_resolution=60)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from edge_server.fields.common.kernels.mlp import Net, backward, forward, param_count
-from edge_server.fields.ngp import torch_model
+from tests.edge_server.fields import torch_model
 
 
 @pytest.mark.parametrize("widths", [[16, 32, 4], [8, 16, 16, 12]])

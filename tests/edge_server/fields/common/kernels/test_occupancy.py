@@ -15,8 +15,8 @@ from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.ngp.torch_model import encode, mlp, to_torch
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.torch_model import encode, mlp, to_torch
 
 CELLS = 8  # a task's worth of cells, so that its samples are all there afterwards
 VIEWS = ring(5, size=24)

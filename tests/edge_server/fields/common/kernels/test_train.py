@@ -19,8 +19,8 @@ from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.ngp.torch_model import encode, mlp, ray_losses, shade, to_torch
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.torch_model import encode, mlp, ray_losses, shade, to_torch
 
 SETTINGS = NgpSettings(
     levels=4,

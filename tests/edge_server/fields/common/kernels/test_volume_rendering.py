@@ -17,7 +17,7 @@ from edge_server.fields.common.kernels.volume_rendering import (
     ray_loss,
     samples_until_opaque,
 )
-from edge_server.fields.ngp import torch_model
+from tests.edge_server.fields import torch_model
 
 SAMPLES = 24
 

@@ -18,6 +18,7 @@ from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.edge_server.fields.small import NAMES, every_field, healthy, reaches, tiny
 
 VIEWS = ring(9, size=24)
+pytestmark = pytest.mark.stability
 
 
 @every_field

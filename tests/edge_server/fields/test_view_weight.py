@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.ngp.torch_field import NgpTorchField
 from tests.edge_server.fields.scenes import mean_psnr, ring
-from tests.edge_server.fields.small import CLASSES, NAMES, TINY, reaches, tiny
+from tests.edge_server.fields.small import every_field, reaches, tiny
 
 VIEWS = ring(7, size=24)
-
-
-every = pytest.mark.parametrize("name", [*NAMES, "ngp-torch"])
-# Plain torch takes a minute for what the kernels do in a second.
-long = pytest.mark.parametrize("name", [*NAMES, pytest.param("ngp-torch", marks=pytest.mark.slow)])
+pytestmark = pytest.mark.stability
 
 
 def weighed(view: View, weight: float) -> View:
@@ -26,9 +21,8 @@ def weighed(view: View, weight: float) -> View:
 
 
 def fitted(name: str, *sets: list[View], steps: int = 12) -> Any:
-    # The color behind everything and what contradicts are judged by whole pictures, not by what they teach.
-    settings = replace(TINY[name.removesuffix("-torch")], background="#808080", refuse_beyond=0.0)
-    field = NgpTorchField(settings, "cpu") if name == "ngp-torch" else CLASSES[name](settings)
+    # The color behind everything is found from whole pictures, not from what they teach.
+    field = tiny(name, background="#808080")
     for views in sets:
         field.fit(views, Budget(steps=steps))
     return field
@@ -40,7 +34,7 @@ def finite(field: Any) -> None:
         assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
 
 
-@every
+@every_field
 def test_a_view_of_no_weight_teaches_nothing(name: str) -> None:
     rng = np.random.default_rng(0)
     noise = replace(VIEWS[3], image=rng.integers(0, 256, VIEWS[3].image.shape, dtype=np.uint8))
@@ -51,24 +45,24 @@ def test_a_view_of_no_weight_teaches_nothing(name: str) -> None:
     assert np.array_equal(*shown)
 
 
-@long
+@every_field
 def test_views_of_no_weight_at_all_break_nothing(name: str) -> None:
     nothing = [weighed(view, 0.0) for view in VIEWS]
     finite(fitted(name, nothing))
     field = fitted(name, VIEWS, nothing, [weighed(VIEWS[0], 0.0)], steps=40)
     finite(field)
     field.fit(VIEWS, Budget(steps=120))
-    reaches(name.removesuffix("-torch"), "after no weights", mean_psnr(field, VIEWS))  # it goes on learning
+    reaches(name, "after no weights", mean_psnr(field, VIEWS))  # it goes on learning
 
 
-@every
+@every_field
 def test_full_weights_are_the_same_as_none(name: str) -> None:
     a, b = (fitted(name, views) for views in (VIEWS, [weighed(view, 1.0) for view in VIEWS]))
     colors = [f.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color for f in (a, b)]
     assert np.array_equal(*colors)
 
 
-@long
+@every_field
 def test_of_two_that_disagree_the_heavier_one_is_believed(name: str) -> None:
     red, blue = (np.broadcast_to(np.array(c, np.uint8), (24, 24, 3)).copy() for c in ((230, 20, 20), (20, 20, 230)))
     views = []

@@ -10,6 +10,7 @@ from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields_for_tests import tiny_field
 
 POSE = look_at([2.0, 0.0, 0.5], [0, 0, 0])
+pytestmark = pytest.mark.stability
 
 
 def view(camera: Pinhole) -> View:
