@@ -58,7 +58,7 @@ import channel_emu.virtual.simulate
             NODE_WITHOUT_ARM,
             (
                 "camera_node.pose",
-                "camera_node.robot.hand_camera",
+                "camera_node.robot.flange_camera",
                 "camera_node.sources.devices.live",
                 "rtde",
                 "depthai",

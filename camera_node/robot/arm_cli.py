@@ -19,7 +19,7 @@ def add_commands(commands: Any) -> None:
         "simulate-arm",
         help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
-        "registers (30004), dashboard (29999), programs (30001-30003). It executes the commands moveJ, "
+        "registers (30004), dashboard (29999), programs (30003). It executes the commands moveJ, "
         "servoJ, servoStop, stopJ, setWatchdog, kickWatchdog and stopScript. Others "
         "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",

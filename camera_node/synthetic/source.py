@@ -83,10 +83,10 @@ def open_sources(
     frames = frame_caches(scenario, config, cameras, effects)
     carried: dict[str, Source] = {}
     if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
-        from camera_node.robot.hand_camera import open_hand_cameras
+        from camera_node.robot.flange_camera import open_flange_cameras
 
         on_hand = {camera: frames.pop(camera) for camera in cameras if camera in config.arm.cameras}
-        carried = open_hand_cameras(scenario, config.arm, on_hand, effects)
+        carried = open_flange_cameras(scenario, config.arm, on_hand, effects)
     return carried | {
         camera: WorldSource(
             camera, each, effects.get(camera) or NO_EFFECTS, partial(render_in_subprocess, scenario, config, camera)

@@ -43,7 +43,7 @@ def test_every_camera_has_a_first_image(file: Path) -> None:
     scenario = load(file)
     config = source_config(scenario)
     if getattr(config, "arm", None) is not None:
-        pytest.skip("needs an arm: tests/camera_node/robot/test_hand_camera.py has one")
+        pytest.skip("needs an arm: tests/camera_node/robot/test_flange_camera.py has one")
     folder = getattr(config, "data", "")
     data = data_dir(folder.split("/")[0]).parent if folder else None
     # One trained and one held-out camera: a world takes a while to prepare each.

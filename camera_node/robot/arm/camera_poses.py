@@ -76,7 +76,7 @@ def mount_on_flange(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64
 
 def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str]) -> dict[str, PoseProvider]:
     """Poses of those ``cameras`` that ``config`` lists, by camera. Connects to the arm if one of them is on
-    its hand. Raises ScenarioError and ArmError."""
+    its flange. Raises ScenarioError and ArmError."""
     if config is None:
         return {}
     mounts = load_hand_eyes(scenario, config, cameras)
@@ -88,15 +88,15 @@ def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable
         if camera not in moving
     }
     if moving:
-        from camera_node.robot.arm.joint_states import ArmStream, HandPoses
+        from camera_node.robot.arm.joint_states import ArmStream, FlangePoses
 
         stream = ArmStream(
             config.host, WallClock(), config.frequency_hz, config.pairing == "interpolated", config.max_gap_ms
         )
         stream.start()
         log.info("arm at %s: connected; it carries %s", config.host, ", ".join(moving))
-        hand = HandPoses(stream, model, base)
-        poses.update({camera: mounts[camera].camera_poses(hand) for camera in moving})
+        flange = FlangePoses(stream, model, base)
+        poses.update({camera: mounts[camera].camera_poses(flange) for camera in moving})
     return poses
 
 

@@ -1,9 +1,9 @@
-"""The saved hand-eye calibration, and poses of the camera from poses of the hand (4.7).
+"""The saved hand-eye calibration, and poses of the camera from poses of the flange (4.7).
 
 ``camera-node calibrate hand-eye --out FILE`` writes the file::
 
-    setup: eye-in-hand             # or eye-to-hand: the camera stands still, the hand holds the target
-    transform: [[...], [...], [...], [0, 0, 0, 1]]   # camera in hand (4.2), or camera in base; meters
+    setup: eye-in-hand             # or eye-to-hand: the camera stands still, the flange holds the target
+    transform: [[...], [...], [...], [0, 0, 0, 1]]   # camera in flange (4.2), or camera in base; meters
     time_offset_s: 0.0             # the arm's stamp of an instant minus the camera's
     ...                            # details of the calibration, for people
 """
@@ -46,30 +46,30 @@ class HandEye:
     time_offset_s: float = 0.0
     details: dict[str, Any] = field(default_factory=dict)
 
-    def camera_poses(self, hand: PoseProvider) -> PoseProvider:
-        """Poses of the camera in the base's axes, from those of the hand."""
+    def camera_poses(self, flange: PoseProvider) -> PoseProvider:
+        """Poses of the camera in the base's axes, from those of the flange."""
         if self.setup == EYE_TO_HAND:
             return FixedPose(Pose.from_matrix(self.transform))
-        return MountedCameraPoses(hand, self)
+        return MountedCameraPoses(flange, self)
 
 
 class MountedCameraPoses:
     """Eye-in-hand: T_W^C(t) = T_W^EE(t) T_EE^C (4.7), with t on the arm's clock."""
 
-    def __init__(self, hand: PoseProvider, calibration: HandEye) -> None:
-        self._hand = hand
+    def __init__(self, flange: PoseProvider, calibration: HandEye) -> None:
+        self._flange = flange
         self._transform = calibration.transform
         self._offset_ns = round(calibration.time_offset_s * 1e9)
 
     def at(self, t_ns: int) -> tuple[Pose, int]:
         """Pose of the camera at its stamp ``t_ns``. Raises PoseGapError."""
-        hand, gap_ns = self._hand.at(t_ns + self._offset_ns)
-        return Pose.from_matrix(hand.matrix() @ self._transform), gap_ns
+        flange, gap_ns = self._flange.at(t_ns + self._offset_ns)
+        return Pose.from_matrix(flange.matrix() @ self._transform), gap_ns
 
     def close(self) -> None:
-        """Close the provider of the hand's poses."""
-        if isinstance(self._hand, Closable):
-            self._hand.close()
+        """Close the provider of the flange's poses."""
+        if isinstance(self._flange, Closable):
+            self._flange.close()
 
 
 def read_hand_eye(path: Path) -> HandEye:

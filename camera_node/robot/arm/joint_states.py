@@ -268,7 +268,7 @@ class ArmStream:
             child.wait()
 
 
-class HandPoses:
+class FlangePoses:
     """Poses of the flange in the world, by forward kinematics of the arm's joints.
 
     base: world-from-base (4, 4).

@@ -19,7 +19,7 @@ EXAMPLES = """examples:
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
   camera-node calibrate intrinsics --live bench.yaml --camera hand --board charuco:7x5:30mm:22mm
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
-  camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [hand, target] pairs
+  camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [flange, target] pairs
   camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
 """
@@ -29,12 +29,12 @@ HAND_EYE = """Estimates the pose of a camera on the arm's flange ("hand"), T_EE^
 that also estimates the arm's noise. Degenerate motions are refused with the reason.
 
 input, one of:
-  FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
+  FOLDER         pictures NAME-3.png with NAME_3.yaml, the flange's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], meters and radians)
-  --pairs FILE   JSON list of [hand in base, target in camera], 4 x 4 each
+  --pairs FILE   JSON list of [flange in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
-  --live SCENARIO --camera ID   guided session: move the hand, hold still; it says which poses are missing and
-                 when there are enough. Hand poses come from the camera's source (without hand_eye), or from
+  --live SCENARIO --camera ID   guided session: move the arm, hold still; it says which poses are missing and
+                 when there are enough. Flange poses come from the camera's source (without hand_eye), or from
                  --hand CSV, by seconds since the first frame
 """
 
@@ -79,18 +79,18 @@ def _command(commands: Any, name: str, summary: str, description: str) -> argpar
 
 def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and hand poses, see above")
+    add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and flange poses, see above")
     add("--pairs", type=Path, metavar="FILE", help="pairs of poses, JSON")
-    add("--hand", type=Path, metavar="CSV", help="stream of hand poses")
+    add("--hand", type=Path, metavar="CSV", help="stream of flange poses")
     add("--target", type=Path, metavar="CSV", help="stream of target poses in the camera")
     add("--live", metavar="SCENARIO", help="guided session with a camera of this scenario")
     add("--board", metavar="SPEC", help=BOARD)
     lens = "intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]"
     add("--lens", type=Path, metavar="FILE", help=lens)
-    add("--eye-to-hand", action="store_true", help="the camera stands still, the hand holds the target")
+    add("--eye-to-hand", action="store_true", help="the camera stands still, the flange holds the target")
     methods = "tsai, park, horaud, andreff, daniilidis or refined [%(default)s]"
     add("--method", default=DEFAULT_METHOD, metavar="NAME", help=methods)
-    gap = f"largest time from a target pose to a hand pose of a stream [{MAX_GAP_S * 1e3:g}]"
+    gap = f"largest time from a target pose to a flange pose of a stream [{MAX_GAP_S * 1e3:g}]"
     add("--max-gap-ms", type=float, metavar="MS", help=gap)
     printed = "print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}"
     add("--json", action="store_true", help=printed)
@@ -103,7 +103,7 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     want = f"end when the standard deviation of the position is below this [{WANT_MM:g}]"
     live.add_argument("--want-mm", type=float, metavar="MM", help=want)
     moving = (
-        "also take pictures while the hand moves; with an arm, the time offset between its stamps and the "
+        "also take pictures while the arm moves; with an arm, the time offset between its stamps and the "
         "camera's is estimated from the motion"
     )
     live.add_argument("--moving", action="store_true", help=moving)

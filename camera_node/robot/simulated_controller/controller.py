@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.joint_motion import STEP_S, JointMotion
-from freshfield.geometry import so3_log
 
 log = logging.getLogger("camera-node.arm")
 
@@ -53,7 +52,6 @@ class Controller:
         noise_rad: float = 0.0,
         seed: int = 0,
     ) -> None:
-        self.arm = arm
         self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
         self.answer = 0
@@ -101,34 +99,16 @@ class Controller:
 
     def values(self) -> dict[str, Any]:
         """Current values of the output variables that are not zero. Each call draws new encoder noise."""
-        m = self.motion
-        q = m.q + self._rng.normal(0.0, self._noise_rad, 6) if self._noise_rad > 0.0 else m.q
-        flange = self.arm.forward(q)
-        pose = (*flange[:3, 3], *so3_log(flange[:3, :3]))
+        q = self.motion.q
         running = self.runtime_state == PLAYING
         return {
             "timestamp": self.steps * STEP_S * self._drift,
-            "target_q": m.q,
-            "target_qd": m.qd,
-            "target_qdd": m.qdd,
-            "actual_q": q,
-            "actual_qd": m.qd,
-            "actual_TCP_pose": pose,
-            "target_TCP_pose": pose,
-            "actual_TCP_speed": self.arm.jacobian(q) @ m.qd if m.qd.any() else None,
-            "joint_temperatures": (25.0,) * 6,
-            "joint_mode": (253,) * 6,
+            "actual_q": q + self._rng.normal(0.0, self._noise_rad, 6) if self._noise_rad > 0.0 else q,
             "robot_mode": 7,
             "safety_mode": 1,
-            "safety_status": 1,
             "safety_status_bits": 1,
             "robot_status_bits": 0b11 if running else 0b01,
             "runtime_state": self.runtime_state,
-            "speed_scaling": 1.0,
-            "target_speed_fraction": 1.0,
-            "actual_main_voltage": 48.0,
-            "actual_robot_voltage": 48.0,
-            "actual_joint_voltage": (48.0,) * 6,
             "output_int_register_0": self.answer,
         }
 

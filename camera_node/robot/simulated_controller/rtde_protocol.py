@@ -2,7 +2,7 @@
 
 Big-endian. A packet is a 16-bit size (with the header), an 8-bit type, and the payload. A recipe is a list of
 variables agreed upon at the start, so that later packets need no names. (Universal Robots, "Real-Time Data
-Exchange (RTDE) Guide".)
+Exchange (RTDE) Guide".) Only the variables that the client library and ``rtde_process`` ask for are known.
 """
 
 from __future__ import annotations
@@ -25,56 +25,27 @@ HEADER = struct.Struct(">HB")
 MAX_PACKET = 4096
 NOT_FOUND = "NOT_FOUND"
 
-_FORMATS = {
-    "BOOL": "?",
-    "UINT8": "B",
-    "UINT32": "I",
-    "UINT64": "Q",
-    "INT32": "i",
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "VECTOR6UINT32": "6I",
-}
+_FORMATS = {"UINT32": "I", "INT32": "i", "DOUBLE": "d", "VECTOR6D": "6d"}
 _TYPES = {
-    "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum "
-    "actual_main_voltage actual_robot_voltage actual_robot_current standard_analog_input0 "
-    "standard_analog_input1 standard_analog_output0 standard_analog_output1 tool_analog_input0 "
-    "tool_analog_input1 payload speed_slider_fraction standard_analog_output_0 standard_analog_output_1 "
-    "tcp_force_scalar",
-    "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd "
-    "actual_current actual_current_window joint_control_output actual_TCP_pose actual_TCP_speed "
-    "actual_TCP_force target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench "
-    "payload_inertia external_force_torque tcp_offset",
-    "VECTOR3D": "actual_tool_accelerometer payload_cog elbow_position elbow_velocity",
-    "VECTOR6INT32": "joint_mode",
-    "INT32": "robot_mode safety_mode safety_status",
-    "UINT32": "runtime_state robot_status_bits safety_status_bits speed_slider_mask "
-    "output_bit_registers0_to_31 output_bit_registers32_to_63 input_bit_registers0_to_31 "
-    "input_bit_registers32_to_63 io_current_types",
-    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
-    "UINT8": "standard_digital_output_mask standard_digital_output configurable_digital_output_mask "
-    "configurable_digital_output tool_digital_output_mask tool_digital_output standard_analog_output_mask "
-    "standard_analog_output_type",
+    "timestamp": "DOUBLE",
+    "actual_q": "VECTOR6D",
+    "external_force_torque": "VECTOR6D",
+    "robot_mode": "INT32",
+    "safety_mode": "INT32",
+    "runtime_state": "UINT32",
+    "robot_status_bits": "UINT32",
+    "safety_status_bits": "UINT32",
 }
-_TYPE_OF = {name: kind for kind, names in _TYPES.items() for name in names.split()}
-_REGISTERS = (
-    (re.compile(r"(?:in|out)put_int_register_(\d+)"), 48, "INT32"),
-    (re.compile(r"(?:in|out)put_double_register_(\d+)"), 48, "DOUBLE"),
-    (re.compile(r"(?:in|out)put_bit_register_(\d+)"), 128, "BOOL"),
-)
+_REGISTER = re.compile(r"(?:in|out)put_(int|double)_register_(\d+)")
+_REGISTERS = 48
 
 
 def type_of(name: str) -> str:
     """The type of a variable; NOT_FOUND for an unknown one."""
-    if name in _TYPE_OF:
-        return _TYPE_OF[name]
-    for pattern, count, kind in _REGISTERS:
-        found = pattern.fullmatch(name)
-        if found and int(found[1]) < count:
-            return kind
-    return NOT_FOUND
+    register = _REGISTER.fullmatch(name)
+    if register and int(register[2]) < _REGISTERS:
+        return "INT32" if register[1] == "int" else "DOUBLE"
+    return _TYPES.get(name, NOT_FOUND)
 
 
 @dataclass(frozen=True)
@@ -101,19 +72,18 @@ class Recipe:
             if value is None:
                 parts.append(bytes(struct.calcsize(layout)))
             else:
-                parts.append(struct.pack(layout, *(value if kind.startswith("VECTOR") else (value,))))
+                parts.append(struct.pack(layout, *(value if kind == "VECTOR6D" else (value,))))
         return b"".join(parts)
 
     def unpack(self, payload: bytes) -> dict[str, Any]:
         """Variables by name, from a payload without the recipe's number. Raises struct.error for a wrong
         size."""
-        layout = ">" + "".join(_FORMATS[kind] for kind in self.types)
-        flat = list(struct.unpack(layout, payload))
+        flat = list(struct.unpack(">" + "".join(_FORMATS[kind] for kind in self.types), payload))
         values: dict[str, Any] = {}
         for name, kind in zip(self.names, self.types):
-            count = int(_FORMATS[kind][0]) if kind.startswith("VECTOR") else 1
+            count = 6 if kind == "VECTOR6D" else 1
             taken, flat = flat[:count], flat[count:]
-            values[name] = tuple(taken) if kind.startswith("VECTOR") else taken[0]
+            values[name] = tuple(taken) if kind == "VECTOR6D" else taken[0]
         return values
 
 

@@ -1,8 +1,8 @@
-"""The ports of the simulated controller.
+"""The ports of the simulated controller: what the client library (ur_rtde) connects to, and the truth.
 
     30004  Real-Time Data Exchange: state out, registers in
-    29999  dashboard: a line in, a line out
-    30001, 30002, 30003  programs in (nothing is streamed out)
+    29999  dashboard: a line in, a line out; the library asks for version, serial number and remote control
+    30003  programs in (nothing is streamed out)
     30010  not on a real controller: a line with an instant (ns) in, a line of JSON out with the instant and
            the true joint angles (rad), from which simulated cameras render
 
@@ -21,7 +21,7 @@ from collections.abc import Awaitable, Callable
 
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller import rtde_protocol as rtde
-from camera_node.robot.simulated_controller.controller import PLAYING, Controller
+from camera_node.robot.simulated_controller.controller import Controller
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from freshfield.clock import Clock
 
@@ -29,19 +29,14 @@ log = logging.getLogger("camera-node.arm")
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
-RTDE_PORT, DASHBOARD_PORT = 30004, 29999
-SCRIPT_PORTS = (30001, 30002, 30003)
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 VERSION = (5, 12, 0, 0)
 _MAX_WAITING_BYTES = 1 << 20
 _IDLE_STEPS = 4
 _DASHBOARD = {
-    "polyscopeversion": "URSoftware 5.12.0.0 (simulated)",
+    "PolyscopeVersion": "URSoftware 5.12.0.0 (simulated)",
     "get serial number": "20230000001",
-    "get robot model": "UR3",
     "is in remote control": "true",
-    "robotmode": "Robotmode: RUNNING",
-    "safetystatus": "Safetystatus: NORMAL",
-    "safetymode": "Safetymode: NORMAL",
 }
 
 
@@ -61,7 +56,7 @@ class ControllerServer:
             RTDE_PORT: self._serve_rtde,
             DASHBOARD_PORT: self._serve_dashboard,
             TRUTH_PORT: self._serve_truth,
-            **dict.fromkeys(SCRIPT_PORTS, self._serve_script),
+            SCRIPT_PORT: self._serve_script,
         }
         try:
             for port, handler in handlers.items():
@@ -140,20 +135,10 @@ class ControllerServer:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
         while line := await reader.readline():
             request = line.decode(errors="replace").strip()
-            if request == "quit":
-                break
-            writer.write(f"{self._answer(request)}\n".encode())
-
-    def _answer(self, request: str) -> str:
-        if request == "stop":
-            self.controller.stop_program()
-            return "Stopped"
-        if request in ("running", "programState"):
-            playing = self.controller.runtime_state == PLAYING
-            if request == "running":
-                return f"Program running: {str(playing).lower()}"
-            return f"{'PLAYING' if playing else 'STOPPED'} simulated"
-        return _DASHBOARD.get(request.lower(), f"could not understand: '{request}'")
+            if request == "stop":  # as at the pendant
+                self.controller.stop_program()
+            answer = "Stopped" if request == "stop" else _DASHBOARD.get(request, f"could not understand: '{request}'")
+            writer.write(f"{answer}\n".encode())
 
     async def _serve_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # The program is not interpreted: the client library's program only executes register commands.

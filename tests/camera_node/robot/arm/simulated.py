@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.robot.hand_camera import TruthClient
-from camera_node.robot.simulated_controller.server import SCRIPT_PORTS
+from camera_node.robot.flange_camera import TruthClient
+from camera_node.robot.simulated_controller.server import SCRIPT_PORT
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 
@@ -60,7 +60,7 @@ def simulated_arm(host: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     try:
         for _ in range(600):
             # The last port that it opens: all others are served by then.
-            with contextlib.suppress(OSError), socket.create_connection((host, SCRIPT_PORTS[-1]), 1.0):
+            with contextlib.suppress(OSError), socket.create_connection((host, SCRIPT_PORT), 1.0):
                 break
             if process.poll() is not None:
                 pytest.fail(f"simulate-arm ended: {process.communicate()}")

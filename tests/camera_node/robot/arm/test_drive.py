@@ -18,7 +18,7 @@ from camera_node.robot.arm import drive as driving
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.viewpoint_tour import plan_tour
-from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from freshfield.scenario import load

@@ -32,20 +32,20 @@ def written(tmp_path, **change):
     return file
 
 
-def test_a_camera_on_a_moving_hand(tmp_path):
+def test_a_camera_on_a_moving_flange(tmp_path):
     calibration = read_hand_eye(written(tmp_path))
     assert calibration.details == {"method": "refined"}
-    hand = SampleBuffer(Pose.interpolate)
+    flange = SampleBuffer(Pose.interpolate)
     for k in range(10):
-        hand.add(k * 10 * MS, Pose.from_matrix(transform((0, 0, 0.1 * k), (0.01 * k, 0, 0))))
+        flange.add(k * 10 * MS, Pose.from_matrix(transform((0, 0, 0.1 * k), (0.01 * k, 0, 0))))
     # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
-    found, gap_ns = calibration.camera_poses(hand).at(30 * MS)
+    found, gap_ns = calibration.camera_poses(flange).at(30 * MS)
     expected = transform((0, 0, 0.5), (0.05, 0, 0)) @ transform((0.1, 0, 0), (0.05, 0, 0.1))
     np.testing.assert_allclose(found.matrix(), expected, atol=1e-8)
     assert gap_ns == 0
 
 
-def test_a_camera_that_stands_does_not_follow_the_hand(tmp_path):
+def test_a_camera_that_stands_does_not_follow_the_flange(tmp_path):
     calibration = read_hand_eye(written(tmp_path, setup="eye-to-hand"))
     poses = calibration.camera_poses(SampleBuffer(Pose.interpolate))
     np.testing.assert_allclose(poses.at(7)[0].matrix(), calibration.transform, atol=1e-12)

@@ -13,9 +13,9 @@ import pytest
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.joint_states import ArmError, ArmStream, HandPoses
+from camera_node.robot.arm.joint_states import ArmError, ArmStream, FlangePoses
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
@@ -75,7 +75,7 @@ def test_joints_come_with_their_times():
         assert np.allclose(joints, HOME_RAD) and gap_ns < 1_000_000_000
         wait_until(lambda: stream.received > 20)
         assert stream.trouble == "" and stream.connections == 1
-        hand = HandPoses(stream, UR3E, np.eye(4), WITHIN_S)
+        hand = FlangePoses(stream, UR3E, np.eye(4), WITHIN_S)
         assert np.allclose(hand.at(clock.now_ns())[0].matrix(), UR3E.forward(HOME_RAD), atol=1e-12)
 
 

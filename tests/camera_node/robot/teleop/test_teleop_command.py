@@ -14,7 +14,7 @@ import pytest
 from camera_node.cli import main
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.teleop import sinks
 from camera_node.robot.teleop.network_stylus import encode
 from camera_node.robot.teleop.teleoperator import Command

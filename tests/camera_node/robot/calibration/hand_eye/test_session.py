@@ -32,7 +32,7 @@ from camera_node.robot.calibration.hand_eye.session import (
 )
 from camera_node.robot.calibration.inputs import read_pairs
 from camera_node.robot.calibration.targets import parse_target
-from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.flange_camera import TruthClient
 from camera_node.sources.base import Shot
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose, se3, se3_inverse, so3_exp

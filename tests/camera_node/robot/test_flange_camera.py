@@ -14,7 +14,7 @@ from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.camera_poses import base_matrix, load_hand_eyes
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.flange_camera import TruthClient
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -54,7 +54,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
         expected = scene.view(shot.intrinsics, place).image(0.0)
         assert np.array_equal(payload.decode(shot.payload, "png", 48, 48), expected)
         assert shot.intrinsics == fixed.source.intrinsics
-        hand.source._poses._hand._stream.stop()
+        hand.source._poses._flange._stream.stop()
 
 
 def test_the_truth_of_another_instant_is_not_taken(host):

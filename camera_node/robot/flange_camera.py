@@ -75,8 +75,8 @@ class TruthClient:
         self._socket = None
 
 
-class HandCamera(Source):
-    """One camera on the hand. base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4)."""
+class FlangeCamera(Source):
+    """One camera on the flange. base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4)."""
 
     def __init__(
         self,
@@ -115,10 +115,10 @@ class HandCamera(Source):
         self._truth.close()
 
 
-def open_hand_cameras(
+def open_flange_cameras(
     scenario: Scenario, config: ArmConfig, frames: Mapping[str, FrameCache], effects: Mapping[str, Effects | None]
 ) -> dict[str, Source]:
-    """Connect to the arm and open the cameras of ``frames``, which are on its hand. Raises ScenarioError and
+    """Connect to the arm and open the cameras of ``frames``, which are on its flange. Raises ScenarioError and
     ArmError."""
     for camera in frames:
         made = effects.get(camera)
@@ -132,7 +132,7 @@ def open_hand_cameras(
     poses = camera_poses(scenario, config, frames)
     truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
     return {
-        camera: HandCamera(
+        camera: FlangeCamera(
             camera,
             each.fps,
             each.scene,
