@@ -94,10 +94,6 @@ _COMMANDS = {
         "experiments.training.detector.command",
         "train the small detector whose backbone makes the default embeddings",
     ),
-    "train-perceptual": (
-        "experiments.training.detector.perceptual",
-        "fit the substitute for LPIPS to real LPIPS on distorted renderings",
-    ),
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }

@@ -3,7 +3,7 @@
 It is thesis (3.34) and (3.35): features of the backbone's layers, normalized over channels as LPIPS does,
 squared differences weighted by w_l^2 >= 0 and averaged over pixels, summed over layers, and
 g(d) = d^power. Weights and power were fitted to real LPIPS on distorted renderings of our own scenes
-(``edge-server train-perceptual``), so figures have LPIPS's size and order. They are not LPIPS: wherever they
+(with tag v0.1-all, which can fit them again), so figures have LPIPS's size and order. They are not LPIPS: wherever they
 appear they are called ``perceptual``. Spearman's correlation with LPIPS is .90 on unseen variations of the
 fitted scenes, and .86 to .90 on a scene that was left out of the fit (``embed/models/perceptual.json``).
 """
@@ -90,7 +90,7 @@ class Layers:
 
 def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | None]:
     """(metric, None), or (None, reason) in one line where it cannot be used. folder: folder with the detector
-    and the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
+    and coefficients in the same format; by default the shipped ones."""
     try:
         with np.load(folder / COEFFICIENTS, allow_pickle=False) as archive:
             taps = tuple(str(tap) for tap in archive["taps"])

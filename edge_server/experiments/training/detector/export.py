@@ -1,12 +1,9 @@
-"""Exports the trained detector to ONNX, in float32 and static 8 bits, with its projection for embeddings."""
+"""Exports the trained detector to ONNX, with its projection for embeddings."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
-import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +13,29 @@ import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 from onnx import helper
-from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
-from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from edge_server.embed.backbone import OUTPUT, PROJECTION_KEY, load_backbone, pack_projection
-from edge_server.experiments.training.detector.average_precision import Run
 from edge_server.experiments.training.detector.dataset import network_inputs
 from edge_server.experiments.training.detector.network import Detector
 from edge_server.experiments.training.detector.scenes import KINDS
 
 OPSET = 17
 INPUT = "images"
-CALIBRATION_IMAGES = 128
 _BATCH = 32
+
+Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Images (n, 3, H, W) in [0, 1] -> output0 (n, 4 + kinds, cells)."""
+
 # Number of axes of the learned projection: the largest dimension of an embedding.
 AXES = 64
 # Least spread of an axis, relative to the first, so that scaling does not amplify one without information.
 _LEAST_SPREAD = 1e-3
 
 
-def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any], kinds: Sequence[str] = KINDS) -> None:
+def export_onnx(model: Detector, side: int, path: Path, about: dict[str, Any]) -> None:
     """Export the detector for any number of images of any size whose sides are multiples of 16."""
     model = model.eval()
     axes = {INPUT: {0: "n", 2: "height", 3: "width"}, "output0": {0: "n", 2: "cells"}}
-    if model.prototypes:
-        axes["output1"] = {0: "n", 2: "mask_height", 3: "mask_width"}
     with warnings.catch_warnings():
         # The newer exporter needs an additional package and gives the same operators.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -51,65 +46,13 @@ def export_fp32(model: Detector, side: int, path: Path, about: dict[str, Any], k
             dynamo=False,
             opset_version=OPSET,
             input_names=[INPUT],
-            output_names=[name for name in axes if name != INPUT],
+            output_names=["output0"],
             dynamic_axes=axes,
         )
     exported = onnx.load(str(path))
     onnx.checker.check_model(exported)
-    task = "segment" if model.prototypes else "detect"
-    _describe(exported, side, {"task": task, **about}, kinds)
+    _describe(exported, side, {"task": "detect", **about})
     onnx.save(exported, str(path))
-
-
-def export_int8(fp32: Path, images: NDArray[np.uint8], path: Path) -> None:
-    """Quantize to static 8 bits, weights per channel, with ranges calibrated on ``images`` (n, H, W, 3).
-
-    The arithmetic of the boxes stays in float: pixel coordinates do not fit in 8 bits.
-    """
-    model = onnx.load(str(fp32))
-    heads = ("/model.10/", "/model.11/")
-    # Not quantized: the last convolutions of the heads and of the prototypes, and what follows them, because
-    # logits and distances need their full range.
-    inner = [n.name for n in model.graph.node if not n.name.startswith("/model.")]
-    last = [
-        n.name
-        for n in model.graph.node
-        if (n.name.startswith(heads) and ".1/" in n.name) or n.name.startswith("/model.12/out/")
-    ]
-    with _quiet(), tempfile.TemporaryDirectory(prefix="freshfield-int8-") as folder:
-        prepared = Path(folder) / "prepared.onnx"
-        quant_pre_process(str(fp32), str(prepared), skip_symbolic_shape=True)
-        quantize_static(
-            str(prepared),
-            str(path),
-            _Calibration(images),
-            quant_format=QuantFormat.QDQ,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            per_channel=True,
-            # Seven bits of weights: with eight, processors without VNNI saturate their sums, and a frame
-            # would have different embeddings on different machines.
-            reduce_range=True,
-            calibrate_method=CalibrationMethod.MinMax,
-            op_types_to_quantize=["Conv", "Concat", "MaxPool", "Add", "Split", "Resize"],
-            nodes_to_exclude=[*inner, *last],
-        )
-    quantised = onnx.load(str(path))
-    del quantised.metadata_props[:]
-    quantised.metadata_props.extend(model.metadata_props)
-    onnx.save(quantised, str(path))
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the quantizer, which logs every node to the root logger."""
-    root = logging.getLogger()
-    level = root.level
-    root.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        root.setLevel(level)
 
 
 def add_projection(path: Path, features: NDArray[np.float32]) -> dict[str, float]:
@@ -153,9 +96,9 @@ def _session(model: str | bytes) -> ort.InferenceSession:
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any], kinds: Sequence[str]) -> None:
+def _describe(model: onnx.ModelProto, side: int, about: dict[str, Any]) -> None:
     """Set the metadata that the family's exporter writes, so that its tools can read the file."""
-    names = "{" + ", ".join(f"{k}: '{kind}'" for k, kind in enumerate(kinds)) + "}"
+    names = "{" + ", ".join(f"{k}: '{kind}'" for k, kind in enumerate(KINDS)) + "}"
     values = {"stride": "16", "imgsz": f"[{side}, {side}]", "names": names, **about}
     _set_metadata(model, {key: str(value) for key, value in values.items()})
 
@@ -164,11 +107,3 @@ def _set_metadata(model: onnx.ModelProto, values: dict[str, str]) -> None:
     merged = {p.key: p.value for p in model.metadata_props} | values
     del model.metadata_props[:]
     helper.set_model_props(model, merged)
-
-
-class _Calibration(CalibrationDataReader):  # type: ignore[misc]
-    def __init__(self, images: NDArray[np.uint8]) -> None:
-        self._parts = ({INPUT: part} for part in network_inputs(images, 8))
-
-    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
-        return next(self._parts, None)

@@ -1,8 +1,7 @@
 """Loss of the detector: task-aligned assignment (TOOD, Feng et al. 2021) as YOLOv8 uses it.
 
 Each true box is assigned the cells inside it whose prediction has the highest score^a * overlap^b. These
-cells learn the box (generalized IoU) and, as their score, the alignment; with masks, also the weights whose
-sum of prototypes is the mask (YOLACT, Bolya et al. 2019).
+cells learn the box (generalized IoU) and, as their score, the alignment.
 """
 
 from __future__ import annotations
@@ -13,12 +12,7 @@ from torch import Tensor
 
 TOP_CELLS = 10
 SCORE_POWER, OVERLAP_POWER = 0.5, 6.0
-BOX_WEIGHT, MASK_WEIGHT = 5.0, 5.0
-# A mask is learned within the box and this share of its sides around it: pixels outside are cut anyway.
-MASK_MARGIN = 0.15
-
-Assigned = tuple[Tensor, Tensor, Tensor]
-"""The result of ``assign`` for one image."""
+BOX_WEIGHT = 5.0
 
 
 def overlaps(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,30 +64,21 @@ def assign(boxes: Tensor, scores: Tensor, cells: Tensor, truth: Tensor) -> tuple
     return holds, which, (own / (top + 1e-12) * quality).detach()
 
 
-def assign_batch(predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor]) -> list[Assigned]:
-    """``assign`` for each image of a batch. predicted: as from ``Detector.raw``. truths: (G, 5) each."""
-    boxes, logits, cells = predicted
-    with torch.no_grad():
-        return [assign(boxes[k], logits[k].sigmoid(), cells, truth) for k, truth in enumerate(truths)]
-
-
-def detection_loss(
-    predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor], assigned: list[Assigned] | None = None
-) -> tuple[Tensor, Tensor]:
+def detection_loss(predicted: tuple[Tensor, Tensor, Tensor], truths: list[Tensor]) -> tuple[Tensor, Tensor]:
     """(score loss, box loss) of a batch.
 
     predicted: as from ``Detector.raw``.
     truths: (G, 5) each.
-    assigned: result of ``assign_batch``; None computes it.
     """
-    boxes, logits, _ = predicted
+    boxes, logits, cells = predicted
     target = torch.zeros_like(logits)
     box_loss = logits.sum() * 0.0
     total = torch.zeros(())
-    for k, (holds, which, score) in enumerate(assigned or assign_batch(predicted, truths)):
+    for k, truth in enumerate(truths):
+        with torch.no_grad():
+            holds, which, score = assign(boxes[k], logits[k].sigmoid(), cells, truth)
         if not len(holds):
             continue
-        truth = truths[k]
         target[k, holds, truth[which, 4].long()] = score
         _, generalised = overlaps(boxes[k, holds], truth[which, :4])
         box_loss = box_loss + ((1.0 - generalised) * score).sum()
@@ -101,31 +86,3 @@ def detection_loss(
     score_loss = F.binary_cross_entropy_with_logits(logits, target, reduction="sum")
     total = total.clamp(min=1.0)
     return score_loss / total, BOX_WEIGHT * box_loss / total
-
-
-def mask_loss(
-    weights: Tensor, prototypes: Tensor, truths: list[Tensor], masks: Tensor, assigned: list[Assigned]
-) -> Tensor:
-    """Mean cross-entropy of the pixels in and near the box.
-
-    weights, prototypes: (B, cells, M) and (B, M, h, w), as from ``Detector.raw_with_masks``.
-    truths: one box (1, 5), or none, per image.
-    masks: (B, H, W), 1 at the object's pixels.
-    """
-    height, width = prototypes.shape[2:]
-    soft = F.adaptive_avg_pool2d(masks[:, None], (height, width))[:, 0]
-    scale = masks.shape[-1] / width
-    x = (torch.arange(width, dtype=torch.float32) + 0.5) * scale
-    y = (torch.arange(height, dtype=torch.float32) + 0.5) * scale
-    loss, total = prototypes.sum() * 0.0, torch.zeros(())
-    for k, (holds, _, score) in enumerate(assigned):
-        if not len(holds):
-            continue
-        left, top, right, bottom = truths[k][0, :4]
-        dx, dy = MASK_MARGIN * (right - left), MASK_MARGIN * (bottom - top)
-        near = ((y > top - dy) & (y < bottom + dy))[:, None] & ((x > left - dx) & (x < right + dx))
-        logits = torch.einsum("pm,mhw->phw", weights[k, holds], prototypes[k])
-        each = F.binary_cross_entropy_with_logits(logits, soft[k].expand_as(logits), reduction="none")
-        loss = loss + ((each * near).sum((1, 2)) / near.sum() * score).sum()
-        total = total + score.sum()
-    return MASK_WEIGHT * loss / total.clamp(min=1.0)

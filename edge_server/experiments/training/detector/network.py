@@ -13,8 +13,6 @@ from torch import Tensor, nn
 
 STRIDES = (8, 16)
 WIDTHS = (16, 24, 48, 80)
-# Modules of the backbone; their outputs are the layers of the perceptual distance (3.35).
-LAYERS = tuple(range(8))
 
 
 class Conv(nn.Module):
@@ -67,49 +65,26 @@ class SPPF(nn.Module):
 
 
 class Head(nn.Module):
-    """Head of one map: distances to the four sides of the box in strides, scores of the kinds as logits, and,
-    of a detector with masks, the weights of the prototypes."""
+    """Head of one map: distances to the four sides of the box in strides, and scores of the kinds as logits."""
 
-    def __init__(self, channels: int, kinds: int, prototypes: int = 0) -> None:
+    def __init__(self, channels: int, kinds: int) -> None:
         super().__init__()
         self.box = nn.Sequential(Conv(channels, 32, 3), nn.Conv2d(32, 4, 1))
         self.score = nn.Sequential(Conv(channels, 32, 3), nn.Conv2d(32, kinds, 1))
         nn.init.constant_(self.score[1].bias, -4.6)  # type: ignore[arg-type]  # one cell in a hundred holds something
-        self.mask = nn.Sequential(Conv(channels, 16, 3), nn.Conv2d(16, prototypes, 1)) if prototypes else None
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        return F.softplus(self.box(x)), self.score(x), None if self.mask is None else self.mask(x)
-
-
-class Prototypes(nn.Module):
-    """Maps at half the image's side whose weighted sums are masks, as logits. The neck's fine map is enlarged
-    twice, each time concatenated with the backbone's map of that size."""
-
-    def __init__(self, fine: int, quarter: int, half: int, prototypes: int) -> None:
-        super().__init__()
-        self.up = nn.Upsample(scale_factor=2, mode="nearest")
-        self.cv1 = Conv(fine + quarter, quarter, 3)
-        self.cv2 = Conv(quarter + half, half, 3)
-        self.cv3 = Conv(half, half, 3)
-        self.out = nn.Conv2d(half, prototypes, 1)
-
-    def forward(self, fine: Tensor, quarter: Tensor, half: Tensor) -> Tensor:
-        x = self.cv1(torch.cat([self.up(fine), quarter], 1))
-        return self.out(self.cv3(self.cv2(torch.cat([self.up(x), half], 1))))
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return F.softplus(self.box(x)), self.score(x)
 
 
 class Detector(nn.Module):
     """Images (B, 3, H, W) in [0, 1], sides multiples of 16, -> output0 (B, 4 + kinds, cells): center, width
-    and height in pixels and a score for each kind, as in every detector of the family.
+    and height in pixels and a score for each kind, as in every detector of the family."""
 
-    With ``prototypes``, as in every segmentation model of the family, output0 (B, 4 + kinds + prototypes,
-    cells) also has the weights of the mask's prototypes, and output1 (B, prototypes, H / 2, W / 2) contains
-    these."""
-
-    def __init__(self, kinds: int, prototypes: int = 0) -> None:
+    def __init__(self, kinds: int) -> None:
         super().__init__()
         a, b, c, d = WIDTHS
-        self.kinds, self.prototypes = kinds, prototypes
+        self.kinds = kinds
         self.model = nn.ModuleList(
             [
                 Conv(3, a, 3, 2),
@@ -122,49 +97,32 @@ class Detector(nn.Module):
                 SPPF(d),
                 nn.Upsample(scale_factor=2, mode="nearest"),
                 C2f(c + d, c, residual=False),
-                Head(c, kinds, prototypes),
-                Head(d, kinds, prototypes),
+                Head(c, kinds),
+                Head(d, kinds),
             ]
         )
-        if prototypes:
-            self.model.append(Prototypes(c, b, a, prototypes))
 
     def raw(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Boxes (B, cells, 4) as left, top, right, bottom in pixels, logits (B, cells, kinds), and the cells'
         centers and strides (cells, 3)."""
-        return self.raw_with_masks(x)[:3]
-
-    def raw_with_masks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """``raw``, and the weights of each cell (B, cells, prototypes) and the prototypes (B, prototypes, H /
-        2, W / 2); None for a detector without masks."""
         m = self.model
-        half = m[0](x)
-        quarter = m[2](m[1](half))
-        fine = m[4](m[3](quarter))
+        fine = m[4](m[3](m[2](m[1](m[0](x)))))
         coarse = m[7](m[6](m[5](fine)))
         fine = m[9](torch.cat([m[8](coarse), fine], 1))
-        boxes, logits, cells, weights = [], [], [], []
+        boxes, logits, cells = [], [], []
         for head, stride, feature in ((m[10], STRIDES[0], fine), (m[11], STRIDES[1], coarse)):
-            side, score, weight = head(feature)
+            side, score = head(feature)
             centre = _cells(feature, stride)
             side = side.flatten(2).transpose(1, 2) * stride
             boxes.append(torch.cat([centre[:, :2] - side[..., :2], centre[:, :2] + side[..., 2:]], 2))
             logits.append(score.flatten(2).transpose(1, 2))
             cells.append(centre)
-            if weight is not None:
-                weights.append(weight.flatten(2).transpose(1, 2))
-        found = torch.cat(boxes, 1), torch.cat(logits, 1), torch.cat(cells)
-        if not weights:
-            return *found, None, None
-        return *found, torch.cat(weights, 1), m[12](fine, quarter, half)
+        return torch.cat(boxes, 1), torch.cat(logits, 1), torch.cat(cells)
 
-    def forward(self, x: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        boxes, logits, _, weights, prototypes = self.raw_with_masks(x)
+    def forward(self, x: Tensor) -> Tensor:
+        boxes, logits, _ = self.raw(x)
         low, high = boxes[..., :2], boxes[..., 2:]
-        table = [(low + high) / 2, high - low, logits.sigmoid()]
-        if weights is None or prototypes is None:
-            return torch.cat(table, 2).transpose(1, 2)
-        return torch.cat([*table, weights], 2).transpose(1, 2), prototypes
+        return torch.cat([(low + high) / 2, high - low, logits.sigmoid()], 2).transpose(1, 2)
 
 
 def _cells(feature: Tensor, stride: int) -> Tensor:

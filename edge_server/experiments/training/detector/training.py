@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.training.detector.dataset import SUBJECTS, LabeledImages
-from edge_server.experiments.training.detector.loss import assign_batch, detection_loss, mask_loss
+from edge_server.experiments.training.detector.dataset import LabeledImages
+from edge_server.experiments.training.detector.loss import detection_loss
 from edge_server.experiments.training.detector.network import Detector
-from edge_server.experiments.training.detector.scenes import MIN_SIDE_PX, Boxes, boxes_of
+from edge_server.experiments.training.detector.scenes import KINDS, MIN_SIDE_PX, Boxes
 
 BATCH = 32
 WARMUP_STEPS = 100
 # The exported weights are an average over about this many steps.
 AVERAGED_STEPS = 300
-PROTOTYPES = 8  # of a detector with masks
 
 
 class CheckpointError(ValueError):
@@ -37,8 +36,6 @@ class Settings:
     """Settings that determine the weights bit for bit; also threads, because they split sums.
 
     side: width and height of the images.
-    subject: a key of ``dataset.SUBJECTS``.
-    start: SHA-256 of the checkpoint with the initial weights; empty: none.
     """
 
     seed: int = 0
@@ -47,17 +44,11 @@ class Settings:
     epochs: int = 18
     rate: float = 2e-3
     threads: int = 1
-    subject: str = "scenes"
-    start: str = ""
 
 
-def train(
-    dataset: LabeledImages, settings: Settings, checkpoint: Path, start: Path | None = None
-) -> tuple[Detector, list[dict[str, Any]]]:
-    """Train, or resume from ``checkpoint``; with masks, if ``dataset`` has them.
+def train(dataset: LabeledImages, settings: Settings, checkpoint: Path) -> tuple[Detector, list[dict[str, Any]]]:
+    """Train, or resume from ``checkpoint``.
 
-    start: a checkpoint of an earlier training with the same subject, whose averaged weights are the initial
-        ones.
     Returns the averaged detector in eval mode, and a row of losses per epoch. Raises CheckpointError if the
     checkpoint has other settings, FloatingPointError if the loss diverges.
     """
@@ -65,15 +56,9 @@ def train(
     torch.use_deterministic_algorithms(True)
     torch.manual_seed(settings.seed)
     # The memory format channels_last saves a quarter of the time per step.
-    kinds, prototypes = len(SUBJECTS[settings.subject]), 0 if dataset.masks is None else PROTOTYPES
-    model = Detector(kinds, prototypes)
+    model = Detector(len(KINDS))
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
-    if start is not None:
-        try:
-            model.load_state_dict(_read(start)["averaged"])
-        except RuntimeError:
-            raise CheckpointError(f"{start}: holds another network; begin from one of the same --of") from None
-    averaged = Detector(kinds, prototypes).eval()
+    averaged = Detector(len(KINDS)).eval()
     averaged.load_state_dict(model.state_dict())
     optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
     parts = {"model": model, "averaged": averaged, "optimizer": optimizer}
@@ -81,34 +66,27 @@ def train(
     per_epoch = len(dataset) // BATCH
     progress = Progress(settings.epochs - len(log))
     for epoch in range(len(log), settings.epochs):
-        began, sums = time.perf_counter(), np.zeros(3)
+        began, sums = time.perf_counter(), np.zeros(2)
         model.train()
-        for k, (images, truths, masks) in enumerate(_batches(dataset, settings, epoch)):
+        for k, (images, truths) in enumerate(_batches(dataset, settings, epoch)):
             step = epoch * per_epoch + k
             for group in optimizer.param_groups:
                 group["lr"] = settings.rate * _schedule(step, settings.epochs * per_epoch)
-            *predicted, weights, maps = model.raw_with_masks(images)
-            found = predicted[0], predicted[1], predicted[2]
-            assigned = assign_batch(found, truths)
-            scored, boxed = detection_loss(found, truths, assigned)
-            losses = [scored, boxed]
-            if masks is not None and weights is not None and maps is not None:
-                losses.append(mask_loss(weights, maps, truths, masks, assigned))
+            losses = detection_loss(model.raw(images), truths)
             optimizer.zero_grad(set_to_none=True)
-            sum(losses[1:], losses[0]).backward()
+            (losses[0] + losses[1]).backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
             optimizer.step()
             _average(averaged, model, step)
-            sums[: len(losses)] += [float(loss.detach()) for loss in losses]
-        score_loss, box_loss, masked = (round(float(v), 5) for v in sums / per_epoch)
-        if not math.isfinite(score_loss + box_loss + masked):
+            sums += [float(loss.detach()) for loss in losses]
+        score_loss, box_loss = (round(float(v), 5) for v in sums / per_epoch)
+        if not math.isfinite(score_loss + box_loss):
             raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite; lower the rate")
         seconds = round(time.perf_counter() - began, 1)
-        row = {"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss}
-        log.append({**row, **({"mask_loss": masked} if prototypes else {}), "seconds": seconds})
+        log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
         _save(checkpoint, settings, parts, log)
         progress.advance(1)
-        words = f"loss {score_loss:.3f} + {box_loss:.3f}{f' + {masked:.3f}' if prototypes else ''}"
+        words = f"loss {score_loss:.3f} + {box_loss:.3f}"
         progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", words)
     return averaged, log
 
@@ -164,30 +142,22 @@ def _save(checkpoint: Path, settings: Settings, parts: dict[str, Any], log: list
     new.replace(checkpoint)
 
 
-def _batches(
-    dataset: LabeledImages, settings: Settings, epoch: int
-) -> Iterator[tuple[Tensor, list[Tensor], Tensor | None]]:
-    """Augmented batches of one epoch, which depend only on seed and epoch: images, boxes, and masks if the
-    data set has them."""
+def _batches(dataset: LabeledImages, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
+    """Augmented batches of one epoch, images and boxes, which depend only on seed and epoch."""
     order = np.random.default_rng([settings.seed, epoch]).permutation(len(dataset))
     for first in range(0, len(dataset) - BATCH + 1, BATCH):
         images, truths = [], []
         for i in order[first : first + BATCH]:
             rng = np.random.default_rng([settings.seed, epoch, int(i)])
-            image = dataset.images[i]
-            if dataset.masks is not None:
-                image = np.dstack([image, np.where(dataset.masks[i], 255, 0).astype(np.uint8)])
-            image_, boxes = augmented(image, dataset.boxes[i], rng)
-            images.append(image_)
+            image, boxes = augmented(dataset.images[i], dataset.boxes[i], rng)
+            images.append(image)
             truths.append(torch.from_numpy(boxes))
-        batch = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
-        yield batch[:, :3], truths, None if dataset.masks is None else batch[:, 3]
+        yield torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), truths
 
 
 def augmented(image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator) -> tuple[NDArray[np.float32], Boxes]:
     """Randomly augment an image (side, side, 3), returned in [0, 1], and its boxes: mirrored, scaled,
-    shifted, with a random exposure and tint, sometimes blurred or noisy. A fourth channel of ``image`` is the
-    mask of its single object, from 0 to 255: it is transformed as well, and the box is computed from it."""
+    shifted, with a random exposure and tint, sometimes blurred or noisy."""
     side = image.shape[0]
     boxes = boxes.copy()
     if rng.random() < 0.5:
@@ -198,7 +168,7 @@ def augmented(image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator) 
         shift = (1.0 - scale) * side / 2 + rng.uniform(-0.15, 0.15, 2) * side
         warp = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
         image = np.asarray(
-            cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side), borderValue=(114, 114, 114, 0)), np.uint8
+            cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side), borderValue=(114, 114, 114)), np.uint8
         )
         before = np.maximum(boxes[:, 2:4] - boxes[:, :2], 1.0).prod(axis=1)
         boxes[:, :4] = boxes[:, :4] * scale + np.tile(shift, 2)
@@ -207,14 +177,10 @@ def augmented(image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator) 
         # Boxes that are mostly cut off are dropped.
         kept = (size.min(axis=1, initial=float(side)) >= MIN_SIDE_PX) & (size.prod(axis=1) > 0.25 * before * scale**2)
         boxes = boxes[kept]
-    mask = image[..., 3:]
-    if mask.shape[2]:
-        boxes = boxes_of(np.where(mask[..., 0] > 127, 0, -1), [0])
-    out = image[..., :3].astype(np.float32) / 255.0
+    out = image.astype(np.float32) / 255.0
     out = out * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3).astype(np.float32) + rng.uniform(-0.08, 0.08)
     if rng.random() < 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.2)))
     if rng.random() < 0.3:
         out = out + rng.normal(0.0, rng.uniform(0.005, 0.04), out.shape)
-    out = np.concatenate([np.clip(out, 0.0, 1.0).astype(np.float32), mask.astype(np.float32) / 255.0], axis=2)
-    return out, boxes.astype(np.float32)
+    return np.clip(out, 0.0, 1.0).astype(np.float32), boxes.astype(np.float32)
