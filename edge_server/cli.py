@@ -225,7 +225,7 @@ def _add_report(commands: argparse._SubParsersAction) -> None:
 
 
 def _report(args: argparse.Namespace) -> int:
-    from edge_server.report import build_report
+    from edge_server.report.build_report import build_report
 
     if not args.directory.is_dir():
         raise ScenarioError(f"{args.directory}: no such folder")

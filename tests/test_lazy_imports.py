@@ -8,7 +8,7 @@ import sys
 import pytest
 
 EDGE = """
-import edge_server.page, edge_server.live.server, edge_server.report.report
+import edge_server.page, edge_server.live.server, edge_server.report.build_report
 import edge_server.experiments.virtual.from_scenario
 from edge_server.config import read_config
 from freshfield.scenario import load

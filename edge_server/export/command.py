@@ -10,7 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from msgspec import to_builtins
+
 from edge_server.export import ExportError, file_names
+from edge_server.report.records import MeshDistances, MeshFacts
 from edge_server.surface import SurfaceError
 from freshfield.files import out_file, out_folder, write_json
 
@@ -205,17 +208,17 @@ class Export:
             print(f"  {words}", flush=True)
         if self.args.json is None:
             return
-        about = {
-            "file": path.name,
-            "triangles": len(mesh.faces),
-            "vertices": len(mesh.vertices),
-            "watertight": mesh.watertight,
-            "cameras": len(self.source.views),
-            "seconds": round(spent_s, 3),
-            "stages_s": {name: round(end - start, 3) for name, (start, end) in self._stages.items()},
-            "measured": found,
-        }
-        write_json(self.args.json, about, indent=1)
+        facts = MeshFacts(
+            file=path.name,
+            triangles=len(mesh.faces),
+            vertices=len(mesh.vertices),
+            watertight=mesh.watertight,
+            cameras=len(self.source.views),
+            seconds=round(spent_s, 3),
+            stages_s={name: round(end - start, 3) for name, (start, end) in self._stages.items()},
+            measured=None if found is None else MeshDistances(**found),
+        )
+        write_json(self.args.json, to_builtins(facts), indent=1)
 
     def _points(self, path: Path) -> None:
         from edge_server.export.ply import write_points

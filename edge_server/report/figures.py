@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
-from edge_server.report.run_files import Row, RunFiles
+from edge_server.report.run_files import RunFiles
 from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -62,14 +62,14 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
 
 def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
     """Age over time (median and range over cameras, mean age of what was selected), and by camera."""
-    rows = [r for r in files.ages if any(a is not None for a in (r.get("age_ms") or {}).values())]
+    rows = [r for r in files.ages if any(a is not None for a in r.age_ms.values())]
     if not rows or report["age_ms"] is None:
         return False
     spreads = {c: s for c, s in report["age_ms"]["by_camera"].items() if s is not None}
     if not spreads:
         return False
-    t = [r["t_s"] for r in rows]
-    known = [[a for a in r["age_ms"].values() if a is not None] for r in rows]
+    t = [r.t_s for r in rows]
+    known = [[a for a in r.age_ms.values() if a is not None] for r in rows]
     low, mid, high = (np.array([np.percentile(k, p) for k in known]) for p in (0, 50, 100))
     aaoi = _points(report["fidelity"]["series"], "aaoi_ms")
     with figure(path, 2, height_inch=2.6) as (_, axes):
@@ -115,11 +115,9 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
     """Share of time in each state of the chain, and the histogram of drawn delays."""
     if report["channel"] is None:
         return False
-    shares = report["channel"].get("state_share")
-    shares = shares if isinstance(shares, dict) else {}
-    drawn = report["channel"].get("drawn_delay_ms")
-    edges, counts = _histogram(drawn.get("histogram") if isinstance(drawn, dict) else None)
-    if not shares and not len(counts):
+    shares, drawn = files.channel.state_share or {}, files.channel.drawn_delay_ms
+    histogram = drawn.histogram if drawn and drawn.histogram and sum(drawn.histogram.counts) > 0 else None
+    if not shares and histogram is None:
         return False
     with figure(path, 1, 2, height_inch=2.7, width_ratios=[1, 2]) as (_, axes):
         left, right = axes[0]
@@ -128,12 +126,12 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
         left.set_ylim(0, 100)
         left.grid(axis="x", visible=False)
         label_lines(left, "% of the time", "state of the channel", "Channel states")
-        if len(counts):
+        if drawn and histogram:
+            edges, counts = np.array(histogram.edges_ms), np.array(histogram.counts)
             width = np.diff(edges)
             right.bar(edges[:-1], counts / counts.sum() / width, width, align="edge", color=BLUE, alpha=0.85)
-            mean = drawn.get("mean") if isinstance(drawn, dict) else None
-            if mean is not None:
-                right.axvline(mean, color=VERMILION, linewidth=1.4, label=f"mean {mean:.1f} ms")
+            if drawn.mean is not None:
+                right.axvline(drawn.mean, color=VERMILION, linewidth=1.4, label=f"mean {drawn.mean:.1f} ms")
                 right.legend()
             right.set_xlim(0, edges[-1])
             right.set_yticks([])
@@ -190,30 +188,23 @@ def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
 def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
     """What accuracy costs in time, as measured (OUT/frontier.json), and the run's own point: PSNR of what it
     showed in its last fifth, against the time from one update to the next."""
-    try:
-        points = [
-            (str(p["effort"]), float(p["update_ms"]), float(p["psnr_db"]), float(p["psnr_moving_db"]))
-            for p in files.frontier["points"]
-        ]
-        about = str(files.frontier["about"])
-    except (KeyError, TypeError, ValueError):
+    measured, shown = files.frontier, report["fidelity"]["shown"]
+    late = [row for row in files.series if row.t_s >= 0.8 * report["seconds"] and row.number is not None]
+    updates = late[-1].number - late[0].number if late else 0  # not all have a row
+    if measured is None or not measured.points or shown["psnr_db"] is None or not updates > 0:
         return False
-    shown = report["fidelity"].get("shown") or {}
-    late = [row for row in files.series if row["t_s"] >= 0.8 * (report["seconds"] or 0.0) and "number" in row]
-    updates = late[-1]["number"] - late[0]["number"] if late else 0  # not all have a row
-    if not points or shown.get("psnr_db") is None or not updates > 0:
-        return False
-    update_s = (late[-1]["t_s"] - late[0]["t_s"]) / updates
+    update_s = (late[-1].t_s - late[0].t_s) / updates
     with figure(path, height_inch=2.6) as (_, ((ax,),)):
-        for effort, color in zip(dict.fromkeys(p[0] for p in points), (BLUE, GREEN, ORANGE, PURPLE)):
-            mine = np.array(sorted(p[1:] for p in points if p[0] == effort))
+        for effort, color in zip(dict.fromkeys(p.effort for p in measured.points), (BLUE, GREEN, ORANGE, PURPLE)):
+            of_effort = [p for p in measured.points if p.effort == effort]
+            mine = np.array(sorted((p.update_ms, p.psnr_db, p.psnr_moving_db) for p in of_effort))
             ax.plot(mine[:, 0] / 1e3, mine[:, 1], color=color, marker=".", label=f"{effort}, whole image")
             ax.plot(mine[:, 0] / 1e3, mine[:, 2], "--", color=color, marker=".", label=f"{effort}, moving")
         for key, label in (("psnr_db", "this run, shown"), ("psnr_moving_db", None)):
-            if shown.get(key) is not None:
+            if shown[key] is not None:
                 ax.plot([update_s], [shown[key]], "o", color=VERMILION, markersize=8, label=label)
         ax.set_xscale("log")
-        label_lines(ax, "PSNR (dB)", "seconds an update takes", f"Measured: {about}")
+        label_lines(ax, "PSNR (dB)", "seconds an update takes", f"Measured: {measured.about}")
     return True
 
 
@@ -234,13 +225,13 @@ def _image(files: RunFiles, name: str) -> np.ndarray | None:
     return None if image is None else np.asarray(image)[..., ::-1] / 255.0
 
 
-def _points(series: list[Row], name: str) -> tuple[list[float], list[float]]:
+def _points(series: list[dict[str, Any]], name: str) -> tuple[list[float], list[float]]:
     """Times and values of the rows that have a value."""
     rows = [r for r in series if r.get(name) is not None]
     return [r["t_s"] for r in rows], [r[name] for r in rows]
 
 
-def _plot(axes: Axes, series: list[Row], name: str, color: str, label: str) -> None:
+def _plot(axes: Axes, series: list[dict[str, Any]], name: str, color: str, label: str) -> None:
     """Draw the values of a row's entry over time, where there are any."""
     points = _points(series, name)
     if points[0]:
@@ -250,21 +241,6 @@ def _plot(axes: Axes, series: list[Row], name: str, color: str, label: str) -> N
 def _robust_top(values: list[float]) -> float:
     """An axis limit that a single outlier (a start, a kill) does not set."""
     return 1.25 * float(np.percentile(values, 99)) + 1e-9 if len(values) else 1.0
-
-
-def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bin edges (n + 1,) in ms and counts (n,) of the emulator's ``histogram``; both empty where it is
-    missing or counts nothing."""
-    empty = (np.zeros(0), np.zeros(0))
-    if not isinstance(found, dict):
-        return empty
-    try:
-        edges = np.array(found.get("edges_ms"), dtype=np.float64)
-        counts = np.array(found.get("counts"), dtype=np.float64)
-    except (TypeError, ValueError):
-        return empty
-    usable = edges.ndim == counts.ndim == 1 and len(edges) == len(counts) + 1 and counts.sum() > 0
-    return (edges, counts) if usable else empty
 
 
 def _is_usage(value: Any) -> bool:

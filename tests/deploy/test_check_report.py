@@ -12,7 +12,7 @@ from tests.edge_server.report.sample_run import write_run
 
 
 def found(out):
-    from edge_server.report import build_report
+    from edge_server.report.build_report import build_report
 
     build_report(out)
     return "\n".join(problems(out))

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.formats import FORMATS
@@ -29,6 +31,7 @@ from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
 from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.live.scoring_thread import to_bytes
+from edge_server.report.records import UpdateRow
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 from freshfield.scenario import NOTHING_HELD_OUT
@@ -181,7 +184,7 @@ class _Run:
         self.scorer = Scorer(metric, background=self.background)
         self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
         self.rendered: NDArray[np.float32] | None = None
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[UpdateRow] = []
         self.processes: list[dict[str, Any]] = []
         self.spent_s, self.spent_steps = 0.0, 0
         self.load_meter = LoadMeter("fit")
@@ -200,7 +203,7 @@ class _Run:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
             self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
-            self.rows = _read_lines(self.out / "series.jsonl")
+            self.rows = msgspec.convert(_read_lines(self.out / "series.jsonl"), list[UpdateRow])
             self.processes = _read_lines(self.out / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
@@ -239,27 +242,24 @@ class _Run:
         outside = outside_cores(self.processes[-1])
         self.load_meter.row(0.0)  # the evaluation is not measured
         self.rows.append(
-            {
-                "number": len(self.rows),
-                "t_s": at.seconds,
-                "psnr_db": score.psnr_db,
-                "psnr_moving_db": None,
-                "ssim": score.ssim,
-                "lpips": score.lpips,
-                "aaoi_ms": None,
-                "selected": len(self.data.training),
-                "update_ms": at.slice_s * 1e3,
-                "truth_gap_ms": None,
-                "steps": at.steps,
-                "loss": at.loss,
-                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
-            }
+            UpdateRow(
+                number=len(self.rows),
+                t_s=at.seconds,
+                psnr_db=score.psnr_db,
+                ssim=score.ssim,
+                lpips=score.lpips,
+                selected=len(self.data.training),
+                update_ms=at.slice_s * 1e3,
+                steps=at.steps,
+                loss=at.loss,
+                scored_on=f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
+            )
         )
         print(progress_line(at, outside, bool(self.data.held_out)), flush=True)
 
     def finish(self) -> dict[str, Any]:
         """Write checkpoint, images and report; returns report.json."""
-        from edge_server.report import build_report  # draws with matplotlib
+        from edge_server.report.build_report import build_report  # draws with matplotlib
 
         checkpoint.save(self.out / "field", self.model.state(), {**self._about(), "steps": self.spent_steps})
         _write_lines(self.out / "series.jsonl", self.rows)
@@ -315,8 +315,8 @@ def _read_lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    path.write_text("".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+def _write_lines(path: Path, rows: Sequence[Any]) -> None:
+    path.write_text("".join(json.dumps(row, default=asdict, allow_nan=False) + "\n" for row in rows))
 
 
 def _write_png(path: Path, image: NDArray[np.uint8]) -> None:

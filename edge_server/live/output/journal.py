@@ -18,9 +18,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
+
 from edge_server.fidelity.scorer import SHOWN, Score
 from edge_server.fields import View
 from edge_server.live.state import Publication
+from edge_server.report.records import AgeParts, AgesRow, ShownRow
 from freshfield.files import Lines, write_json
 from freshfield.geometry import Pose
 
@@ -81,22 +84,22 @@ class Journal:
         """Write a line with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated
         to ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
         waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
-        line = {
-            "t_s": round(t_s, 4),
-            "number": publication.number,
+        line = ShownRow(
+            t_s=round(t_s, 4),
+            number=publication.number,
             **{name: getattr(score, name) for name in SHOWN},
-            "age_ms": {
-                "network": publication.network_ms,
-                "waiting": waiting_ms,
-                "computing": publication.update_ms,
-                "display": 1e3 * (t_s - publication.t_s),
-            },
-        }
-        self._files["shown"].write(json.dumps(line, allow_nan=False))
+            age_ms=AgeParts(
+                network=publication.network_ms,
+                waiting=waiting_ms,
+                computing=publication.update_ms,
+                display=1e3 * (t_s - publication.t_s),
+            ),
+        )
+        self._files["shown"].write(json.dumps(line, default=asdict, allow_nan=False))
 
     def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
-        line = {"t_s": round(t_s, 4), "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()}}
-        self._files["ages"].write(json.dumps(line))
+        line = AgesRow(round(t_s, 4), {c: a if a is None else round(a, 3) for c, a in ages_ms.items()})
+        self._files["ages"].write(json.dumps(line, default=asdict))
 
     def poses(self, views: Sequence[View]) -> None:
         """Write the poses of those views whose cameras have moved."""

@@ -14,7 +14,8 @@ from edge_server.experiments.fitting.command import progress_line
 from edge_server.experiments.fitting.evaluate import Scored
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.page import markup, timelines
-from edge_server.report import build_report, figures
+from edge_server.report import figures
+from edge_server.report.build_report import build_report
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.display import _edge_line
 from freshfield_up.summary import summarize

@@ -1,0 +1,157 @@
+"""Builds report.json, report.html and the figures of a run from the files in its folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from edge_server.fidelity.scorer import SHOWN
+from edge_server.report.frame_accounting import account_frames
+from edge_server.report.machine import machine, versions
+from edge_server.report.records import AgesRow, Baseline, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
+from edge_server.report.run_files import RunFiles, read_run_files
+from freshfield.files import write_json, write_text
+from freshfield.machine_load import outside_load
+
+METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
+SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
+# ``final`` is the mean of this last share of the run.
+FINAL_SHARE = 0.2
+
+
+def build_report(out_dir: str | Path) -> dict[str, Any]:
+    """Write report.json, report.html and PNGs into the run's folder; returns what report.json holds.
+
+    Works on what is there: after a kill, without the files of other machines, without a channel. ``notes``
+    says what was missing. Raises FileNotFoundError if the folder does not exist.
+    """
+    # Lazy: only the figures need matplotlib.
+    from edge_server.report.figures import draw_all
+    from edge_server.report.page import render_page
+
+    out = Path(out_dir)
+    files = read_run_files(out)
+    report = assemble(files)
+    write_json(out / "report.json", report, indent=1)
+    figures = draw_all(report, files)
+    write_text(out / "report.html", render_page(report, figures))
+    return report
+
+
+def assemble(files: RunFiles) -> dict[str, Any]:
+    """The contents of report.json. ``kind``: live, or fit for a recorded data set without a network, whose
+    frames, ages and channel are None."""
+    edge, series = files.edge, files.series
+    notes = list(files.notes)
+    if edge.lines_lost:
+        notes.append(f"the edge could not write {edge.lines_lost} lines of its results (a full disk?)")
+    accounting = account_frames(files.out)
+    seconds = max(edge.seconds or edge.uptime_s or 0.0, series[-1].t_s if series else 0.0)
+    report = {
+        "kind": edge.kind,
+        "scenario": edge.scenario,
+        "seed": edge.seed,
+        "seconds": seconds,
+        "field": edge.field,
+        "policy": {"name": edge.policy, "value": edge.value},
+        "versions": versions(),
+        "machine": machine(),
+        "outside_load": outside_load(files.processes),
+        "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
+        "age_ms": ages(files.ages),
+        "updates": updates(series, edge.updates or UpdateCounts()),
+        "foreground": edge.foreground,
+        "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
+        "channel": msgspec.to_builtins(files.channel),
+        "notes": notes + accounting.notes,
+    }
+    if files.mesh:
+        report["mesh"] = msgspec.to_builtins(files.mesh)
+    if edge.kind == "fit":
+        data = msgspec.to_builtins(edge.data)
+        report |= {"data": data, "frames": None, "age_ms": None, "channel": None, "notes": []}
+    return report
+
+
+def ages(rows: Sequence[AgesRow]) -> dict[str, Any]:
+    """Age of the newest buffered frame, averaged over time: {mean, p50, p95, by_camera: {camera: the same, or
+    None if it never reported}}. Samples are evenly spaced, so their mean is the time average."""
+    samples: dict[str, list[float]] = {}
+    for row in rows:
+        for camera, age_ms in row.age_ms.items():
+            values = samples.setdefault(camera, [])
+            if age_ms is not None:
+                values.append(age_ms)
+    everything = [age_ms for values in samples.values() for age_ms in values]
+    total = _spread(everything) or {"mean": None, "p50": None, "p95": None}
+    return {**total, "by_camera": {camera: _spread(values) for camera, values in sorted(samples.items())}}
+
+
+def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
+    """Number and duration of updates.
+
+    series: rows of updates, used where the edge has no count; not every update has a row.
+    edge: the edge's own counts.
+    Returns {count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
+    undecodable, shed: frames left out for lack of time, without_step: updates without time for an optimizer
+    step, refused: {camera: how often the field left its image out}}.
+    """
+    spent = [row.update_ms for row in series if row.update_ms is not None]
+    p50, p95 = np.percentile(spent, [50, 95]).tolist() if spent else (None, None)
+    refused = Counter(camera for row in series for camera in row.refused)
+    return {
+        "count": max(len(series), edge.count),
+        "ms_p50": edge.ms_p50 or p50,
+        "ms_p95": edge.ms_p95 or p95,
+        "first_ms": edge.first_ms if edge.first_ms is not None or not series else 1e3 * series[0].t_s,
+        "undecodable": edge.undecodable,
+        "shed": edge.shed,
+        "without_step": max(sum(row.steps == 0 for row in series), edge.without_step),
+        "refused": dict(sorted((refused | Counter(edge.refused)).items())),
+    }
+
+
+def fidelity(series: Sequence[UpdateRow], seconds: float, edge: EdgeStatus) -> dict[str, Any]:
+    """Scores against the held-out views at publication: {final, mean, baseline, lpips_missing, lpips_network,
+    scored_on, scored, series}. ``final``: mean over the last fifth of the run's ``seconds``."""
+    return {
+        "final": _means(_last_fifth(series, seconds), METRICS),
+        "mean": _means(series, METRICS),
+        "baseline": msgspec.to_builtins(edge.baseline or Baseline()),
+        "lpips_missing": edge.lpips_missing,
+        "lpips_network": edge.lpips_network,
+        "scored_on": sorted({row.scored_on for row in series if row.scored_on}),
+        "scored": sum(row.psnr_db is not None for row in series),
+        "series": [{name: getattr(row, name) for name in SERIES} for row in series],
+    }
+
+
+def shown(rows: Sequence[ShownRow], seconds: float) -> dict[str, Any]:
+    """What was shown at random instants of the last fifth of the run's ``seconds``: mean of each score, count
+    of the instants, and age_ms {network, waiting, computing, display}: the parts of the mean age of the views
+    behind what was shown."""
+    late = _last_fifth(rows, seconds)
+    parts = ("network", "waiting", "computing", "display")
+    return {**_means(late, SHOWN), "count": len(late), "age_ms": _means([row.age_ms for row in late], parts)}
+
+
+def _last_fifth(rows: Sequence[Any], seconds: float) -> list[Any]:
+    return [row for row in rows if row.t_s >= (1.0 - FINAL_SHARE) * seconds]
+
+
+def _means(rows: Iterable[Any], names: Sequence[str]) -> dict[str, float | None]:
+    """The mean of each attribute over the rows that know it; None where none does."""
+    known = {name: [value for row in rows if (value := getattr(row, name)) is not None] for name in names}
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+
+
+def _spread(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    p50, p95 = np.percentile(values, [50, 95])
+    return {"mean": float(np.mean(values)), "p50": float(p50), "p95": float(p95)}

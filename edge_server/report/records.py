@@ -1,0 +1,190 @@
+"""What the files of a run hold: the structs with which the edge, fits and exports write, and the report reads.
+
+series.jsonl has one line an update, a ``live.state.Publication``, of which ``UpdateRow`` is the part that a
+report takes. A number that no run can have measured (not finite, or beyond ``Number``) makes its line, or its
+file, unreadable.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct, field
+
+Number = Annotated[float, Meta(ge=-1e15, le=1e15)]
+Count = Annotated[int, Meta(ge=0, le=10**15)]
+
+
+class UpdateRow(Struct, kw_only=True):
+    """A line of series.jsonl. selected: the cameras whose views were used, or of a fit their number."""
+
+    t_s: Number
+    number: Count | None = None
+    selected: list[str] | Count | None = None
+    refused: list[str] = field(default_factory=list)
+    steps: Count | None = None
+    loss: Number | None = None
+    update_ms: Number | None = None
+    aaoi_ms: Number | None = None
+    psnr_db: Number | None = None
+    psnr_moving_db: Number | None = None
+    ssim: Number | None = None
+    lpips: Number | None = None
+    perceptual: Number | None = None
+    truth_gap_ms: Number | None = None
+    scored_on: str | None = None
+
+
+class AgeParts(Struct):
+    """What the mean age of the views behind an image that was shown consists of, milliseconds."""
+
+    network: Number | None = None
+    waiting: Number | None = None
+    computing: Number | None = None
+    display: Number | None = None
+
+
+class ShownRow(Struct, kw_only=True):
+    """A line of shown.jsonl: the score of what was shown at ``t_s``. number: the update that was extrapolated."""
+
+    t_s: Number
+    number: Count | None = None
+    psnr_db: Number | None = None
+    psnr_moving_db: Number | None = None
+    psnr_still_db: Number | None = None
+    ssim: Number | None = None
+    lpips: Number | None = None
+    age_ms: AgeParts = field(default_factory=AgeParts)
+
+
+class AgesRow(Struct):
+    """A line of ages.jsonl: the age of every camera's newest frame; None before its first."""
+
+    t_s: Number
+    age_ms: dict[str, Number | None]
+
+
+class UpdateCounts(Struct):
+    """The edge's own counts of its updates. refused: by camera, how often the field left its view out."""
+
+    count: Count = 0
+    ms_p50: Number | None = None
+    ms_p95: Number | None = None
+    first_ms: Number | None = None
+    undecodable: Count | None = None
+    shed: Count | None = None
+    without_step: Count = 0
+    refused: dict[str, Count] = field(default_factory=dict)
+
+
+class Baseline(Struct):
+    """PSNR of two baselines that need no field."""
+
+    mean_colour_db: Number | None = None
+    nearest_view_db: Number | None = None
+
+
+class FitData(Struct):
+    """The data set of a fit. training: number of views. held_out: names of cameras. missing: entries without
+    an image."""
+
+    file: str
+    instant: str | None
+    training: Count
+    held_out: list[str]
+    missing: Count
+
+
+class EdgeStatus(Struct, kw_only=True):
+    """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge."""
+
+    kind: Literal["live", "fit"] = "live"
+    scenario: str | None = None
+    seed: int | None = None
+    field: str | None = None
+    policy: str | None = None
+    value: Number | None = None
+    seconds: Number | None = None
+    uptime_s: Number | None = None
+    lines_lost: Count = 0
+    updates: UpdateCounts | None = None
+    foreground: dict[str, Number | None] | None = None
+    baseline: Baseline | None = None
+    data: FitData | None = None
+    lpips_missing: str | None = None
+    lpips_network: str | None = None
+
+
+class Histogram(Struct):
+    """Edges of the bins (n + 1) and the counts in them (n)."""
+
+    edges_ms: list[Number]
+    counts: list[Number]
+
+    def __post_init__(self) -> None:
+        if len(self.edges_ms) != len(self.counts) + 1:
+            raise ValueError(f"{len(self.edges_ms)} edges do not bound {len(self.counts)} bins")
+
+
+class Delays(Struct, omit_defaults=True):
+    """A distribution of delays, milliseconds."""
+
+    count: Count | None = None
+    mean: Number | None = None
+    p50: Number | None = None
+    p95: Number | None = None
+    p99: Number | None = None
+    max: Number | None = None
+    histogram: Histogram | None = None
+
+
+class ChannelStatus(Struct):
+    """What a report takes from the emulator's channel.json. state_share: share of time in each state."""
+
+    state_share: dict[str, Number] | None = None
+    drawn_delay_ms: Delays | None = None
+    delay_error_ms: Delays | None = None
+
+
+class FrontierPoint(Struct):
+    """What one setting reached: milliseconds of an update, and PSNR shown."""
+
+    effort: str
+    update_ms: Number
+    psnr_db: Number
+    psnr_moving_db: Number
+
+
+class MeasuredFrontier(Struct):
+    """frontier.json: what accuracy costs in time, as measured before the run. about: where and how."""
+
+    points: list[FrontierPoint]
+    about: str
+
+
+class MeshDistances(Struct):
+    """A mesh compared with the true surface, see ``surface.metrics.Comparison``, and the targets."""
+
+    chamfer_mm: Number
+    accuracy_mm: Number
+    accuracy_median_mm: Number
+    accuracy_p95_mm: Number
+    completeness_mm: Number
+    complete: Number
+    precise: Number
+    within_mm: Number
+    target_chamfer_mm: Number
+    target_complete: Number
+
+
+class MeshFacts(Struct):
+    """mesh.json, as ``edge-server export --json`` writes it. measured: None where the surface is unknown."""
+
+    file: str
+    triangles: Count
+    vertices: Count
+    watertight: bool
+    cameras: Count
+    seconds: Number
+    stages_s: dict[str, Number]
+    measured: MeshDistances | None
