@@ -150,7 +150,7 @@ def _means(rows: Iterable[Any], names: Sequence[str]) -> dict[str, float | None]
     return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
-def _spread(values: Sequence[float]) -> dict[str, float] | None:
+def _spread(values: Sequence[float]) -> dict[str, float | None] | None:
     if not values:
         return None
     p50, p95 = np.percentile(values, [50, 95])

@@ -189,11 +189,13 @@ def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
     """What accuracy costs in time, as measured (OUT/frontier.json), and the run's own point: PSNR of what it
     showed in its last fifth, against the time from one update to the next."""
     measured, shown = files.frontier, report["fidelity"]["shown"]
-    late = [row for row in files.series if row.t_s >= 0.8 * report["seconds"] and row.number is not None]
-    updates = late[-1].number - late[0].number if late else 0  # not all have a row
+    late = [
+        (row.t_s, row.number) for row in files.series if row.t_s >= 0.8 * report["seconds"] and row.number is not None
+    ]
+    updates = late[-1][1] - late[0][1] if late else 0  # not all have a row
     if measured is None or not measured.points or shown["psnr_db"] is None or not updates > 0:
         return False
-    update_s = (late[-1].t_s - late[0].t_s) / updates
+    update_s = (late[-1][0] - late[0][0]) / updates
     with figure(path, height_inch=2.6) as (_, ((ax,),)):
         for effort, color in zip(dict.fromkeys(p.effort for p in measured.points), (BLUE, GREEN, ORANGE, PURPLE)):
             of_effort = [p for p in measured.points if p.effort == effort]

@@ -75,7 +75,8 @@ def read_run_files(out: Path) -> RunFiles:
         path = out / f"{name}.png"
         if path.is_file():
             files.images[name] = path
-    for rows in (files.series, files.shown, files.ages):
+    timed: tuple[list[Any], ...] = (files.series, files.shown, files.ages)
+    for rows in timed:
         for row, t_s in zip(rows, continuous([row.t_s for row in rows])):
             row.t_s = t_s
         rows.sort(key=lambda row: row.t_s)
