@@ -13,7 +13,7 @@ from typing import Any
 from msgspec import to_builtins
 
 from edge_server.export import ExportError, file_names
-from edge_server.report.records import MeshDistances, MeshFacts
+from edge_server.run_records import MeshDistances, MeshFacts
 from edge_server.surface import SurfaceError
 from freshfield.files import out_file, out_folder, write_json
 

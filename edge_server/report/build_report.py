@@ -13,8 +13,8 @@ import numpy as np
 from edge_server.fidelity.scorer import SHOWN
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.machine import machine, versions
-from edge_server.report.records import AgesRow, Baseline, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
 from edge_server.report.run_files import RunFiles, read_run_files
+from edge_server.run_records import AgesRow, Baseline, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from edge_server.report.records import (
+from edge_server.run_records import (
     AgesRow,
     ChannelStatus,
     EdgeStatus,

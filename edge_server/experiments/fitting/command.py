@@ -31,7 +31,7 @@ from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
 from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.live.scoring_thread import to_bytes
-from edge_server.report.records import UpdateRow
+from edge_server.run_records import UpdateRow
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 from freshfield.scenario import NOTHING_HELD_OUT

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,7 +75,9 @@ def _scan_from(poses: Sequence[Array], size: int, fov_deg: float) -> Scan:
 
 def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
     """Distance (H, W) along the ray through every pixel's center; inf if it meets nothing."""
-    renderer = replace(scene, params=replace(scene.params, supersample=1)).view(view.intrinsics, view.camera_to_world)
+    renderer = replace(scene, params=msgspec.structs.replace(scene.params, supersample=1)).view(
+        view.intrinsics, view.camera_to_world
+    )
     return renderer.distance()
 
 

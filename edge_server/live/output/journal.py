@@ -23,7 +23,7 @@ from msgspec.structs import asdict
 from edge_server.fidelity.scorer import SHOWN, Score
 from edge_server.fields import View
 from edge_server.live.state import Publication
-from edge_server.report.records import AgeParts, AgesRow, ShownRow
+from edge_server.run_records import AgeParts, AgesRow, ShownRow
 from freshfield.files import Lines, write_json
 from freshfield.geometry import Pose
 

@@ -16,8 +16,8 @@ from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.figures import draw_fidelity, draw_frontier
 from edge_server.report.page import counts, number, render_page
-from edge_server.report.records import EdgeStatus, UpdateCounts, UpdateRow
 from edge_server.report.run_files import continuous, read_run_files
+from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
