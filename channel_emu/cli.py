@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from channel_emu.model import ages, faults, spelling
-from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping, spelled_out
+from channel_emu.model.config import ChannelConfig, channel_from_mapping, spelled_out
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
 from freshfield import scenario, transport
@@ -401,7 +401,7 @@ def _add_fit(commands: Any) -> None:
     )
     sub.add_argument(
         "--scope",
-        choices=SCOPES,
+        choices=("shared", "per-camera"),
         default="shared",
         help="one Markov chain for all cameras, or one for each [%(default)s]",
     )

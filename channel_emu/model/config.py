@@ -1,4 +1,4 @@
-"""The scenario's ``channel:`` section as validated dataclasses with all defaults.
+"""The scenario's ``channel:`` section as settings with all defaults.
 
 Rates are per millisecond and delays in milliseconds, as in the thesis. A value that may depend on
 the chain's state is one number, or a list with one entry a state.
@@ -6,13 +6,13 @@ the chain's state is one number, or a list with one entry a state.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
+from msgspec import Meta, field
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from channel_emu.model import faults as fault_modules
@@ -29,17 +29,12 @@ from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.presets import preset
 from channel_emu.model.spelling import section
-from freshfield.scenario import ScenarioError, read_section
+from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
 
-PROCESSES = ("as-offered", "periodic", "poisson")
-LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
-SERVICE_STATES = ("at-start", "modulated")
-SCOPES = ("shared", "per-camera")
-SAMPLINGS = ("continuous", "slots")
+NotNegative = Annotated[float, Meta(ge=0)]
 
 
-@dataclass(frozen=True)
-class ArrivalsConfig:
+class ArrivalsConfig(Settings, frozen=True):
     """When frames enter the link.
 
     as-offered: whenever the camera offers one.
@@ -48,58 +43,43 @@ class ArrivalsConfig:
     poisson: a Poisson process samples the newest offered frame; with one rate a chain state it is an MMPP.
     """
 
-    process: str = "as-offered"
-    period_ms: float | None = None
-    rate_per_ms: float | list[float] | None = None
-    spread: bool = False
-    """In simulations, spread the captures of periodic cameras evenly over the period, not at one instant."""
+    process: Literal["as-offered", "periodic", "poisson"] = "as-offered"
+    period_ms: Annotated[float, within(1e-3, math.inf, "of periodic arrivals")] | None = None
+    rate_per_ms: Annotated[NotNegative | list[NotNegative] | None, about("of poisson; one, or one a state")] = None
+    spread: Annotated[bool, about("in simulations: captures evenly over the period, not at one instant")] = False
 
     def __post_init__(self) -> None:
-        _one_of("process", self.process, PROCESSES)
         _belongs("period_ms", self.period_ms, self.process == "periodic", "process periodic")
         _belongs("rate_per_ms", self.rate_per_ms, self.process == "poisson", "process poisson")
-        if self.period_ms is not None and not self.period_ms >= 1e-3:
-            raise ValueError(f"period_ms: expected at least 0.001, got {self.period_ms:g}")
         if self.spread and self.process == "poisson":
             raise ValueError("spread: belongs to process periodic or as-offered only")
-        if self.rate_per_ms is not None:
-            _not_negative("rate_per_ms", per_state(self.rate_per_ms))
-            if max(per_state(self.rate_per_ms)) <= 0:
-                raise ValueError("rate_per_ms: expected a rate above 0 in at least one state")
+        if self.rate_per_ms is not None and not any(per_state(self.rate_per_ms)):
+            raise ValueError("rate_per_ms: expected a rate above 0 in at least one state")
 
 
-@dataclass(frozen=True)
-class ChainConfig:
+class ChainConfig(Settings, frozen=True):
     """The Markov chain of the network's state (6.25).
 
-    mu1_per_ms, mu2_per_ms: rates of leaving the first and the second of two states (6.26).
-    generator_per_ms: instead of them, the generator (M, M) of any number of states, row by row.
+    generator_per_ms: instead of the two rates, row by row.
     scope: ``shared`` by all cameras, or ``per-camera``: an independent chain for each.
+    sampled: continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
+        the slot, as the thesis does; ``closed_forms`` has the bias.
     """
 
-    mu1_per_ms: float | None = None
-    mu2_per_ms: float | None = None
-    generator_per_ms: list[list[float]] | None = None
-    states: list[str] = field(default_factory=list)
-    """Names of the states; s1, s2, ... if not given."""
-    initial: str | None = None
-    """Name of the first state; drawn from the stationary distribution if not given."""
-    scope: str = "shared"
-    sampled: str = "continuous"
-    """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
-    the slot, as the thesis does; ``closed_forms`` has the bias."""
-    slot_ms: float | None = None
+    mu1_per_ms: Annotated[NotNegative | None, about("rate of leaving the first of two states (6.26)")] = None
+    mu2_per_ms: Annotated[NotNegative | None, about("rate of leaving the second")] = None
+    generator_per_ms: Annotated[list[list[float]] | None, about("(M, M), of any number of states")] = None
+    states: Annotated[list[str], about("names of the states; not given: s1, s2, ...")] = field(default_factory=list)
+    initial: Annotated[str | None, about("first state; not given: drawn from the stationary distribution")] = None
+    scope: Literal["shared", "per-camera"] = "shared"
+    sampled: Literal["continuous", "slots"] = "continuous"
+    slot_ms: Annotated[float, within(1e-3, 1e9, "length of a slot")] | None = None
 
     def __post_init__(self) -> None:
-        _one_of("scope", self.scope, SCOPES)
-        _one_of("sampled", self.sampled, SAMPLINGS)
         _belongs("slot_ms", self.slot_ms, self.sampled == "slots", "sampled slots")
-        if self.slot_ms is not None and not 1e-3 <= self.slot_ms <= 1e9:
-            raise ValueError(f"slot_ms: expected 0.001 to 1e9, got {self.slot_ms:g}")
         pair = (self.mu1_per_ms is not None) + (self.mu2_per_ms is not None)
         if pair != (0 if self.generator_per_ms is not None else 2):
             raise ValueError("expected mu1_per_ms and mu2_per_ms, or generator_per_ms")
-        _not_negative("mu1_per_ms and mu2_per_ms", [self.mu1_per_ms or 0.0, self.mu2_per_ms or 0.0])
         try:
             generator = self.generator()
         except ValueError as error:
@@ -113,8 +93,8 @@ class ChainConfig:
                 stationary(generator)
             except ChainError as error:
                 raise ValueError(f"initial: {error}") from None
-        else:
-            _one_of("initial", self.initial, self.names())
+        elif self.initial not in self.names():
+            raise ValueError(f"initial: expected one of {', '.join(self.names())}, got {self.initial!r}")
 
     def generator(self) -> NDArray[np.float64]:
         """Q in 1/ms, (M, M)."""
@@ -138,42 +118,28 @@ class ChainConfig:
         return self.states or [f"s{i + 1}" for i in range(count)]
 
 
-@dataclass(frozen=True)
-class ServiceConfig:
+class ServiceConfig(Settings, frozen=True):
     """The distribution of service times: how long the link takes to transmit a frame.
 
-    mean_ms: mean of every law but none and trace; one number, or one a chain state.
-    shape: of gamma; the coefficient of variation is 1/sqrt(shape).
-    sigma: of lognormal, the standard deviation of the logarithm.
-    delays_ms: of trace, used in turn and repeated from the start after the last.
+    mean_ms: of every law but none and trace.
+    shape: the coefficient of variation is 1/sqrt(shape).
+    delays_ms: used in turn and repeated from the start after the last.
     """
 
-    law: str = "none"
-    mean_ms: float | list[float] | None = None
-    shape: float | None = None
-    sigma: float | None = None
-    delays_ms: list[float] | None = None
+    law: Literal["none", "exponential", "deterministic", "gamma", "lognormal", "trace"] = "none"
+    mean_ms: Annotated[NotNegative | list[NotNegative] | None, about("mean; one, or one a state")] = None
+    shape: Annotated[float, within(1e-3, 1e6, "of gamma")] | None = None
+    sigma: Annotated[float, within(0, 10, "of lognormal: standard deviation of the logarithm")] | None = None
+    delays_ms: Annotated[list[NotNegative], Meta(min_length=1, description="of trace")] | None = None
 
     def __post_init__(self) -> None:
-        _one_of("law", self.law, LAWS)
         _belongs("mean_ms", self.mean_ms, self.law not in ("none", "trace"), "a law with a mean")
         _belongs("shape", self.shape, self.law == "gamma", "law gamma")
         _belongs("sigma", self.sigma, self.law == "lognormal", "law lognormal")
         _belongs("delays_ms", self.delays_ms, self.law == "trace", "law trace")
-        if self.mean_ms is not None:
-            _not_negative("mean_ms", per_state(self.mean_ms))
-        if self.shape is not None and not 1e-3 <= self.shape <= 1e6:
-            raise ValueError(f"shape: expected 0.001 to 1e6, got {self.shape:g}")
-        if self.sigma is not None and not 0 <= self.sigma <= 10:
-            raise ValueError(f"sigma: expected 0 to 10, got {self.sigma:g}")
-        if self.delays_ms is not None:
-            if not self.delays_ms:
-                raise ValueError("delays_ms: expected at least one delay")
-            _not_negative("delays_ms", self.delays_ms)
 
 
-@dataclass(frozen=True)
-class ServerConfig:
+class ServerConfig(Settings, frozen=True):
     """shared: all cameras compete for one server (``queue_server`` explains the disciplines); otherwise each
     has its own. Cameras that capture at the same instant arrive in the order of their names, so under
     drop-new the first of them is served."""
@@ -181,30 +147,27 @@ class ServerConfig:
     shared: bool = False
 
 
-@dataclass(frozen=True)
-class ChannelConfig:
-    """The whole ``channel:`` section; ``presets`` holds the channels of the thesis."""
+class ChannelConfig(Settings, frozen=True):
+    """The whole ``channel:`` section; ``presets`` holds the channels of the thesis.
+
+    service_state: at-start: the state in which transmission starts sets the mean delay. modulated: the service rate
+        follows the chain's state during transmission.
+    queue_limit: bounds memory; for all cameras together if the server is shared.
+    """
 
     preset: str | None = None
     arrivals: ArrivalsConfig = field(default_factory=ArrivalsConfig)
     chain: ChainConfig | None = None
     service: ServiceConfig = field(default_factory=ServiceConfig)
-    service_state: str = "at-start"
-    """at-start: the state in which transmission starts sets the mean delay. modulated: the service rate
-    follows the chain's state during transmission."""
+    service_state: Literal["at-start", "modulated"] = "at-start"
     discipline: str = "drop-new"
     server: ServerConfig = field(default_factory=ServerConfig)
-    queue_limit: int = 1024
-    """Maximum number of frames waiting (fcfs) or in service (parallel), which bounds memory; for all cameras
-    together if the server is shared."""
-    faults: dict[str, Any] = field(default_factory=dict)
-    """Parameters of the listed faults, by name."""
+    queue_limit: Annotated[int, within(1, 10**6, "frames waiting (fcfs) or in service (parallel)")] = 1024
+    faults: Annotated[dict[str, Any], about("parameters of the listed faults, by name")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _one_of("service_state", self.service_state, SERVICE_STATES)
-        _one_of("discipline", self.discipline, DISCIPLINES)
-        if not 1 <= self.queue_limit <= 10**6:
-            raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
+        if self.discipline not in DISCIPLINES:
+            raise ValueError(f"discipline: expected one of {', '.join(DISCIPLINES)}, got {self.discipline!r}")
         states = 1 if self.chain is None else len(self.chain.names())
         chances = {f"faults.{name}.probability": getattr(p, "probability", None) for name, p in self.faults.items()}
         by_state = {
@@ -256,8 +219,8 @@ class ChannelConfig:
 
     def to_mapping(self) -> dict[str, Any]:
         """The resolved section: reading it again gives this configuration."""
-        plain = _without_none(dataclasses.asdict(dataclasses.replace(self, preset=None, faults={})))
-        plain["faults"] = {name: _without_none(dataclasses.asdict(p)) for name, p in self.faults.items()}
+        plain = _without_none(as_mapping(replace(self, preset=None, faults={})))
+        plain["faults"] = {name: _without_none(as_mapping(p)) for name, p in self.faults.items()}
         return plain
 
 
@@ -286,9 +249,9 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
         merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
     merged = {key: spelled_out(key, value) for key, value in merged.items()} | {"preset": name}
     faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
-    config = read_section(ChannelConfig, merged, where)
+    config = read_settings(ChannelConfig, merged, where)
     try:
-        return dataclasses.replace(config, faults=faults)
+        return replace(config, faults=faults)
     except ValueError as error:
         raise ScenarioError(f"{where}: {error}") from None
 
@@ -298,7 +261,9 @@ def spelled_out(key: Any, value: Any, where: str = "channel", folder: Path = Pat
 
     Other values are returned unchanged. Raises ScenarioError.
     """
-    names = {"arrivals": ("process", PROCESSES), "service": ("law", LAWS), "chain": ("", ())}
+    kinds: dict[Any, tuple[str, Any]] = {"arrivals": ("process", ArrivalsConfig), "service": ("law", ServiceConfig)}
+    names = {key: (name, get_args(get_type_hints(kind)[name])) for key, (name, kind) in kinds.items()}
+    names["chain"] = ("", ())
     if key not in names or not isinstance(value, str):
         return value
     kind, known = names[key]
@@ -327,14 +292,9 @@ def _read_faults(faults: Any, where: str) -> dict[str, Any]:
             raise ScenarioError(f"{where}.{name}: unknown fault; expected one of {known}")
         kind = fault_modules.params_class(name)
         if not isinstance(params, dict):  # the first parameter alone: loss: 0.1
-            params = {dataclasses.fields(kind)[0].name: params}
-        read[name] = read_section(kind, params, f"{where}.{name}")
+            params = {kind.__struct_fields__[0]: params}
+        read[name] = read_settings(kind, params, f"{where}.{name}")
     return read
-
-
-def _one_of(key: str, value: str, allowed: Any) -> None:
-    if value not in allowed:
-        raise ValueError(f"{key}: expected one of {', '.join(allowed)}, got {value!r}")
 
 
 def _belongs(key: str, value: Any, wanted: bool, owner: str) -> None:
@@ -342,12 +302,6 @@ def _belongs(key: str, value: Any, wanted: bool, owner: str) -> None:
         raise ValueError(f"{key}: missing ({owner} needs it)")
     if value is not None and not wanted:
         raise ValueError(f"{key}: belongs to {owner} only")
-
-
-def _not_negative(key: str, values: list[float]) -> None:
-    for value in values:
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{key}: expected finite numbers of at least 0, got {value:g}")
 
 
 def _without_none(mapping: dict[str, Any]) -> dict[str, Any]:

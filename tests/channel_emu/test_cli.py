@@ -202,7 +202,7 @@ def test_rates(text: str, value: float) -> None:
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
         (["--cameras", "30000000"], "cameras: expected 1 to"),
         (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
-        (["--fault", "bandwidth:1.0e-308"], "bandwidth: megabits_per_s: expected at least"),
+        (["--fault", "bandwidth:1.0e-308"], "bandwidth.megabits_per_s: expected a number, at least"),
         (["--fault", "loss:{probability: 0, probability: 1}"], "expected something like loss:0.1"),
         (["--seconds", "1e9", "--cameras", "18"], "frames: expected at most"),
         (["--arrivals", "poisson:1e12"], "frames: expected at most"),

@@ -1,6 +1,6 @@
 """Faults of the link, one file each, loaded only if the scenario lists them.
 
-A fault module has a dataclass ``Params`` (its keys in the scenario) and a subclass ``Effect`` of
+A fault module has settings ``Params`` (its keys in the scenario) and a subclass ``Effect`` of
 ``link.Fault``, constructed from (params, seed, camera). Like the link, it looks up its random numbers by
 (camera, offer number).
 """
@@ -8,17 +8,17 @@ A fault module has a dataclass ``Params`` (its keys in the scenario) and a subcl
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.link import Fault, Transit
+from freshfield.settings import Settings, within
 
 NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth", "mahimahi")
 
 
 def params_class(name: str) -> type[Any]:
-    """The parameter dataclass of the fault ``name``, one of NAMES. Imports the fault's module."""
+    """The parameters of the fault ``name``, one of NAMES. Imports the fault's module."""
     return importlib.import_module(f"channel_emu.model.faults.{name}").Params
 
 
@@ -31,20 +31,17 @@ def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
     )
 
 
-@dataclass(frozen=True)
-class ChanceParams:
+Probability = Annotated[float, within(0.0, 1.0, "of each frame")]
+
+
+class ChanceParams(Settings, frozen=True):
     """Parameters of a ``ChanceFault``.
 
     probability: one number, or one for each chain state in which transmission may start (for losses, the
         Gilbert-Elliott model).
     """
 
-    probability: float | list[float]
-
-    def __post_init__(self) -> None:
-        for p in per_state(self.probability):
-            if not 0.0 <= p <= 1.0:
-                raise ValueError(f"probability: expected a probability from 0 to 1, got {p:g}")
+    probability: Probability | list[Probability]
 
 
 class ChanceFault(Fault):

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import Annotated
 
 from channel_emu.model.link import Fault, Transit
 from channel_emu.model.nanoseconds import saturating_round
+from freshfield.settings import Settings, within
 
 
-@dataclass(frozen=True)
-class Params:
-    megabits_per_s: float
-
-    def __post_init__(self) -> None:
-        if not self.megabits_per_s >= 1e-9:  # a bit in a quarter of an hour
-            raise ValueError(f"megabits_per_s: expected at least 1e-9, got {self.megabits_per_s:g}")
+class Params(Settings, frozen=True):
+    # The least is a bit in a quarter of an hour.
+    megabits_per_s: Annotated[float, within(1e-9, math.inf, "rate of the line")]
 
 
 class Effect(Fault):

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import Annotated
+
+from msgspec import field
 
 from channel_emu.model.link import Fault, Transit
 from channel_emu.model.nanoseconds import to_ns
+from freshfield.settings import Settings, about
 
 
-@dataclass(frozen=True)
-class Params:
-    windows_ms: list[list[float]] = field(default_factory=list)
-    """[start, end] of each window, in ms since the emulator started."""
+class Params(Settings, frozen=True):
+    """Windows since the emulator started; in addition, one of ``for_ms`` at the end of each period of ``every_ms``."""
+
+    windows_ms: Annotated[list[list[float]], about("[start, end] of each window")] = field(default_factory=list)
     every_ms: float | None = None
     for_ms: float | None = None
-    """In addition, a window of ``for_ms`` at the end of each period of ``every_ms``."""
 
     def __post_init__(self) -> None:
         for window in self.windows_ms:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 from channel_emu.model.faults import ChanceFault, ChanceParams
 from channel_emu.model.link import Transit
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class Params(ChanceParams):
-    count: int = 1
-    """Number of bytes to damage in a frame that is hit."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= self.count <= 1000:
-            raise ValueError(f"count: expected 1 to 1000 bytes, got {self.count}")
+class Params(ChanceParams, frozen=True):
+    count: Annotated[int, within(1, 1000, "bytes to damage in a frame that is hit")] = 1
 
 
 class Effect(ChanceFault):

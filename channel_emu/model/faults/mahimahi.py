@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from typing import Annotated
 
 from channel_emu.model.link import Fault, Transit
+from freshfield.settings import Settings, about
 
 PACKET_BYTES = 1500
 
 
-@dataclass(frozen=True)
-class Params:
-    opportunities_ms: list[int]
-    """Ascending instants in ms; at each PACKET_BYTES may be sent. The trace repeats after the last."""
+class Params(Settings, frozen=True):
+    """At each instant PACKET_BYTES may be sent. The trace repeats after the last."""
+
+    opportunities_ms: Annotated[list[int], about("ascending instants")]
 
     def __post_init__(self) -> None:
         times = self.opportunities_ms

@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from typing import Annotated
+
+from msgspec import field
 
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.link import Fault
 from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round, to_ns
+from freshfield.settings import Settings, within
+
+Instant = Annotated[float, within(0, math.inf, "since the emulator started")]
 
 
-@dataclass(frozen=True)
-class Params:
-    mean_interval_ms: float | None = None
-    """Resets at the instants of a Poisson process with this mean interval, independent for each camera."""
-    at_ms: list[float] = field(default_factory=list)
-    """Or at these instants, in ms since the emulator started."""
+class Params(Settings, frozen=True):
+    """Resets by a Poisson process, independent for each camera, or at given instants."""
+
+    # Faster than this a node cannot reconnect in between.
+    mean_interval_ms: Annotated[float, within(10, math.inf, "between resets")] | None = None
+    at_ms: list[Instant] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if (self.mean_interval_ms is None) == (not self.at_ms):
             raise ValueError("expected either mean_interval_ms or at_ms")
-        # Faster than this a node cannot reconnect in between.
-        if self.mean_interval_ms is not None and self.mean_interval_ms < 10.0:
-            raise ValueError(f"mean_interval_ms: expected at least 10, got {self.mean_interval_ms:g}")
-        if any(at < 0 for at in self.at_ms):
-            raise ValueError("at_ms: expected no negative instants")
 
 
 class Effect(Fault):

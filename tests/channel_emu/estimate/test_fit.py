@@ -8,6 +8,7 @@ import json
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -108,7 +109,7 @@ def test_cameras_with_chains_of_their_own(tmp_path: Path) -> None:
     path = write_trace(tmp_path / "t.jsonl", section, 5, cameras=3, seconds=120)
     found = fit(path, scope="per-camera")
     check(found, GILBERT_TRUE)
-    assert channel_from_mapping(found.channel).chain == dataclasses.replace(
+    assert channel_from_mapping(found.channel).chain == msgspec.structs.replace(
         channel_from_mapping(section).chain,
         mu1_per_ms=found.channel["chain"]["mu1_per_ms"],
         mu2_per_ms=found.channel["chain"]["mu2_per_ms"],

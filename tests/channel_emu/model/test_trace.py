@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from channel_emu.live.replay_link import ReplayLink
@@ -45,7 +45,7 @@ def test_a_recorded_trace_is_decided_again_exactly(tmp_path: Path, preset: str) 
     config = channel_from_mapping({"preset": preset, "faults": FAULTS})
     told = record(tmp_path / "t.jsonl", config)
     found = trace.read(tmp_path / "t.jsonl")
-    assert found.seed == 3 and dataclasses.replace(found.config, preset=preset) == config
+    assert found.seed == 3 and msgspec.structs.replace(found.config, preset=preset) == config
     assert {c: len(r) for c, r in found.by_camera().items()} == {"a": 400, "b": 400}
     assert sum(r.outcome == "delivered" for r in found.by_camera()["a"]) == sum(
         e.kind is EventKind.DELIVERED for e in told["a"]
