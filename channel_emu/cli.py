@@ -387,7 +387,7 @@ def _proxy(args: argparse.Namespace) -> int:
 def _add_fit(commands: Any) -> None:
     sub = commands.add_parser(
         "fit",
-        help="estimate a channel from a recording: chain, rates, delays, bursts, with 95 %% intervals",
+        help="estimate a channel from a recording: chain, delays, losses, with 95 %% intervals",
         description="Fits a channel with one or two hidden states to a trace of this emulator (its recorded "
         "states are not used) or to a CSV of any link with columns offered_ms, delivered_ms (blank: lost), "
         "camera. Prints the channel section for a scenario.",

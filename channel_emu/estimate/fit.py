@@ -1,15 +1,12 @@
 """Fits a channel to a recording: ``channel-emu fit``.
 
-The Bayesian information criterion BIC = k log n - 2 log L (Schwarz, Annals of Statistics 6(2), 1978) chooses
-between one state (exponential delays, periodic or Poisson arrivals) and two (``hmm``). Intervals are 95 %:
-for the chain, delays and rates from the observed information of the parameters' logarithms; for shares and
-run lengths from the means of twenty batches of equal length (Schmeiser, Operations Research 30(3), 1982),
-because losses in bursts are not independent.
+The Bayesian information criterion BIC = k log n - 2 log L (Schwarz, Annals of Statistics 6(2), 1978) chooses between
+one state and two (``two_states``), and between exponential and gamma delays. Intervals are 95 %, by parametric
+bootstrap: the fitted channel draws recordings with frames at the same instants, which are fitted as the recording was.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,25 +15,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.estimate import hmm
-from channel_emu.estimate.hmm import Z_95, Estimate, Timeline
-from channel_emu.estimate.recording import MAX_DELAY_MS, Camera, Recording, RecordingError, read_recording, timelines
+from channel_emu.estimate import two_states
+from channel_emu.estimate.recording import (
+    LOST,
+    MAX_DELAY_MS,
+    Camera,
+    Recording,
+    RecordingError,
+    Transmissions,
+    read_recording,
+    transmissions,
+)
+from channel_emu.estimate.two_states import Segments, TwoStates
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import EventKind
 from freshfield.scenario import ScenarioError
 
 MIN_DELAYS = 20
+SAMPLES = 40
+"""Bootstrap samples."""
+_Z_95 = 1.959964
 # A state with fewer frames or fewer visits counts as outliers.
 _MIN_FRAMES, _MIN_VISITS = 10.0, 3.0
-# Exponential gaps are within a quarter of their median with probability .17, a periodic camera's nearly
-# always.
+# Exponential gaps are within a quarter of their median with probability .17, a periodic camera's nearly always.
 _NEAR_MEDIAN, _PERIODIC_SHARE = 0.25, 0.5
 _CONSTANT_CV = 0.01
-# Kolmogorov-Smirnov distance times sqrt(n), for parameters fitted to the same data: above the 1 % level of
-# Lilliefors' test for the exponential (1.25), with a margin for two states and dependent delays.
-_MISFIT = 1.6
-_BATCHES, _T_95 = 20, 2.093
-_LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
+# Kolmogorov-Smirnov distance times sqrt(n) to the delays that the fit draws: the 1 % level, with a margin.
+_MISFIT = 2.0
+# With a larger standard deviation of its logarithm (an interval of e^10 each way) a parameter has no interval.
+_MAX_LOG_SD = 5.0
+# Searches begin with sojourns of so many frames, on so many segments.
+_START_FRAMES, _START_STEPS, _START_SEGMENTS = (5, 50, 500), 8, 80
 _DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
 
 Interval = tuple[float, float] | None
@@ -47,7 +56,7 @@ class IntervalEstimate:
     """An estimate with its 95 % interval; ``interval`` is None if the recording does not determine one."""
 
     value: float
-    interval: Interval
+    interval: Interval = None
 
     def as_dict(self) -> dict[str, float | None]:
         low, high = self.interval or (None, None)
@@ -62,9 +71,9 @@ class Fit:
     arrivals: periodic, poisson or as-offered.
     parameters: by name, in 1/ms and ms.
     bic: by number of states.
-    bursts: statistics of undelivered frames, by name.
+    bursts: shares and runs of undelivered frames, by name.
     channel: the ``channel:`` section for a scenario.
-    estimate: the two-state fit if it was chosen. lines: the observations, one timeline a chain.
+    lines: the transmissions, one timeline a chain; second_state: probability of the second state at each.
     """
 
     recording: Recording
@@ -76,8 +85,8 @@ class Fit:
     bursts: dict[str, IntervalEstimate]
     channel: dict[str, Any]
     warnings: list[str] = field(default_factory=list)
-    estimate: Estimate | None = None
-    lines: list[Timeline] = field(default_factory=list)
+    lines: list[Transmissions] = field(default_factory=list)
+    second_state: list[NDArray[np.float64]] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """The fit as plain values, as the command prints it with --json."""
@@ -95,75 +104,86 @@ class Fit:
             "arrivals": self.arrivals,
             "parameters": {name: value.as_dict() for name, value in self.parameters.items()},
             "bursts": {name: value.as_dict() for name, value in self.bursts.items()},
-            "intervals": "95 %: parameters by observed information, bursts by batch means",
+            "intervals": "95 %, by parametric bootstrap",
             "warnings": self.warnings,
             "channel": self.channel,
         }
 
 
-def fit(path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared") -> Fit:
+@dataclass(frozen=True)
+class _Candidate:
+    """One of the models that BIC chooses from. law: of the delays, see ``two_states.step``. model: None for one
+    state, which ``one`` describes."""
+
+    states: int
+    law: str
+    bic: float
+    one: dict[str, float]
+    model: TwoStates | None = None
+
+
+def fit(
+    path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared", samples: int = SAMPLES
+) -> Fit:
     """Fit a channel to the recording in ``path`` (``recording`` describes the format).
 
     states: number of states: "1", "2" or "auto" (BIC decides).
     discipline: queue discipline of the recorded link, for rows only; None: drop-new.
     scope: one chain for all cameras (shared), or one each with equal parameters (per-camera).
+    samples: number of bootstrap samples.
     Raises RecordingError or TraceError (both ValueError) if the recording cannot be read or fitted.
     """
     if states not in ("1", "2", "auto"):
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
     recording = read_recording(path, discipline)
     delays_ms = _usable_delays_ms(recording)
-    kind, period_ms = _arrivals(recording)
     constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
-    poisson = kind == "poisson"
-    lines = timelines(recording, scope == "shared", poisson)
-    one_state, bic_1 = _fit_one_state(lines, delays_ms, constant, poisson)
-    bic = {1: bic_1}
-    warnings = _data_warnings(recording, constant, poisson, states)
-    estimate = None
-    if states != "1" and (poisson or not constant):
-        _require_libraries(path)
-        estimate = hmm.fit(lines, not constant, poisson)
-        if states == "2" and not estimate.finite:
-            raise RecordingError(f"{path}: --states 2: delays and arrivals do not determine two states")
-    if estimate is not None and not estimate.finite:
-        estimate = None
-    elif estimate is not None:
-        parameter_count = len(estimate.model.log_parameters())
-        bic[2] = parameter_count * math.log(_observation_count(lines)) - 2 * estimate.log_likelihood
-        why_not = _reject_two_states(estimate, lines)
-        if states == "auto" and (why_not or bic[2] >= bic[1]):
-            if bic[2] < bic[1]:
-                warnings.append(f"two states were preferred by BIC and set aside: {why_not}")
-            estimate = None
-        elif why_not:
-            warnings.append(f"two states as asked, though {why_not}")
-    parameters = one_state if estimate is None else _two_state_parameters(estimate, delays_ms, constant)
+    lines = transmissions(recording, scope == "shared")
+    lost = np.concatenate([line[2] for line in lines])
+    loses = bool((lost == 1.0).any())
+    warnings = _data_warnings(recording, constant, loses, states)
+    hides_lost = all(np.isnan(delay[lost == 1.0]).all() for _, delay, lost in lines)
+    data = two_states.segments(lines, hides_lost)
+    laws = ("constant",) if constant else ("exponential", "gamma")
+    best = {1: min((_one_state(delays_ms, lost, law) for law in laws), key=lambda each: each.bic)}
+    if states != "1" and (loses or not constant):
+        best[2] = min((_two_states(data, delays_ms, lost, law) for law in laws), key=lambda each: each.bic)
+    chosen = best[1]
+    if 2 in best:
+        why_not = _reject_two_states(best[2], data, lines)
+        if states == "2" or (not why_not and best[2].bic < best[1].bic):
+            chosen = best[2]
+            warnings += [f"two states as asked, though {why_not}"] if why_not else []
+        elif best[2].bic < best[1].bic:
+            warnings.append(f"two states were preferred by BIC and set aside: {why_not}")
+    parameters, drawn_ms = _with_intervals(chosen, data, delays_ms, lost, samples)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
-    if not constant:
-        warnings += _misfit_warnings(delays_ms, parameters, estimate, lines)
-    chosen_by = "BIC" if states == "auto" else "asked"
+    if chosen.law != "constant":
+        warnings += _misfit_warnings(delays_ms, drawn_ms)
+    kind, period_ms = _arrivals(recording)
+    if kind == "poisson":
+        parameters["rate_per_ms"] = _arrival_rate(recording)
     bursts = _loss_statistics(recording.cameras)
-    channel = _channel_section(recording, parameters, kind, period_ms, scope, bursts)
+    channel = _channel_section(recording, parameters, chosen.law, kind, period_ms, scope)
     try:
         channel_from_mapping(channel, "the fitted channel")
     except ScenarioError as error:
         raise RecordingError(
-            f"{path}: delays and arrivals do not determine a channel of two states ({error}): --states 1"
+            f"{path}: delays and losses do not determine a channel of two states ({error}): --states 1"
         ) from None
     return Fit(
         recording,
-        1 if estimate is None else 2,
-        chosen_by,
+        chosen.states,
+        "BIC" if states == "auto" else "asked",
         kind,
         parameters,
-        bic,
+        {k: each.bic for k, each in best.items()},
         bursts,
         channel,
         warnings,
-        estimate,
         lines,
+        [] if chosen.model is None else _second_state(chosen.model, data, lines, chosen.law),
     )
 
 
@@ -183,12 +203,166 @@ def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     return delays_ms
 
 
-def _require_libraries(path: Path) -> None:
-    if any(importlib.util.find_spec(name) is None for name in ("numba", "scipy")):
-        raise RecordingError(
-            f"{path}: two states are fitted with numba and scipy (pip install 'freshfield[emu]'); --states 1 "
-            "needs neither"
-        )
+def _data_warnings(recording: Recording, constant: bool, loses: bool, states: str) -> list[str]:
+    notes = []
+    if recording.too_long:
+        notes.append(f"{recording.too_long} frames took longer than {MAX_DELAY_MS:g} ms: left out")
+    if constant:
+        what = "states are told apart by losses alone" if loses else "there is nothing to tell states by"
+        notes.append(f"the delays hardly vary: {what}")
+        if states == "2" and not loses:
+            raise RecordingError(
+                f"{recording.path}: --states 2: the delays hardly vary and no frame was lost: there is nothing to "
+                "tell states by"
+            )
+    return notes
+
+
+def _one_state(delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> _Candidate:
+    one = _one_state_parameters(delays_ms, lost, law)
+    log_likelihood = sum(math.log(p) * n for p, n in _fates(one["loss"], lost) if n)
+    if law != "constant":
+        delays_ms = np.maximum(delays_ms, 1e-6)
+        density = two_states.log_density(delays_ms, np.array(max(one["mean_ms"], 1e-6)), np.array(one["shape"]))
+        log_likelihood += float(density.sum())
+    free = (law != "constant") + (law == "gamma") + bool((lost == 1.0).any())
+    return _Candidate(1, law, free * math.log(len(lost)) - 2 * log_likelihood, one)
+
+
+def _fates(loss: float, lost: NDArray[np.float64]) -> list[tuple[float, int]]:
+    return [(loss, int((lost == 1.0).sum())), (1.0 - loss, int((lost == 0.0).sum()))]
+
+
+def _one_state_parameters(delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> dict[str, float]:
+    mean_ms = float(delays_ms.mean())
+    known = lost[~np.isnan(lost)]
+    spread = math.log(max(mean_ms, 1e-6)) - float(np.log(np.maximum(delays_ms, 1e-6)).mean())
+    shape = float(two_states.gamma_shape(np.array(spread))) if law == "gamma" else 1.0
+    return {"mean_ms": mean_ms, "loss": float(known.mean()) if len(known) else 0.0, "shape": shape}
+
+
+def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> _Candidate:
+    """The most likely model of two states: a few steps from several models on the first part of the data, then from
+    the best of them to the maximum."""
+    one = _one_state_parameters(delays_ms, lost, law)
+    head = Segments(*(a[:, :_START_SEGMENTS] for a in (data.span_ms, data.delay_ms, data.lost)), data.hides_lost)
+    frames = max(int((~np.isnan(data.lost) | ~np.isnan(data.delay_ms)).sum()), 1)
+    between_ms = max(float(data.span_ms.sum()) / frames, 1e-9)
+    contrasts = [(0.6, 1.6), (1.6, 0.6)] if one["loss"] and law != "constant" else [(0.6, 1.6)]
+    starts = [(n, contrast) for n in _START_FRAMES for contrast in contrasts]
+    begin = TwoStates(
+        np.array([[1 / (n * between_ms)] * 2 for n, _ in starts]),
+        max(one["mean_ms"], 1e-6) * np.array([[0.6, 1.6]] * len(starts)),
+        np.minimum(one["loss"] * np.array([contrast for _, contrast in starts]), 0.99),
+        np.full(len(starts), one["shape"]),
+    )
+    tried, value = two_states.maximize(begin, head, law, _START_STEPS)
+    model, log_likelihood = two_states.maximize(tried.take([int(np.argmax(value))]), data, law)
+    free = 2 + 2 * (law != "constant") + (law == "gamma") + 2 * bool(one["loss"])
+    bic = free * math.log(len(lost)) - 2 * float(log_likelihood[0])
+    return _Candidate(2, law, bic, one, model.ordered(law != "constant"))
+
+
+def _second_state(model: TwoStates, data: Segments, lines: list[Transmissions], law: str) -> list[NDArray[np.float64]]:
+    """Probability of the second state at each transmission, one array a timeline."""
+    flat = two_states.step(model, data, law)[2][0]
+    found, row = [], 0
+    for start, _, _ in lines:
+        rows = -(-len(start) // two_states.SEGMENT)
+        found.append(flat[row : row + rows].ravel()[: len(start)] if rows > 1 else flat[row][: len(start)])
+        row += rows
+    return found
+
+
+def _reject_two_states(found: _Candidate, data: Segments, lines: list[Transmissions]) -> str | None:
+    """The reason to reject two states whatever their likelihood, or None."""
+    assert found.model is not None
+    second = np.concatenate(_second_state(found.model, data, lines, found.law))
+    frames = min(float(second.sum()), float((1 - second).sum()))
+    if frames < _MIN_FRAMES:
+        return f"one of them rests on {frames:.0f} frames"
+    span_ms = sum(float(start[-1] - start[0]) for start, _, _ in lines)
+    visits = float(found.model.leave_per_ms[0, 0] * found.model.stationary()[0, 0]) * span_ms
+    if visits < _MIN_VISITS:
+        return f"the chain changed state {2 * visits:.0f} times only: record longer"
+    return None
+
+
+def _with_intervals(
+    chosen: _Candidate, data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np.float64], count: int
+) -> tuple[dict[str, IntervalEstimate], NDArray[np.float64]]:
+    """The parameters with their intervals by ``count`` samples, and delays drawn from the fitted distributions."""
+    rng, model = np.random.default_rng(0), chosen.model
+    if model is None:
+        values = {name: np.array([value]) for name, value in chosen.one.items()}
+        shape, fates = chosen.one["shape"], int((~np.isnan(lost)).sum())
+        if chosen.law == "constant":
+            drawn = rng.choice(delays_ms, (count, len(delays_ms)))
+        else:
+            drawn = rng.gamma(shape, chosen.one["mean_ms"] / shape, (count, len(delays_ms)))
+        drawn_ms = drawn.ravel()
+        losses = rng.binomial(fates, chosen.one["loss"], count) / max(fates, 1)
+        again = [_one_state_parameters(d, np.array([loss]), chosen.law) for d, loss in zip(drawn, losses)]
+        samples = {name: np.array([each[name] for each in again]) for name in values}
+    else:
+        many = two_states.draw(model, data, count, rng)
+        second = two_states.step(model, data, chosen.law)[2][~np.isnan(data.delay_ms)]
+        means_ms = model.mean_ms[0][(rng.random((count, len(second))) < second).astype(int)].ravel()
+        drawn_ms = rng.gamma(model.shape[0], means_ms / model.shape[0])
+        values = _named(model, chosen.law)
+        samples = _named(two_states.maximize(model.repeat(count), many, chosen.law, 40)[0], chosen.law)
+        if chosen.law == "constant":
+            values["mean_ms"] = samples["mean_ms"] = np.array([float(delays_ms.mean())])
+    if chosen.law != "gamma":
+        del values["shape"]
+    if not (lost == 1.0).any():
+        values = {name: value for name, value in values.items() if not name.startswith("loss")}
+    return {
+        name: IntervalEstimate(float(value[0]), _interval(float(value[0]), samples[name], name.startswith("loss")))
+        for name, value in values.items()
+    }, drawn_ms
+
+
+def _named(model: TwoStates, law: str) -> dict[str, NDArray[np.float64]]:
+    """The parameters of each sample by name; a loss of nearly nothing is none."""
+    pairs = {
+        "mu{}_per_ms": model.leave_per_ms,
+        "mean_{}_ms": model.mean_ms,
+        "loss_{}": np.where(model.loss < 1e-6, 0.0, model.loss),
+    }
+    if law == "constant":
+        del pairs["mean_{}_ms"]
+    return {name.format(k + 1): pair[:, k] for name, pair in pairs.items() for k in (0, 1)} | {"shape": model.shape}
+
+
+def _interval(value: float, samples: NDArray[np.float64], chance: bool) -> Interval:
+    """The interval of an estimate by the spread of its samples: of their logarithms, or of a chance's log odds."""
+    if value <= 0.0:
+        return None if chance else (value, value)
+
+    def spread(x: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        x = np.clip(x, 1e-300, 1 - 1e-12 if chance else 1e300)
+        return np.asarray(np.log(x / (1 - x)) if chance else np.log(x))
+
+    at, reach = float(spread(value)), _Z_95 * float(spread(samples).std())
+    if not reach < _Z_95 * _MAX_LOG_SD:
+        return None
+    low, high = (math.exp(at + sign * reach) for sign in (-1, 1))
+    return (low / (1 + low), high / (1 + high)) if chance else (min(low, value), max(high, value))
+
+
+def _misfit_warnings(delays_ms: NDArray[np.float64], drawn_ms: NDArray[np.float64]) -> list[str]:
+    """A warning if the delays are not distributed as those that the fit draws (Kolmogorov-Smirnov distance)."""
+    ordered, drawn = np.sort(delays_ms), np.sort(drawn_ms)
+    below = np.searchsorted(drawn, ordered, side="right") / len(drawn)
+    n = len(ordered)
+    distance = max((np.arange(1, n + 1) / n - below).max(), (below - np.arange(n) / n).max())
+    if distance * math.sqrt(n) <= _MISFIT:
+        return []
+    return [
+        f"the delays are not exponential or gamma by state (their distribution differs by {distance:.3f}): the means "
+        "hold, shapes do not; --service trace:FILE of simulate replays the delays themselves"
+    ]
 
 
 def _arrivals(recording: Recording) -> tuple[str, float]:
@@ -203,116 +377,34 @@ def _arrivals(recording: Recording) -> tuple[str, float]:
     return ("periodic" if near.mean() > _PERIODIC_SHARE else "poisson"), median
 
 
-def _fit_one_state(
-    lines: list[Timeline], delays_ms: NDArray[np.float64], constant: bool, poisson: bool
-) -> tuple[dict[str, IntervalEstimate], float]:
-    mean, n = float(delays_ms.mean()), len(delays_ms)
-    found, log_likelihood = {"mean_ms": IntervalEstimate(mean, (mean, mean))}, 0.0
-    if not constant:
-        reach = math.exp(Z_95 / math.sqrt(n))
-        found["mean_ms"] = IntervalEstimate(mean, (mean / reach, mean * reach))
-        log_likelihood -= n * (math.log(mean) + 1)
-    if poisson:
-        arrivals = sum(int(line.arrived.sum()) for line in lines)
-        rate = arrivals / sum(float(line.span_ms @ line.waiting) for line in lines)
-        reach = math.exp(Z_95 / math.sqrt(arrivals))
-        found["rate_per_ms"] = IntervalEstimate(rate, (rate / reach, rate * reach))
-        log_likelihood += arrivals * (math.log(rate) - 1)
-    return found, ((not constant) + poisson) * math.log(_observation_count(lines)) - 2 * log_likelihood
-
-
-def _two_state_parameters(
-    estimate: Estimate, delays_ms: NDArray[np.float64], constant: bool
-) -> dict[str, IntervalEstimate]:
-    names = ["mu1_per_ms", "mu2_per_ms"]
-    names += [] if estimate.model.mean_ms is None else ["mean_1_ms", "mean_2_ms"]
-    names += [] if estimate.model.rate_per_ms is None else ["rate_1_per_ms", "rate_2_per_ms"]
-    values = np.exp(estimate.model.log_parameters())
-    found = {name: IntervalEstimate(float(values[i]), estimate.interval(i)) for i, name in enumerate(names)}
-    if constant:
-        found["mean_ms"] = IntervalEstimate(mean := float(delays_ms.mean()), (mean, mean))
-    return found
-
-
-def _observation_count(lines: list[Timeline]) -> int:
-    """Number of delays and arrivals."""
-    return sum(int((~np.isnan(line.delay_ms)).sum() + line.arrived.sum()) for line in lines)
-
-
-def _reject_two_states(estimate: Estimate, lines: list[Timeline]) -> str | None:
-    """The reason to reject two states whatever their likelihood, or None."""
-    frames = np.zeros(2)
-    time_ms = np.zeros(2)
-    for line, states in zip(lines, estimate.states):
-        frames += states[~np.isnan(line.delay_ms) | line.arrived].sum(0)
-        time_ms += line.span_ms @ states
-    if frames.min() < _MIN_FRAMES:
-        return f"one of them rests on {frames.min():.0f} frames"
-    jumps = estimate.model.leave_per_ms * time_ms
-    if jumps.min() < _MIN_VISITS:
-        return f"the chain changed state {jumps.sum():.0f} times only: record longer"
-    return None
-
-
-def _data_warnings(recording: Recording, constant: bool, poisson: bool, states: str) -> list[str]:
-    notes = []
-    if recording.too_long:
-        notes.append(f"{recording.too_long} frames took longer than {MAX_DELAY_MS:g} ms: left out")
-    if constant:
-        what = "states are told apart by arrivals alone" if poisson else "there is nothing to tell states by"
-        notes.append(f"the delays hardly vary: {what}")
-        if states == "2" and not poisson:
-            raise RecordingError(
-                f"{recording.path}: --states 2: the delays hardly vary and the arrivals are "
-                "periodic: there is nothing to tell states by"
-            )
-    return notes
-
-
-def _misfit_warnings(
-    delays_ms: NDArray[np.float64],
-    parameters: dict[str, IntervalEstimate],
-    estimate: Estimate | None,
-    lines: list[Timeline],
-) -> list[str]:
-    """A warning if the delays do not follow the fitted law (Kolmogorov-Smirnov distance)."""
-    if estimate is None or estimate.model.mean_ms is None:
-        means, shares = np.array([parameters["mean_ms"].value]), np.ones(1)
-    else:
-        has_delay = [~np.isnan(line.delay_ms) for line in lines]
-        weight = sum(s[t].sum(0) for s, t in zip(estimate.states, has_delay))
-        means, shares = estimate.model.mean_ms, weight / np.sum(weight)
-    ordered = np.sort(delays_ms)
-    below = (shares * -np.expm1(-ordered[:, None] / means)).sum(1)
-    n = len(ordered)
-    distance = max((np.arange(1, n + 1) / n - below).max(), (below - np.arange(n) / n).max())
-    if distance * math.sqrt(n) <= _MISFIT:
-        return []
-    return [
-        f"the delays are not exponential by state (their distribution differs by {distance:.3f}): the means "
-        "hold, shapes do not; --service trace:FILE of simulate replays the delays themselves"
-    ]
+def _arrival_rate(recording: Recording) -> IntervalEstimate:
+    """Rate of Poisson arrivals: their number over the time in which a camera waited for one."""
+    arrivals, waited_ms = 0, 0.0
+    for camera in recording.cameras:
+        if recording.sampled:
+            until = np.append(camera.offered_ms[1:], camera.offered_ms[-1])
+            taken = ~np.isnan(camera.arrived_ms)
+            waited_ms += float((np.where(taken, camera.arrived_ms, until) - camera.offered_ms).sum())
+            arrivals += int(taken.sum())
+        else:
+            waited_ms += float(camera.offered_ms[-1] - camera.offered_ms[0])
+            arrivals += len(camera.offered_ms) - 1
+    rate = max(arrivals, 1) / max(waited_ms, 1e-6)
+    reach = math.exp(_Z_95 / math.sqrt(max(arrivals, 1)))
+    return IntervalEstimate(rate, (rate / reach, rate * reach))
 
 
 def _loss_statistics(cameras: list[Camera]) -> dict[str, IntervalEstimate]:
-    """Shares of dropped and lost frames, lengths of runs of undelivered and of delivered frames, gaps between
-    deliveries. Skipped frames and those still inside the link are not counted."""
-    found: dict[str, IntervalEstimate] = {}
+    """Shares of dropped and lost frames, and lengths of runs of undelivered frames. Skipped frames and those still
+    inside the link are not counted."""
     kept = [camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras]
-    gone = [np.isin(outcome, _DROPPED + _LOST) for outcome in kept]
-    found["dropped_share"] = _batch_share([np.isin(o, _DROPPED) for o in kept], [np.ones(len(o), bool) for o in kept])
-    found["lost_share"] = _batch_share([np.isin(o, _LOST) for o in kept], [~np.isin(o, _DROPPED) for o in kept])
-    for name, values in (("run_of_missing", gone), ("run_of_delivered", [~g for g in gone])):
-        runs = np.concatenate([_runs(value) for value in values])
-        if len(runs):
-            found[f"{name}_frames"] = _batch_mean(runs)
-            found[f"longest_{name}_frames"] = IntervalEstimate(float(runs.max()), None)
-    gaps = [np.diff(np.sort((c.started_ms + c.delay_ms)[c.delivered() & ~np.isnan(c.delay_ms)])) for c in cameras]
-    together = np.concatenate(gaps)
-    if len(together):
-        found["gap_ms"] = _batch_mean(together)
-        found["longest_gap_ms"] = IntervalEstimate(float(together.max()), None)
-    return found
+    outcome = np.concatenate(kept)
+    dropped, lost = np.isin(outcome, _DROPPED), np.isin(outcome, LOST)
+    found = {"dropped_share": float(dropped.mean()), "lost_share": float(lost.sum() / max((~dropped).sum(), 1))}
+    runs = np.concatenate([_runs(np.isin(o, _DROPPED + LOST)) for o in kept])
+    if len(runs):
+        found |= {"run_of_missing_frames": float(runs.mean()), "longest_run_of_missing_frames": float(runs.max())}
+    return {name: IntervalEstimate(value) for name, value in found.items()}
 
 
 def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -321,43 +413,8 @@ def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
 
 
-def _batch_share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]]) -> IntervalEstimate:
-    """Number of ``counted`` over the number of ``among``, with an interval by batch means."""
-    top, bottom = np.zeros(_BATCHES), np.zeros(_BATCHES)
-    for some, every in zip(counted, among):
-        stretch = np.arange(len(some)) * _BATCHES // max(len(some), 1)
-        top += np.bincount(stretch, some, _BATCHES)
-        bottom += np.bincount(stretch, every, _BATCHES)
-    total = float(bottom.sum())
-    if not total:
-        return IntervalEstimate(0.0, None)
-    share = float(top.sum()) / total
-    if not 0 < share < 1:
-        # None or all of n were counted: the exact 95 % bound.
-        bound = 1 - 0.05 ** (1 / total)
-        return IntervalEstimate(share, (0.0, bound) if share == 0 else (1 - bound, 1.0))
-    # Ratio estimator; its variance comes from the batches' residuals.
-    reach = _T_95 * float(np.sqrt(((top - share * bottom) ** 2).sum() * _BATCHES / (_BATCHES - 1))) / total
-    return IntervalEstimate(share, (max(share - reach, 0.0), min(share + reach, 1.0)))
-
-
-def _batch_mean(values: NDArray[Any]) -> IntervalEstimate:
-    """Mean of a series with an interval by batch means."""
-    mean = float(values.mean())
-    if len(values) < 2 * _BATCHES:
-        return IntervalEstimate(mean, None)
-    means = np.array([batch.mean() for batch in np.array_split(values.astype(float), _BATCHES)])
-    reach = _T_95 * float(means.std(ddof=1)) / math.sqrt(_BATCHES)
-    return IntervalEstimate(mean, (mean - reach, mean + reach))
-
-
 def _channel_section(
-    recording: Recording,
-    parameters: dict[str, IntervalEstimate],
-    arrivals: str,
-    period_ms: float,
-    scope: str,
-    bursts: dict[str, IntervalEstimate],
+    recording: Recording, parameters: dict[str, IntervalEstimate], law: str, arrivals: str, period_ms: float, scope: str
 ) -> dict[str, Any]:
     """The ``channel:`` section, rounded to six digits."""
 
@@ -371,18 +428,16 @@ def _channel_section(
     if arrivals == "periodic":
         section["arrivals"]["period_ms"] = float(f"{max(period_ms, 1e-3):.6g}")
     elif arrivals == "poisson":
-        section["arrivals"]["rate_per_ms"] = by_state("rate_per_ms", "rate_{}_per_ms")
+        section["arrivals"]["rate_per_ms"] = number("rate_per_ms")
     if "mu1_per_ms" in parameters:
         rates = {name: number(name) for name in ("mu1_per_ms", "mu2_per_ms")}
         section["chain"] = {**rates, "states": ["low", "high"], "scope": scope}
     mean = by_state("mean_ms", "mean_{}_ms")
-    if mean == 0.0:
-        section["service"] = {"law": "none"}
-    else:
-        exact = parameters.get("mean_ms")
-        law = "deterministic" if exact and exact.interval == (exact.value, exact.value) else "exponential"
-        section["service"] = {"law": law, "mean_ms": mean}
+    name = {"constant": "deterministic"}.get(law, law)
+    section["service"] = {"law": "none"} if mean == 0.0 else {"law": name, "mean_ms": mean}
+    if law == "gamma":
+        section["service"]["shape"] = number("shape")
     section["discipline"] = recording.discipline
-    if bursts["lost_share"].value > 0:
-        section["faults"] = {"loss": {"probability": float(f"{bursts['lost_share'].value:.6g}")}}
+    if "loss" in parameters or "loss_1" in parameters:
+        section["faults"] = {"loss": {"probability": by_state("loss", "loss_{}")}}
     return section

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.estimate.hmm import Timeline
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 
 # Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
 MAX_DELAY_MS = 1e9
+LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
 _MAX_ROWS_MS = 1e12
 _MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
 
@@ -216,54 +216,29 @@ def _camera_of_rows(
     return Camera(name, offered, offered, started, delivered - started, outcome)
 
 
-def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
-    """The observations for ``hmm``, without empty timelines.
+Transmissions = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Start in ms, delay in ms (NaN: unknown) and loss (1 or 0; NaN: unknown) of frames, each (N,)."""
 
-    shared: one timeline of all cameras, which share a chain; otherwise one a camera.
-    arrivals: whether arrivals count as observations. A process that samples frames waits from a frame's offer
-        on; one that generates frames waits from the camera's first frame to its last.
+
+def transmissions(recording: Recording, shared: bool) -> list[Transmissions]:
+    """The frames that were transmitted, in the order of their starts; lost ones whose start is unknown count from
+    their offer.
+
+    shared: one timeline of all cameras, which share a chain; otherwise one a camera. Empty ones are left out.
     """
     groups = [recording.cameras] if shared else [[camera] for camera in recording.cameras]
-    return [line for group in groups if len((line := _timeline(group, recording.sampled, arrivals)).span_ms)]
+    lines = [[np.concatenate(column) for column in zip(*map(_transmitted, group))] for group in groups]
+    return [
+        (start[order], delay[order], lost[order])
+        for start, delay, lost in lines
+        if len(order := np.argsort(start, kind="stable"))
+    ]
 
 
-def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
-    at: list[NDArray[np.float64]] = []
-    change: list[NDArray[np.int64]] = []
-    arrived: list[NDArray[np.bool_]] = []
-    delay: list[NDArray[np.float64]] = []
-
-    def add(at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None) -> None:
-        n = len(at_ms)
-        at.append(at_ms)
-        change.append(np.full(n, by))
-        arrived.append(np.full(n, is_arrival))
-        delay.append(np.full(n, math.nan) if delays is None else delays)
-
-    for camera in cameras:
-        went = ~np.isnan(camera.delay_ms)
-        add(camera.started_ms[went], 0, False, camera.delay_ms[went])
-        if not arrivals or not len(camera.offered_ms):
-            continue
-        if sampled:
-            following = np.append(camera.offered_ms[1:], camera.offered_ms[-1])
-            taken = ~np.isnan(camera.arrived_ms)
-            add(camera.offered_ms, 1, False)
-            add(camera.arrived_ms[taken], -1, True)
-            add(following[~taken], -1, False)
-        else:
-            add(camera.offered_ms[:1], 1, False)
-            add(camera.offered_ms[1:-1], 0, True)
-            add(camera.offered_ms[-1:], -1, len(camera.offered_ms) > 1)
-    when = np.concatenate(at)
-    # Among events of one instant, waiting begins first, so that an arrival finds its camera waiting.
-    order = np.lexsort((-np.concatenate(change), when))
-    when = when[order]
-    waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order
-    return Timeline(
-        np.diff(when, prepend=when[:1]),
-        waiting.astype(np.int64),
-        np.concatenate(arrived)[order],
-        np.concatenate(delay)[order],
-        float(when[0]) if len(when) else 0.0,
-    )
+def _transmitted(camera: Camera) -> Transmissions:
+    lost = np.isin(camera.outcome, LOST)
+    came = camera.delivered()
+    start = np.where(np.isnan(camera.started_ms) & lost, camera.offered_ms, camera.started_ms)
+    kept = (lost | came | ~np.isnan(camera.delay_ms)) & ~np.isnan(start)
+    fate = np.where(lost, 1.0, np.where(came, 0.0, np.nan))
+    return start[kept], camera.delay_ms[kept], fate[kept]

@@ -57,7 +57,7 @@ def plot(fit: Fit, path: Path) -> None:
     has_delay = ~np.isnan(delay_ms)
     order = np.argsort(start_s[has_delay], kind="stable")[: _plotted_frames(fit, np.sort(start_s[has_delay]))]
     start_s, delay_ms = start_s[has_delay][order], delay_ms[has_delay][order]
-    two = fit.estimate is not None
+    two = fit.states == 2
     ratios = [3, 1] if two else [1]
     with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=ratios) as axes:
         top = axes[0, 0]
@@ -84,18 +84,17 @@ def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
 
 def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
     """Draw delays colored by the state's probability, the means, and below the probability over time."""
-    assert fit.estimate is not None
     names, (top, bottom) = fit.channel["chain"]["states"], axes
     bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({names[1]})")
     for i, (name, color) in enumerate(zip(names, _COLORS), start=1):
         if f"mean_{i}_ms" in fit.parameters:
             mean = fit.parameters[f"mean_{i}_ms"].value
             top.axhline(mean, color=color, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
-    for line, states in zip(fit.lines, fit.estimate.states):
-        at_s = line.at_ms() / 1e3
-        bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1], 1], lw=0.8, color=_COLORS[1])
+    for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
+        at_s = at_ms / 1e3
+        bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1]], lw=0.8, color=_COLORS[1])
         if len(fit.lines) == 1:
-            second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1), 1]
+            second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1)]
             drawn = top.scatter(start_s, delay_ms, c=second, s=8, cmap="coolwarm", vmin=0, vmax=1)
             top.figure.colorbar(drawn, ax=top, label=f"P({names[1]})")
     if len(fit.lines) > 1:

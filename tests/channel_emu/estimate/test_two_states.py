@@ -1,0 +1,97 @@
+"""The recursions against sums over all paths, and the expected jumps against small steps of time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from channel_emu.estimate import two_states
+from channel_emu.estimate.two_states import TwoStates
+from channel_emu.model.chain import transition_matrix, two_state_generator
+
+LEAVE, MEAN, LOSS = (0.02, 0.05), (20.0, 90.0), (0.05, 0.4)
+MODEL = TwoStates(np.array([LEAVE]), np.array([MEAN]), np.array([LOSS]), np.array([1.0]))
+START_MS = np.array([0.0, 12.0, 13.0, 70.0, 71.0, 400.0])
+DELAY_MS = np.array([5.0, 100.0, np.nan, 15.0, np.nan, 60.0])
+LOST = np.array([0.0, 0.0, 1.0, 1.0, np.nan, 0.0])
+
+
+def likelihood(state: int, k: int) -> float:
+    """Of frame k, written out."""
+    density = 1.0 if math.isnan(DELAY_MS[k]) else math.exp(-DELAY_MS[k] / MEAN[state]) / MEAN[state]
+    return density * {0.0: 1 - LOSS[state], 1.0: LOSS[state]}.get(float(LOST[k]), 1.0)
+
+
+def test_likelihood_states_and_losses_are_sums_over_all_paths() -> None:
+    q, count = two_state_generator(*LEAVE), len(START_MS)
+    steps = [transition_matrix(q, span) for span in np.diff(START_MS)]
+    share = (LEAVE[1] / sum(LEAVE), LEAVE[0] / sum(LEAVE))
+    total, states = 0.0, np.zeros((count, 2))
+    for path in itertools.product((0, 1), repeat=count):
+        p = share[path[0]] * math.prod(likelihood(s, k) for k, s in enumerate(path))
+        p *= math.prod(step[a, b] for step, a, b in zip(steps, path, path[1:]))
+        total += p
+        states[range(count), path] += p
+    states /= total
+    data = two_states.segments([(START_MS, DELAY_MS, LOST)], True)
+    after, log_likelihood, second = two_states.step(MODEL, data, "exponential")
+    assert log_likelihood[0] == pytest.approx(math.log(total), rel=1e-12)
+    assert second[0, 0] == pytest.approx(states[:, 1], rel=1e-10)
+    known, came = ~np.isnan(LOST), ~np.isnan(DELAY_MS)
+    assert after.loss[0] == pytest.approx((LOST[known] @ states[known]) / states[known].sum(0))
+    assert after.mean_ms[0] == pytest.approx((DELAY_MS[came] @ states[came]) / states[came].sum(0))
+
+
+def test_a_step_gives_the_expected_jumps_over_the_expected_time() -> None:
+    """Two frames 40 ms apart, and the way between them in four thousand steps of the chain."""
+    parts, span = 4000, 40.0
+    start, delay, lost = np.array([0.0, span]), np.array([5.0, 150.0]), np.array([0.0, 0.0])
+    after, _, _ = two_states.step(MODEL, two_states.segments([(start, delay, lost)], True), "exponential")
+    q, h = two_state_generator(*LEAVE), span / parts
+    small = transition_matrix(q, h)
+    ahead = np.empty((parts + 1, 2))
+    back = np.empty((parts + 1, 2))
+    ahead[0] = [LEAVE[1 - k] / sum(LEAVE) * math.exp(-5.0 / MEAN[k]) / MEAN[k] * (1 - LOSS[k]) for k in (0, 1)]
+    back[-1] = [math.exp(-150.0 / MEAN[k]) / MEAN[k] * (1 - LOSS[k]) for k in (0, 1)]
+    for k in range(parts):
+        ahead[k + 1] = ahead[k] @ small
+        back[-k - 2] = small @ back[-k - 1]
+    time_in = (ahead * back)[:-1].sum(0) * h
+    jumps = [(ahead[:-1, k] * small[k, 1 - k] * back[1:, 1 - k]).sum() for k in (0, 1)]
+    assert after.leave_per_ms[0] == pytest.approx(np.array(jumps) / time_in, rel=2e-3)
+
+
+def test_the_maximum_is_higher_than_all_around_it() -> None:
+    base = two_states.segments([(np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500))], False)
+    data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
+    found, best = two_states.maximize(MODEL, data, "gamma")
+    for k, parameter in itertools.product((0, 1), ("leave_per_ms", "mean_ms", "loss")):
+        for by in (0.97, 1.03):
+            values = {name: getattr(found, name).copy() for name in ("leave_per_ms", "mean_ms", "loss", "shape")}
+            values[parameter][0, k] *= by
+            assert two_states.step(TwoStates(**values), data, "gamma")[1] < best + 0.01
+
+
+def test_samples_are_drawn_from_the_model_and_fitted_apart() -> None:
+    base = two_states.segments([(np.arange(3000) * 30.0, np.ones(3000), np.zeros(3000))], True)
+    data = two_states.draw(MODEL, base, 3, np.random.default_rng(0))
+    assert np.isnan(data.delay_ms[data.lost == 1.0]).all()
+    share = MODEL.stationary()[0]
+    count = np.sqrt(3 * 3000 / 3)
+    assert np.nanmean(data.lost) == pytest.approx(share @ LOSS, abs=4 * 0.4 / count)
+    came = data.lost == 0.0
+    expected = share * (1 - np.array(LOSS)) @ MEAN / (share @ (1 - np.array(LOSS)))
+    assert data.delay_ms[came].mean() == pytest.approx(expected, rel=0.1)
+    together, _ = two_states.maximize(MODEL.repeat(3), data, "exponential")
+    alone, _ = two_states.maximize(MODEL, data.take(slice(1, 2)), "exponential")
+    assert together.mean_ms[1] == pytest.approx(alone.mean_ms[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", [0.3, 1.0, 4.0, 200.0])
+def test_the_shape_of_a_gamma_distribution(shape: float) -> None:
+    draws = np.random.default_rng(2).gamma(shape, 1.0, 200_000)
+    spread = math.log(draws.mean()) - np.log(draws).mean()
+    assert float(two_states.gamma_shape(np.array(spread))) == pytest.approx(shape, rel=0.03)
