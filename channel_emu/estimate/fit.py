@@ -245,7 +245,7 @@ def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np
     """The most likely model of two states: a few steps from several models on the first part of the data, then from
     the best of them to the maximum."""
     one = _one_state_parameters(delays_ms, lost, law)
-    head = Segments(*(a[:, :_START_SEGMENTS] for a in (data.span_ms, data.delay_ms, data.lost)), data.hides_lost)
+    head = data.head(_START_SEGMENTS)
     frames = max(int((~np.isnan(data.lost) | ~np.isnan(data.delay_ms)).sum()), 1)
     between_ms = max(float(data.span_ms.sum()) / frames, 1e-9)
     contrasts = [(0.6, 1.6), (1.6, 0.6)] if one["loss"] and law != "constant" else [(0.6, 1.6)]

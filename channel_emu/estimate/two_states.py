@@ -46,6 +46,10 @@ class Segments:
     lost: Array
     hides_lost: bool
 
+    def head(self, count: int) -> Segments:
+        """The first ``count`` segments."""
+        return Segments(self.span_ms[:, :count], self.delay_ms[:, :count], self.lost[:, :count], self.hides_lost)
+
     def take(self, samples: slice | NDArray[np.int64]) -> Segments:
         """Some of the samples; spans are the same in all."""
         return replace(self, delay_ms=self.delay_ms[samples], lost=self.lost[samples])
@@ -76,9 +80,8 @@ class TwoStates:
         """The same models with the state of shorter delays, or else of fewer losses, first."""
         key = self.mean_ms if by_delay else self.loss
         place = np.argsort(key, 1, kind="stable")
-        return TwoStates(
-            *(np.take_along_axis(a, place, 1) for a in (self.leave_per_ms, self.mean_ms, self.loss)), self.shape
-        )
+        leave, mean, loss = (np.take_along_axis(a, place, 1) for a in (self.leave_per_ms, self.mean_ms, self.loss))
+        return TwoStates(leave, mean, loss, self.shape)
 
 
 def segments(timelines: Sequence[tuple[Array, Array, Array]], hides_lost: bool) -> Segments:
@@ -138,9 +141,9 @@ def maximize(model: TwoStates, data: Segments, law: str, steps: int = _MOST_STEP
     if model.shape.size > 1 and data.lost.size > _MOST_AT_ONCE:
         at_once = max(1, _MOST_AT_ONCE // data.lost[0].size)
         parts = [slice(n, n + at_once) for n in range(0, model.shape.size, at_once)]
-        found = [maximize(model.take(part), data.take(part), law, steps) for part in parts]
-        columns = zip(*((m.leave_per_ms, m.mean_ms, m.loss, m.shape) for m, _ in found))
-        return TwoStates(*map(np.concatenate, columns)), np.concatenate([value for _, value in found])
+        apart = [maximize(model.take(part), data.take(part), law, steps) for part in parts]
+        columns = zip(*((m.leave_per_ms, m.mean_ms, m.loss, m.shape) for m, _ in apart))
+        return TwoStates(*map(np.concatenate, columns)), np.concatenate([value for _, value in apart])
     found, best = _vector(model), np.full(model.shape.size, -np.inf)
     open_ = np.arange(model.shape.size)
     for _ in range(steps):
