@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from edge_server.edge_defaults import CYCLE, FIELD, cameras_move, with_defaults
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario, ScenarioError, read_section
@@ -99,6 +100,8 @@ class EdgeConfig:
     """The edge section of a scenario.
 
     field, field_options: the representation and its settings (edge_server.fields.registry).
+    What a scenario leaves open of field, layers, updates, update_ms, steps and keyframes is chosen by what
+    its cameras do (``edge_defaults``); the values here are those of the thesis's cycle.
     policy: which views an update uses.
     updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame
     has arrived since.
@@ -115,19 +118,19 @@ class EdgeConfig:
     noisy_truth: held-out frames are noisy video, so that the bound of moving pixels follows their noise.
     metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS.
     embedding: an edge_server.embed.EmbeddingConfig, for policies that look at what cameras see.
-    keyframes: earlier viewpoints of moving cameras go on supervising.
+    keyframes: earlier viewpoints of moving cameras go on supervising; null: they do not.
     foreground: an edge_server.foreground.ForegroundConfig, cuts the background out of every view.
     export: what deploy/up.py makes of the field when the run ends.
     What a scenario does not name is neither imported nor computed.
     """
 
-    field: str = "ngp"
+    field: str = FIELD
     field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
-    updates: str = "cycle"
-    update_ms: float = 800.0
+    updates: str = CYCLE["updates"]
+    update_ms: float = CYCLE["update_ms"]
     frontier: str | None = None
-    steps: int = 100
+    steps: int = CYCLE["steps"]
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     grace_ms: float = 3000.0
     lpips: str = "alex"
@@ -198,9 +201,12 @@ class _Scores(msgspec.Struct):
     policies: dict[str, _Policy]
 
 
-def read_config(scenario: Scenario) -> EdgeConfig:
-    """The edge section of a scenario. Raises ScenarioError."""
-    section = dict(scenario.edge)
+def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
+    """The edge section of a scenario, with what it leaves open. Raises ScenarioError.
+
+    moving: whether a camera moves, as its poses told; None: as the scenario says, else they stand still.
+    """
+    section = with_defaults(scenario.edge, cameras_move(scenario) if moving is None else moving)
     if section.get("compute") == "zero":
         section["compute"] = {}
     elif isinstance(section.get("compute"), str):

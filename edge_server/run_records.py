@@ -96,12 +96,14 @@ class FitData(Struct):
 
 
 class EdgeStatus(Struct, kw_only=True):
-    """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge."""
+    """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge. chosen: how the edge
+    works and why, in one line."""
 
     kind: Literal["live", "fit"] = "live"
     scenario: str | None = None
     seed: int | None = None
     field: str | None = None
+    chosen: str | None = None
     policy: str | None = None
     value: Number | None = None
     seconds: Number | None = None

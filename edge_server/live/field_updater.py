@@ -15,6 +15,7 @@ import numpy as np
 from edge_server.config import EdgeConfig, embedding_for, open_embedder
 from edge_server.fields import Budget, Field, FitReport, View
 from edge_server.live.buffer import FrameBuffer
+from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
@@ -93,6 +94,8 @@ class FieldUpdater:
         self.keyframes = keyframes
         self.start_ns = start_ns
         self.number = 0
+        self._motion: CameraMotion | None = None
+        self._if_moving: Callable[[str], None] | None = None
         self._follow_field()
 
     def _follow_field(self) -> None:
@@ -189,6 +192,10 @@ class FieldUpdater:
         if not views:
             return None
         others = self.decoder.others(selection.others)
+        if self._motion is not None and (camera := self._motion.moving([*others, *views])) is not None:
+            self._motion, if_moving = None, self._if_moving
+            assert if_moving is not None
+            if_moving(camera)
         if self.keyframes is None:
             return views, self.field.fit([*others, *views], budget)
         supervision = self.keyframes.with_earlier(views)
@@ -198,6 +205,23 @@ class FieldUpdater:
         # Refusals of earlier viewpoints are not counted against current frames.
         current = {view.camera for view in views}
         return views, replace(report, refused=tuple(c for c in report.refused if c in current))
+
+    def watch_cameras(
+        self, config: EdgeConfig, make: Callable[[EdgeConfig], Field], changed: Callable[[EdgeConfig, str], None]
+    ) -> None:
+        """Once a camera is seen to move, begin anew with field, keyframes and updates of ``config``.
+
+        make: makes the field. changed(config, camera): called then, on the thread of ``fit``.
+        """
+
+        def if_moving(camera: str) -> None:
+            self.field = make(config)
+            self.field.warm_up()
+            self.keyframes = _keyframes(config)
+            self.on_arrivals = config.updates == "arrivals"
+            changed(config, camera)
+
+        self._motion, self._if_moving = CameraMotion(), if_moving
 
     def reset(self) -> None:
         """Forget the scene."""
@@ -245,11 +269,7 @@ def open_updater(
     embedder: one that several runs share; None opens the scenario's.
     Nothing of embedder, keyframes and foreground is imported unless asked for. Raises ScenarioError.
     """
-    keyframes: Keyframes | None = None
-    if config.keyframes is not None:
-        from edge_server.live.keyframes import Keyframes
-
-        keyframes = Keyframes(config.keyframes, resumed)
+    keyframes = _keyframes(config, resumed)
     foreground: Foreground | None = None
     if config.foreground is not None:
         from edge_server.foreground import ForegroundError
@@ -266,3 +286,11 @@ def open_updater(
         return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground, on_arrivals)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+
+
+def _keyframes(config: EdgeConfig, resumed: bool = False) -> Keyframes | None:
+    if config.keyframes is None:
+        return None
+    from edge_server.live.keyframes import Keyframes
+
+    return Keyframes(config.keyframes, resumed)

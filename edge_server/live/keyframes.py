@@ -23,6 +23,7 @@ import numpy as np
 
 from edge_server.config import KeyframesConfig
 from edge_server.fields import View
+from edge_server.live.camera_motion import pose_distance
 
 SEPARATOR = "#"
 # A camera leaving a keyframe replaces its image only within this share of the distance to the next one.
@@ -109,10 +110,8 @@ class Keyframes:
         """Distance of two views, 1 where they become two keyframes; infinite with different lenses."""
         if a.intrinsics != b.intrinsics:
             return np.inf
-        apart_m = float(np.linalg.norm(a.camera_to_world[:3, 3] - b.camera_to_world[:3, 3]))
-        rotation = a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]
-        rotation_deg = float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
-        return max(_share(apart_m, self.config.apart_m), _share(rotation_deg, self.config.apart_deg))
+        apart_m, apart_deg = pose_distance(a.camera_to_world, b.camera_to_world)
+        return max(_share(apart_m, self.config.apart_m), _share(apart_deg, self.config.apart_deg))
 
     @staticmethod
     def _named(view: View, number: int) -> View:

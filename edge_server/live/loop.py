@@ -48,7 +48,7 @@ class UpdateLoop:
     ) -> None:
         self._updater = updater
         self._clock = clock
-        self._update_ms = update_ms
+        self.update_ms = update_ms
         self._grace_ns = round(grace_ms * 1e6)
         self._on_published = on_published
         self._on_status = on_status
@@ -124,7 +124,7 @@ class UpdateLoop:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
-        budget = Budget(seconds=self._update_ms / 1e3)
+        budget = Budget(seconds=self.update_ms / 1e3)
         selection = self._select(budget)
         if selection is None:
             return

@@ -7,18 +7,20 @@ published.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
 
-from edge_server.config import EdgeConfig, embedding_for
+from edge_server.config import EdgeConfig, embedding_for, read_config
+from edge_server.edge_defaults import cameras_move, described
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
 from edge_server.fields import Field, View, checkpoint
@@ -100,7 +102,6 @@ class EdgeServer:
         self, scenario: Scenario, config: EdgeConfig, options: ServerOptions, clock: Clock | None = None
     ) -> None:
         self.scenario = scenario
-        self.config = config
         self.options = options
         self.clock = clock or WallClock()
         self.start_ns = self.clock.now_ns()
@@ -111,14 +112,17 @@ class EdgeServer:
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
-        self.frontier = open_frontier(scenario, config)
-        resumed_updates = 0
-        field = self._make_field()
+        state, about = None, dict[str, Any]()
         if options.resume is not None:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
+        # What moves, in words: nothing yet, or what the earlier run knew.
+        self._moving = str(about.get("moving") or ("a camera" if cameras_move(scenario) else ""))
+        config_if_moving = replace(read_config(scenario, moving=True), policy=config.policy)
+        self.config = config = config_if_moving if about.get("moving") else config
+        self.frontier = open_frontier(scenario, config)
+        field = self._make_field(config)
+        if state is not None:
             field.load_state(state)
-            # Numbers continue, so that a snapshot does not take the name of an earlier one.
-            resumed_updates = max(0, int(about.get("updates", 0)))
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
             (None, "turned off by the scenario (edge.lpips: none)")
@@ -133,7 +137,10 @@ class EdgeServer:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         policy = self.policies.first
         self.updater = open_updater(scenario, config, policy, field, self.start_ns, resumed=options.resume is not None)
-        self.updater.number = resumed_updates
+        # Numbers continue, so that a snapshot does not take the name of an earlier one.
+        self.updater.number = max(0, int(about.get("updates", 0)))
+        if not self._moving:
+            self.updater.watch_cameras(config_if_moving, self._make_field, self._camera_moves)
         self.buffer = self.updater.buffer
         self.recorder: Recorder | None = None
         if options.record is not None:
@@ -174,9 +181,11 @@ class EdgeServer:
             scores=config.scores,
             frontier=self.frontier,
             field_name=config.field,
+            chosen=described(scenario, config, self._moving),
             decision=lambda: self.updater.policy.last_decision,
             embed=None if embedder is None else embedder.embed,
         )
+        log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", asdict(self.frontier))
         self.journal = Journal(options.out, self.status)
 
@@ -285,9 +294,18 @@ class EdgeServer:
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
 
-    def _make_field(self) -> Field:
-        options = {"nice": SERVER_NICE, **self.config.field_options}
-        return make_field(self.config.field, options, seed=self.scenario.seed)
+    def _make_field(self, config: EdgeConfig) -> Field:
+        return make_field(config.field, {"nice": SERVER_NICE, **config.field_options}, seed=self.scenario.seed)
+
+    def _camera_moves(self, config: EdgeConfig, camera: str) -> None:
+        """Follow the updater, which has begun anew because ``camera`` moves."""
+        self.config, self._moving = config, camera
+        self.loop.update_ms = config.update_ms
+        self.state.chosen, self.state.bounds = described(self.scenario, config, camera), None
+        log.info("%s", self.state.chosen)
+        with contextlib.suppress(ValueError):  # the file that a scenario names may know the first choice only
+            self.frontier = self.state.frontier = open_frontier(self.scenario, config)
+            write_json(self.options.out / "frontier.json", asdict(self.frontier))
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:
@@ -308,6 +326,7 @@ class EdgeServer:
         about = {
             "field": self.config.field,
             "options": self.config.field_options,
+            "moving": self._moving,
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,
@@ -341,6 +360,7 @@ class EdgeServer:
             "started_ns": self.start_ns,
             "uptime_s": self.state.now_s(),
             "field": self.config.field,
+            "chosen": self.state.chosen,
             "policy": short_name(self.state.controls.policy),
             "value": self.state.controls.value,
             "paused": self.state.controls.paused,

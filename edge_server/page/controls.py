@@ -43,6 +43,7 @@ class ControlPanel:
         )
         self.value: Any = gui.add_number("value", _finite_or_zero(state.controls.value), min=0.0, step=1.0)
         self.help = gui.add_html("")
+        self.chosen = gui.add_html("", visible=bool(state.chosen))
         self.frontier = gui.add_html("", visible=state.frontier is not None)
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
         self.view = gui.add_dropdown(
@@ -72,6 +73,7 @@ class ControlPanel:
             if self._state.frontier is not None:
                 self.frontier.content = frontier(self._state.frontier, self._state.present())
             self.help.content = _help(controls.policy)
+            self.chosen.content = note(self._state.chosen)
             if self._paused != controls.paused:
                 self._paused = controls.paused
                 self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")

@@ -58,6 +58,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "seed": edge.seed,
         "seconds": seconds,
         "field": edge.field,
+        "chosen": edge.chosen,
         "policy": {"name": edge.policy, "value": edge.value},
         "versions": versions(),
         "machine": machine(),

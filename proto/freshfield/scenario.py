@@ -140,6 +140,8 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     if not isinstance(data, dict):
         raise ScenarioError(f"{file}: expected a mapping with the keys {', '.join(known)}")
     _refuse_unknown(data, known, f"{file}: ")
+    if data.get("edge") is None:  # the edge chooses for itself
+        data = {**data, "edge": {}}
     for key in ("source", "channel", "edge"):
         if not isinstance(data.get(key, {}), dict):
             raise ScenarioError(f"{file}: {key}: expected a mapping")
@@ -169,7 +171,7 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
         description=str(data.get("description", "")),
         source=dict(data.get("source", {})),
         channel=dict(data.get("channel", {})),
-        edge=dict(data.get("edge", {})),
+        edge=dict(data["edge"]),
         phase=found.phase,
     )
 

@@ -84,7 +84,12 @@ def scenario_of(seed: int) -> Scenario:
                 "params": {"supersample": 1},
             },
             "channel": channel,
-            "edge": {"field": field, "field_options": _SMALL[field], "policy": {"name": policy, "value": value}},
+            "edge": {
+                "field": field,
+                "field_options": _SMALL[field],
+                "updates": "cycle",
+                "policy": {"name": policy, "value": value},
+            },
         },
         Path(f"chaos-{seed}.yaml"),
     )

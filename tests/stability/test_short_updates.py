@@ -25,7 +25,7 @@ def _mean_psnr(field: Any, cameras: int, size: int, steps: int, update_ms: float
         "cameras": {"count": cameras, "held_out": ["cam00"]},
         "source": {"kind": "world", "scene": "room", "width": size, "height": size, "fps": 15},
         "channel": {"preset": "ch5"},
-        "edge": {"policy": {"name": "all"}},
+        "edge": {"updates": "cycle"},
     }
     settings = RunSettings(
         steps,

@@ -21,6 +21,7 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
+from edge_server.edge_defaults import FIELD
 from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, command_parser, parse_options
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
@@ -43,7 +44,7 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
   edge-server fit ~/data/kitchen --field splat --holdout cam00 --frame 12
   edge-server fit tower --field splat --seconds 10
   edge-server fit --field splat --list-options
-  edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
+  edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --field ngp --option samples=256
   edge-server fit ~/data/apartment --format eyeful --holdout split
 
 DATA is the folder of a data set, or a synthetic scene: room, tile, tower. The format is found from the files:
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("data", type=Path, nargs="?", metavar="DATA", help="data set (folder or file), or a synthetic scene")
     add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
-    add("--field", default="ngp", metavar="NAME", help=f"representation: {', '.join(field_names())} [%(default)s]")
+    add("--field", metavar="NAME", help=f"representation: {', '.join(field_names())} [{FIELD}]")
     add("--list-options", action="store_true", help="list the options of --field, with defaults, and exit")
     add("--seconds", type=float, default=60.0, metavar="S", help="seconds of fitting [%(default)g]")
     add(
@@ -97,6 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")
     add("--resume", action="store_true", help="continue the fit in OUT, up to --seconds in total")
     args = parser.parse_args(argv)
+    args.chosen = f"{FIELD} without layers: all views are of one instant" if args.field is None else ""
+    args.field = args.field or FIELD
     if args.list_options:
         try:
             known, defaults = option_help(args.field), settings_of(args.field)
@@ -148,6 +151,8 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
     if request.resume:
         run_.load()
     print(run_.headline(), flush=True)
+    if request.chosen:
+        print(request.chosen, flush=True)
     print(f"kernels ready after {model.warm_up():.1f} s", flush=True)
     return run_.go()
 
@@ -287,6 +292,7 @@ class _Run:
         return {
             **self._about(),
             "kind": "fit",
+            "chosen": self.request.chosen or None,
             "data": {
                 "file": d.file.name,
                 "instant": d.instant,

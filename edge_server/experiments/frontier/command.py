@@ -17,6 +17,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
+from edge_server.edge_defaults import FIELD
 from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
 from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
 from edge_server.experiments.frontier import effort_sweep, update_time
@@ -140,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--holdout", default="8", metavar="K|NAME,...", help="views of a data set to test on, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes of a data set by K [%(default)g]")
     add("--frame", type=int, default=0, metavar="N", help="frame of a moving data set, from 0 [%(default)s]")
-    add("--field", metavar="NAME,...|all", default="ngp", help="representations [%(default)s]")
+    add("--field", metavar="NAME,...|all", default=FIELD, help="representations [%(default)s]")
     add(
         "--option",
         action="append",

@@ -109,6 +109,7 @@ class Trial:
             "field": self.field,
             "field_options": self.field_options,
             "policy": {"name": self.policy, "value": self.value},
+            "updates": "cycle",  # as in the thesis
             "noisy_truth": edge.get("noisy_truth", False),
             "lpips": edge.get("lpips", "alex"),
         }

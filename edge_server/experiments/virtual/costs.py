@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import ComputeConfig, read_config
+from edge_server.config import ComputeConfig, EdgeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings
@@ -80,8 +80,7 @@ def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dic
     scenario = dataclasses.replace(
         scenario, edge={**scenario.edge, "policy": {"name": "all"}, "compute": "zero", "embedding": None}
     )
-    most = read_config(scenario).steps
-    rows = np.concatenate([_timed(scenario, max(1, round(share * most)), seconds, data) for share in _SHARES])
+    rows = np.concatenate([_timed(scenario, share, seconds, data) for share in _SHARES])
     compute = fitted(rows)
     return {
         "compute": dataclasses.asdict(compute),
@@ -145,12 +144,20 @@ class UpdateCosts:
         return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
 
 
-def _timed(scenario: Scenario, steps: int, seconds: float, data: Path | None) -> NDArray[np.float64]:
-    """Steps, frames taken in and milliseconds of the updates of a run, (n, 3)."""
-    settings = RunSettings(steps=steps, epoch_ms=_EPOCH_MS, score_every_ms=None)
-    deployment = build_deployment(scenario, settings, data=data)
-    updates, fit = deployment.updates, deployment.updates.fit
+def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) -> NDArray[np.float64]:
+    """Steps, frames taken in and milliseconds of the updates of a run, (n, 3). share: of the scenario's
+    steps."""
+
+    def settings(edge: EdgeConfig) -> RunSettings:
+        return RunSettings(steps=max(1, round(share * edge.steps)), epoch_ms=_EPOCH_MS, score_every_ms=None)
+
+    def camera_moves(edge: EdgeConfig, camera: str) -> None:
+        rows.clear()  # of a field that it will not have
+        deployment.settings = settings(edge)
+
     rows: list[tuple[float, float, float]] = []
+    deployment = build_deployment(scenario, settings(read_config(scenario)), data=data, on_motion=camera_moves)
+    updates, fit = deployment.updates, deployment.updates.fit
 
     def timed(selection: Any, budget: Any) -> Any:
         before_s, began_s = beside_s(updates.field), time.perf_counter()

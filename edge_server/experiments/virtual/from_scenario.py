@@ -14,6 +14,7 @@ from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.config import channel_from_mapping
 from edge_server.config import EdgeConfig, read_config
+from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
@@ -41,6 +42,7 @@ def build_deployment(
     on_published: Callable[[Publication], None] | None = None,
     truth: Truth | None = None,
     embedder: Embedder | None = None,
+    on_motion: Callable[[EdgeConfig, str], None] | None = None,
 ) -> VirtualDeployment:
     """Build the deployment of ``scenario`` in virtual time, with the scenario's seed.
 
@@ -52,6 +54,8 @@ def build_deployment(
     on_published: called with each publication.
     truth: result of ``build_truth``, to share it between runs; None builds it.
     embedder: to share it between runs; None: as the scenario says.
+    on_motion: makes the deployment begin anew once a camera is seen to move, with a field for moving cameras;
+    called then with the configuration and the camera.
     Raises ScenarioError or DatasetError.
     """
     edge = read_config(scenario)
@@ -62,10 +66,13 @@ def build_deployment(
         field = field or _field(edge, scenario.seed)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+    updater = open_updater(scenario, edge, policy, field, start_ns=0, embedder=embedder)
+    if on_motion is not None and not cameras_move(scenario):
+        updater.watch_cameras(read_config(scenario, moving=True), lambda new: _field(new, scenario.seed), on_motion)
     return VirtualDeployment(
         cameras or training_cameras(scenario, data),
         channel,
-        open_updater(scenario, edge, policy, field, start_ns=0, embedder=embedder),
+        updater,
         settings,
         scenario.seed,
         truth or build_truth(scenario, source, edge, scorer or Scorer(), data),

@@ -16,6 +16,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, EdgeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.edge_defaults import cameras_move, described
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.common.result_store import processor
 from edge_server.experiments.common.tables import mean_or_none, number
@@ -56,14 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         scenario = _scenario(args)
         config = read_config(scenario)
-        settings = RunSettings(
-            steps=config.steps if args.steps is None else args.steps,
-            compute=config.compute,
-            epoch_ms=_epoch_ms(config) if args.epoch_ms is None else args.epoch_ms,
-            grace_ms=config.grace_ms,
-            score_every_ms=_SCORED_EVERY_MS,
-            shown_every_ms=_SCORED_EVERY_MS,
-        )
+        chosen = described(scenario, config, "a camera" if cameras_move(scenario) else "")
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(folders.lpips, cast(Network, config.lpips))
@@ -74,14 +68,29 @@ def main(argv: Sequence[str] | None = None) -> int:
             if decisions is not None:
                 decisions.record(deployment.updates.policy, publication.number)
 
-        deployment = build_deployment(scenario, settings, scorer=scorer, data=folders.data, on_published=published)
+        def camera_moves(new: EdgeConfig, camera: str) -> None:
+            nonlocal chosen
+            deployment.settings, chosen = _settings(new, args), described(scenario, new, camera)
+            if not args.json:
+                print(chosen, flush=True)
+
+        if not args.json:
+            print(chosen, flush=True)
+        deployment = build_deployment(
+            scenario,
+            _settings(config, args),
+            scorer=scorer,
+            data=folders.data,
+            on_published=published,
+            on_motion=camera_moves,
+        )
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         _run(deployment, args.seconds, quiet=args.json)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
         return 2
-    found = summary(scenario, settings, deployment, args.seconds)
+    found = {**summary(scenario, deployment, args.seconds), "chosen": chosen}
     if missing:
         found["lpips_missing"] = missing
     if args.out is not None:
@@ -90,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def summary(scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float) -> dict[str, Any]:
+def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -> dict[str, Any]:
     """A run's frame counts, means over its last fifth, and a digest for comparing runs, as plain values.
 
     last_fifth: scores at publication, the thesis's measure. shown: scores of the images at random instants.
@@ -104,8 +113,8 @@ def summary(scenario: Scenario, settings: RunSettings, deployment: VirtualDeploy
         "seconds": seconds,
         "policy": deployment.updates.policy.name,
         "value": deployment.updates.policy.value,
-        "steps": settings.steps,
-        "compute": dataclasses.asdict(settings.compute),
+        "steps": deployment.settings.steps,
+        "compute": dataclasses.asdict(deployment.settings.compute),
         "updates": len(publications),
         "frames": deployment.frames(),
         "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
@@ -188,6 +197,17 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     if not 0.0 < args.seconds <= 1e6:
         raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {args.seconds:g}")
     return dataclasses.replace(scenario, edge=edge)
+
+
+def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
+    return RunSettings(
+        steps=config.steps if args.steps is None else args.steps,
+        compute=config.compute,
+        epoch_ms=_epoch_ms(config) if args.epoch_ms is None else args.epoch_ms,
+        grace_ms=config.grace_ms,
+        score_every_ms=_SCORED_EVERY_MS,
+        shown_every_ms=_SCORED_EVERY_MS,
+    )
 
 
 def _epoch_ms(config: EdgeConfig) -> float:

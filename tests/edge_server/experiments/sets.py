@@ -14,7 +14,7 @@ from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
 
 # Enough of a field to learn a small scene in a second; results do not depend on threads.
 SMALL: dict[str, Any] = {"levels": 4, "log2_table": 12, "batch_samples": 8192, "rays": 2048, "samples": 64}
-SMALL_WORDS = [word for key, value in SMALL.items() for word in ("--option", f"{key}={value}")]
+SMALL_WORDS = ["--field", "ngp"] + [word for key, value in SMALL.items() for word in ("--option", f"{key}={value}")]
 
 
 def write_photos(folder: Path, count: int = 9, size: int = 32, alpha: bool = False) -> Path:

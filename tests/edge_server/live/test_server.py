@@ -37,7 +37,7 @@ def tiny_scenario(tmp_path, held_out=("cam00",), **edge):
         "name": "tiny",
         "seed": 3,
         "cameras": {"count": 3, "held_out": list(held_out)},
-        "edge": {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none", **edge},
+        "edge": {"field": "ngp", "field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none", **edge},
     }
     return scenario.parse(data, tmp_path / "tiny.yaml")
 
@@ -45,8 +45,9 @@ def tiny_scenario(tmp_path, held_out=("cam00",), **edge):
 class Feed(threading.Thread):
     """Streams real frames of every camera, one unacknowledged at a time, until stopped."""
 
-    def __init__(self, port: int, cameras, held_out, transport: Transport | None = None) -> None:
+    def __init__(self, port: int, cameras, held_out, transport: Transport | None = None, moving: str = "") -> None:
         super().__init__(daemon=True)
+        self.moving = moving
         self.cameras, self.held_out = cameras, held_out
         self.transport = transport or Transport()
         self.channel = self.transport.channel(f"127.0.0.1:{port}")
@@ -59,7 +60,8 @@ class Feed(threading.Thread):
             for camera in self.cameras:
                 if self.done.wait(0.01):
                     return
-                eye = [2 * np.cos(angle[camera]), 2 * np.sin(angle[camera]), 0.5]
+                turned = angle[camera] + 0.1 * sequence * (camera == self.moving)
+                eye = [2 * np.cos(turned), 2 * np.sin(turned), 0.5]
                 image = np.full((24, 32, 3), 90, np.uint8)
                 image[6:18, 10:22] = (200, 40 + sequence % 100, 30)
                 yield wire.to_request(
@@ -194,6 +196,29 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
     decisions.cancel()
     feed.stop()
     channel.close()
+
+
+def test_a_camera_that_moves_begins_the_field_anew_with_keyframes_and_a_resumed_run_knows_it(serve, tmp_path):
+    small = {"gaussians": 300, "start": 200, "seed_cells": 12}
+    made = tiny_scenario(tmp_path, field="splat", field_options=small)
+    server, port, thread = serve(made)
+    assert server.state.chosen == (
+        "splat in layers, updated at arrivals for 100 ms: no camera moves; the scenario sets field, update_ms"
+    )
+    feed = Feed(port, made.cameras, made.held_out, moving="cam02")
+    feed.start()
+    until(lambda: "cam02 moves" in server.state.chosen)
+    moved = server.updater.number
+    until(lambda: server.updater.number > moved + 1)
+    assert server.updater.keyframes is not None and not server.updater.on_arrivals
+    assert not server.updater.field.frame_s and server.loop.update_ms == 100.0
+    feed.stop()
+    server.stop()
+    thread.join(20)
+    status = json.loads((tmp_path / "out" / "edge.json").read_text())
+    assert status["chosen"].startswith("splat with keyframes, updated in a cycle for 100 ms: cam02 moves")
+    again, _, _ = serve(made, resume=tmp_path / "out" / "field.npz")
+    assert again.state.chosen == status["chosen"] and again.updater.keyframes is not None
 
 
 def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):

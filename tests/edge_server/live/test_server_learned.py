@@ -27,7 +27,7 @@ from tests.ports import free_port
 def server_of(tmp_path, layout, embedding=True, port=None):
     Learner(Spec("select", layout), 1).save(tmp_path / "policy.npz")
     detector(tmp_path / "d.onnx")
-    edge = {"field_options": TINY, "update_ms": 50, "grace_ms": 500, "lpips": "none"}
+    edge = {"field": "ngp", "field_options": TINY, "update_ms": 50, "grace_ms": 500, "lpips": "none"}
     edge["policy"] = {"name": "bandit:policy.npz"}
     if embedding:
         edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS, "provider": "cpu"}

@@ -144,6 +144,17 @@ def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
     assert panel.policy.value == "bandit:p.npz"
 
 
+def test_what_was_chosen_is_a_line_among_the_controls():
+    state = replace(bare_state(), chosen="splat in layers: no camera moves")
+    gui = MagicMock()
+    for kind in (gui.add_number, gui.add_html):
+        kind.side_effect = lambda *words, **more: MagicMock()
+    panel = ControlPanel(MagicMock(gui=gui), state)
+    state.chosen = "splat with keyframes: cam01 moves"
+    panel.refresh()
+    assert "cam01 moves" in panel.chosen.content
+
+
 def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():
     state = bare_state()
     assert state.present() is None

@@ -334,3 +334,12 @@ def test_the_stand_in_distance_is_never_shown_as_lpips(tmp_path, monkeypatch):
         row["perceptual"], row["lpips"] = row["lpips"], None
     assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "fidelity.png")
     assert [label for label in labels if "LPIPS" in label] == ["perceptual, not LPIPS (lower is better)"]
+
+
+def test_what_was_chosen_and_why_is_said(tmp_path):
+    write_run(tmp_path)
+    assert build_report(tmp_path)["chosen"] is None
+    edge = json.loads((tmp_path / "edge.json").read_text())
+    (tmp_path / "edge.json").write_text(json.dumps({**edge, "chosen": "splat in layers: no <camera> moves"}))
+    assert build_report(tmp_path)["chosen"] == "splat in layers: no <camera> moves"
+    assert "no &lt;camera&gt; moves" in (tmp_path / "report.html").read_text()

@@ -180,7 +180,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     if quick:
         if quick not in field_names():
             raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {quick!r}")
-        edge["field"] = quick
+        edge["field"], edge["updates"] = quick, "cycle"
         edge["field_options"] = {"effort": "low"} if quick in ("splat", "ngp") else {}
     if args.distance == "perceptual":
         edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})

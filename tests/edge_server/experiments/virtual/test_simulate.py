@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout
 from freshfield.scenario import ScenarioError, load, parse
-from tests.edge_server.experiments.sets import SMALL
+from tests.edge_server.experiments.sets import SMALL, write_photos
 
 
 def write(tmp_path: Path, **edge: Any) -> Path:
@@ -63,10 +64,9 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
 
 def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
     Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
-    out, file = tmp_path / "out", write(tmp_path, learn={})
+    out, file = tmp_path / "out", write(tmp_path)
     words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]
     assert main([str(file), *words]) == 0
-    assert "in virtual time nobody learns" in capsys.readouterr().err
     lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     for number in (0, lines[-1]["number"]):
         decided = read_decision(out, number).decision
@@ -164,3 +164,23 @@ def test_costs_are_told_apart():
 def test_an_arm_keeps_real_time():
     with pytest.raises(ScenarioError, match=r"cell.yaml: source: .* cannot be run in virtual time"):
         training_cameras(load("cell"))
+
+
+def test_cameras_that_are_seen_to_move_get_keyframes_and_the_reason_is_said(tmp_path: Path, capsys):
+    write_photos(tmp_path / "set", 19)
+    data = {
+        "name": "photos",
+        "seed": 3,
+        "cameras": {"count": 4, "held_out": ["cam00"]},
+        "source": {"kind": "transforms", "data": str(tmp_path / "set"), "fps": 10},
+        "edge": {"lpips": "none", "grace_ms": 0.0},
+    }
+    (path := tmp_path / "photos.yaml").write_text(json.dumps(data))
+    assert main([str(path), "--seconds", "3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert re.fullmatch(r"splat with keyframes, updated in a cycle for 800 ms: cam0[123] moves", found["chosen"])
+    assert found["steps"] == 100
+    path.write_text(json.dumps({**data, "edge": {**data["edge"], "field_options": {"layers": True}}}))
+    assert main([str(path), "--seconds", "3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["chosen"].startswith("splat in layers, updated at arrivals for 20 ms") and found["steps"] == 10

@@ -28,7 +28,7 @@ RAW: dict[str, Any] = {
         "params": {"supersample": 1},
     },
     "channel": {"preset": "ch5"},
-    "edge": {"field": "splat", "field_options": FIELD, "lpips": "none"},
+    "edge": {"field": "splat", "field_options": FIELD, "updates": "cycle", "lpips": "none"},
 }
 
 

@@ -1,0 +1,70 @@
+"""Notices that a camera moves, from the poses that its frames report.
+
+Noise of poses is no motion, nor is a single wrong pose, nor that a camera is knocked or calibrated anew: then
+it stands still somewhere else. So a camera moves if it has left the place where it stood twice, each time by
+more than ``APART_M`` or ``APART_DEG``, in two frames in a row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+
+APART_M = 0.03
+APART_DEG = 5.0
+_MOVES = 2  # places that a camera leaves until it counts as moving
+_IN_A_ROW = 2  # frames away from a place until the camera has left it
+
+
+def pose_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance in meters and angle in degrees of two poses, camera to world (4, 4)."""
+    apart_m = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1.0) / 2.0
+    return apart_m, float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+@dataclass
+class _Place:
+    """Where a camera stands, the instant of its newest frame, how many frames in a row were taken elsewhere,
+    and how many places it has left."""
+
+    pose: NDArray[np.float64]
+    newest_ns: int
+    away: int = 0
+    left: int = 0
+
+
+class CameraMotion:
+    """Follows the poses of all cameras; memory is one pose a camera."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, _Place] = {}
+
+    def moving(self, views: Iterable[View]) -> str | None:
+        """Take in the poses of views, each camera's in the order of capture (older ones are ignored). Returns
+        a camera that moves; None as long as none is known to."""
+        for view in views:
+            place = self._places.get(view.camera)
+            if place is None:
+                self._places[view.camera] = _Place(view.camera_to_world, view.generated_ns)
+            elif view.generated_ns > place.newest_ns and self._leaves(place, view):
+                return view.camera
+        return None
+
+    @staticmethod
+    def _leaves(place: _Place, view: View) -> bool:
+        """Whether the camera has now left as many places as one that moves."""
+        place.newest_ns = view.generated_ns
+        if np.array_equal(place.pose, view.camera_to_world):  # most cameras; quicker than a distance
+            place.away = 0
+            return False
+        apart_m, apart_deg = pose_distance(place.pose, view.camera_to_world)
+        place.away = place.away + 1 if apart_m > APART_M or apart_deg > APART_DEG else 0
+        if place.away == _IN_A_ROW:
+            place.pose, place.away, place.left = view.camera_to_world, 0, place.left + 1
+        return place.left >= _MOVES
