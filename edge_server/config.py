@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from edge_server.edge_defaults import CYCLE, FIELD, cameras_move, with_defaults
+from edge_server.edge_defaults import CHOSEN, CYCLE, FIELD, cameras_move, with_defaults
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario, ScenarioError, read_section
@@ -155,6 +155,24 @@ class EdgeConfig:
             raise ValueError(f"lpips: expected alex, squeeze or none, got {self.lpips!r}")
         if unknown := set(self.metrics) - {"perceptual"}:
             raise ValueError(f"metrics: expected perceptual, got {', '.join(sorted(unknown))}")
+
+
+def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:
+    """One line for people: how the edge works, and why.
+
+    config: the scenario's, with defaults.
+    moving: what moves, such as a camera's name; empty: nothing.
+    """
+    layers = " in layers" if config.field_options.get("layers") else ""
+    keyframes = " with keyframes" if config.keyframes is not None else ""
+    pace = "at arrivals" if config.updates == "arrivals" else "in a cycle"
+    line = f"{config.field}{layers}{keyframes}, updated {pace} for {config.update_ms:g} ms"
+    options = scenario.edge.get("field_options") or {}
+    given = [key for key in CHOSEN if key in scenario.edge or key in options]
+    open_keys = {"layers", "updates", "keyframes"} - set(given)
+    why = [f"{moving} moves" if moving else "no camera moves"] if open_keys else []
+    why += [f"the scenario sets {', '.join(given)}"] if given else []
+    return f"{line}: {'; '.join(why)}"
 
 
 def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import cv2
 import numpy as np
 
-from edge_server.config import EdgeConfig, embedding_for, read_config
-from edge_server.edge_defaults import cameras_move, described
+from edge_server.config import EdgeConfig, described, embedding_for, read_config
+from edge_server.edge_defaults import cameras_move
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
 from edge_server.fields import Field, View, checkpoint

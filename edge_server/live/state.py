@@ -130,7 +130,7 @@ class EdgeState:
     embed: embeds images as that policy does, on any thread; None where nothing is embedded.
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     frontier: what accuracy costs in time, as measured.
-    chosen: how the edge works and why, in one line (``edge_defaults.described``).
+    chosen: how the edge works and why, in one line (``config.described``).
     bounds: world box (2, 3) in meters of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.

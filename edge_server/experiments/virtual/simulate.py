@@ -15,8 +15,8 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import ComputeConfig, EdgeConfig, PolicyConfig, embedding_for, read_config
-from edge_server.edge_defaults import cameras_move, described
+from edge_server.config import ComputeConfig, EdgeConfig, PolicyConfig, described, embedding_for, read_config
+from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.common.result_store import processor
 from edge_server.experiments.common.tables import mean_or_none, number
