@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu.model import ages, faults, spelling
-from channel_emu.model.config import ChannelConfig, channel_from_mapping, spelled_out
+from channel_emu.model import ages, faults, notation
+from channel_emu.model.config import ChannelConfig, channel_from_mapping, from_notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import FROM_FILES, PRESETS
 from freshfield import scenario, transport
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "to" in args:
             args.to = transport.peer("--to", args.to)
         return args.go(args)
-    # ValueError: a scenario, a spelling, a transport option, a trace. OSError: a path, an address.
+    # ValueError: a scenario, its notation, a transport option, a trace. OSError: a path, an address.
     except (ValueError, OSError) as error:
         print(f"channel-emu: {error}", file=sys.stderr)
         return 2
@@ -204,9 +204,8 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
         "--service",
         metavar="SPEC",
         help="delay: none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-        "lognormal:60ms:SIGMA, trace:FILE; by state exp:30ms,exp:60ms",
+        "lognormal:60ms:SIGMA, trace:FILE; a mean for each state: exp:30ms,exp:60ms",
     )
-    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="--service for each state: exp:30ms,exp:60ms")
     sub.add_argument(
         "--fault",
         metavar="NAME:VALUE",
@@ -272,8 +271,6 @@ def _simulate(args: argparse.Namespace) -> int:
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
     """The channel that the options of ``_add_channel_options`` describe; they override the preset or the
     scenario's section."""
-    if args.service and args.service_by_state:
-        raise spelling.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
     folder = Path()
     if args.scenario:
@@ -281,17 +278,15 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         section, folder = dict(plan.channel), plan.path.parent
     for key in ("arrivals", "service", "chain", "service_state", "discipline"):
         if value := vars(args)[key]:
-            section[key] = spelled_out(key, value)
-    if args.service_by_state:
-        section["service"] = spelled_out("service", args.service_by_state)
+            section[key] = from_notation(key, value)
     if args.fault:
         section["faults"] = dict(section.get("faults") or {})
         for text in args.fault:
-            section["faults"] |= spelling.fault(text)
+            section["faults"] |= notation.fault(text)
     if args.shared_server:
         section["server"] = {"shared": True}
     if vars(args).get("spread"):  # only simulate has it
-        section["arrivals"] = {**(spelled_out("arrivals", section.get("arrivals")) or {}), "spread": True}
+        section["arrivals"] = {**(from_notation("arrivals", section.get("arrivals")) or {}), "spread": True}
     return channel_from_mapping(section, "channel", folder)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from channel_emu.model.chain import Chain, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.nanoseconds import to_ns
-from channel_emu.model.spelling import SpellingError, rate_per_ms, span_ms
+from channel_emu.model.notation import NotationError, rate_per_ms, span_ms
 
 Instants = NDArray[np.int64]
 
@@ -203,17 +203,17 @@ def measure(text: str, saw: Sawtooth, seed: int, camera: str) -> float | None:
     """Evaluate a metric given as on the command line, such as ``query:100ms``.
 
     saw: the deliveries of ``camera``. seed: of the run; with ``camera`` it fixes the sender's process.
-    Returns ms, None if nothing arrived. Raises SpellingError for an unknown metric or a bad value.
+    Returns ms, None if nothing arrived. Raises NotationError for an unknown metric or a bad value.
     """
     name, *words = text.split(":")
     if name not in METRICS:
-        raise SpellingError(f"metric {text!r}: expected one of {', '.join(METRICS)}")
+        raise NotationError(f"metric {text!r}: expected one of {', '.join(METRICS)}")
     metric = METRICS[name]
     try:
         values = [read(word) for read, word in zip(metric.values, words, strict=True)]
         return metric.of(saw, *values, *([CounterRng(seed, camera, f"age.{name}")] if metric.drawn else []))
     except ValueError:
-        raise SpellingError(f"metric {text!r}: {metric.about}") from None
+        raise NotationError(f"metric {text!r}: {metric.about}") from None
 
 
 class RunningAge:

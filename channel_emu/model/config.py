@@ -27,8 +27,8 @@ from channel_emu.model.chain import (
 )
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.notation import section
 from channel_emu.model.presets import preset
-from channel_emu.model.spelling import section
 from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
 
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -121,7 +121,7 @@ class ChainConfig(Settings, frozen=True):
 class ServiceConfig(Settings, frozen=True):
     """The distribution of service times: how long the link takes to transmit a frame.
 
-    mean_ms: of every law but none and trace.
+    law: of the delays. mean_ms: of all but none and trace.
     shape: the coefficient of variation is 1/sqrt(shape).
     delays_ms: used in turn and repeated from the start after the last.
     """
@@ -133,7 +133,7 @@ class ServiceConfig(Settings, frozen=True):
     delays_ms: Annotated[list[NotNegative], Meta(min_length=1, description="of trace")] | None = None
 
     def __post_init__(self) -> None:
-        _belongs("mean_ms", self.mean_ms, self.law not in ("none", "trace"), "a law with a mean")
+        _belongs("mean_ms", self.mean_ms, self.law not in ("none", "trace"), "a distribution with a mean")
         _belongs("shape", self.shape, self.law == "gamma", "law gamma")
         _belongs("sigma", self.sigma, self.law == "lognormal", "law lognormal")
         _belongs("delays_ms", self.delays_ms, self.law == "trace", "law trace")
@@ -229,7 +229,7 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
 
     Keys beside ``preset`` override the preset's. Mappings are merged key by key, but one that names another
     process or law replaces the preset's as a whole. ``arrivals``, ``service`` and ``chain`` may be written as
-    on the command line (``spelling``), and a fault as the value of its first parameter.
+    on the command line (``notation``), and a fault as the value of its first parameter.
 
     where: what error messages call the section. folder: what file names in the section are relative to.
     Raises ScenarioError (a ValueError), one line that names the key.
@@ -244,10 +244,10 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
     except ValueError as error:
         raise ScenarioError(f"{where}.preset: {error}") from None
     for key, value in mapping.items():
-        value = spelled_out(key, value, where, folder)
-        base = spelled_out(key, merged.get(key))
+        value = from_notation(key, value, where, folder)
+        base = from_notation(key, merged.get(key))
         merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
-    merged = {key: spelled_out(key, value) for key, value in merged.items()} | {"preset": name}
+    merged = {key: from_notation(key, value) for key, value in merged.items()} | {"preset": name}
     faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
     config = read_settings(ChannelConfig, merged, where)
     try:
@@ -256,8 +256,8 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
         raise ScenarioError(f"{where}: {error}") from None
 
 
-def spelled_out(key: Any, value: Any, where: str = "channel", folder: Path = Path()) -> Any:
-    """The value of a key of the section, with a short spelling (``exp:60ms``) replaced by its mapping.
+def from_notation(key: Any, value: Any, where: str = "channel", folder: Path = Path()) -> Any:
+    """The value of a key of the section, in the short notation (``exp:60ms``) replaced by its mapping.
 
     Other values are returned unchanged. Raises ScenarioError.
     """

@@ -47,7 +47,7 @@ class Simulation:
         """Results as plain values, as the command prints them with --json.
 
         metrics: further age metrics (see ``ages.measure``), each averaged over the cameras that have a value.
-        Raises SpellingError for an unknown one.
+        Raises NotationError for an unknown one.
         """
         saws = [run.sawtooth() for run in self.runs]
         delays = np.concatenate([run.delays_ms() for run in self.runs])

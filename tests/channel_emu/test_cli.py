@@ -12,7 +12,7 @@ import grpc
 import pytest
 
 from channel_emu.cli import main
-from channel_emu.model import spelling
+from channel_emu.model import notation
 from channel_emu.model.presets import PRESETS
 from freshfield import ledger
 from freshfield.transport import Transport
@@ -35,12 +35,12 @@ def simulate(capsys, *words: str) -> dict:
     return json.loads(capsys.readouterr().out)
 
 
-def test_simulate_takes_short_spellings(capsys) -> None:
+def test_simulate_takes_the_short_notation(capsys) -> None:
     found = simulate(
         capsys,
         "--arrivals",
         "periodic:30ms",
-        "--service-by-state",
+        "--service",
         "exp:30ms,exp:60ms",
         "--chain",
         "mu1=1/30,mu2=1/30",
@@ -83,7 +83,7 @@ def test_simulate_takes_short_spellings(capsys) -> None:
 def test_a_chain_of_any_number_of_states(capsys) -> None:
     found = simulate(
         capsys,
-        "--service-by-state",
+        "--service",
         "exp:5ms,exp:20ms,exp:80ms",
         "--seconds",
         "3000",
@@ -166,14 +166,14 @@ def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)])
 def test_spans(text: str, value: float) -> None:
-    assert spelling.span_ms(text) == pytest.approx(value)
+    assert notation.span_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
     ("text", "value"), [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)]
 )
 def test_rates(text: str, value: float) -> None:
-    assert spelling.rate_per_ms(text) == pytest.approx(value)
+    assert notation.rate_per_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,8 @@ def test_rates(text: str, value: float) -> None:
         (["--arrivals", "poisson:1/0ms"], "is not a rate"),
         (["--service", "exp"], "expected exp:60ms"),
         (["--service", "gamma:60ms:big"], "expected exp:60ms"),
-        (["--service-by-state", "exp:30ms,det:60ms"], "expected one law"),
-        (["--service", "exp:1ms", "--service-by-state", "exp:1ms,exp:2ms"], "exclude each other"),
-        (["--service-by-state", "exp:1ms,exp:2ms"], "there is no chain"),
+        (["--service", "exp:30ms,det:60ms"], "expected one distribution"),
+        (["--service", "exp:1ms,exp:2ms"], "there is no chain"),
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--chain", "mu3=1"], "expected mu1="),
         (["--chain", "{generator_per_ms: [[-1, 1]"], "not a mapping; write {generator_per_ms"),
@@ -338,7 +337,7 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
 
 
 def test_bare_mmpp_is_the_thesiss() -> None:
-    assert spelling.arrivals("mmpp") == spelling.arrivals("mmpp:1/120ms,1/30ms")
+    assert notation.arrivals("mmpp") == notation.arrivals("mmpp:1/120ms,1/30ms")
 
 
 def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Path, tmp_path: Path) -> None:

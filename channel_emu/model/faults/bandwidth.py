@@ -15,7 +15,7 @@ class Params(Settings, frozen=True):
     megabits_per_s: Annotated[float, within(1e-9, math.inf, "rate of the line")]
 
 
-class Effect(Fault):
+class Bandwidth(Fault):
     by_size = True
 
     def __init__(self, params: Params, seed: int, camera: str) -> None:

@@ -30,7 +30,7 @@ class Params(Settings, frozen=True):
             raise ValueError("expected windows_ms, or every_ms with for_ms")
 
 
-class Effect(Fault):
+class Blackout(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.windows_ns = [(to_ns(a), to_ns(b)) for a, b in params.windows_ms]
         self.every_ns = to_ns(params.every_ms) if params.every_ms is not None else 0

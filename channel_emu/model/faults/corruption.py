@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from channel_emu.model.faults import ChanceFault, ChanceParams
+from channel_emu.model.faults import chance
 from channel_emu.model.link import Transit
 from freshfield.settings import within
 
 
-class Params(ChanceParams, frozen=True):
+class Params(chance.Params, frozen=True):
     count: Annotated[int, within(1, 1000, "bytes to damage in a frame that is hit")] = 1
 
 
-class Effect(ChanceFault):
+class Corruption(chance.ChanceFault):
     purpose = "channel.corruption"
 
     def flips(self, transit: Transit) -> tuple[tuple[float, int], ...]:

@@ -22,7 +22,7 @@ class Params(Settings, frozen=True):
             raise ValueError("opportunities_ms: expected ascending instants, the last of them above 0")
 
 
-class Effect(Fault):
+class Mahimahi(Fault):
     """A frame is delivered with the last packet that it needs. Unused bytes of an opportunity are lost, and a
     preempted frame does not give its opportunities back."""
 

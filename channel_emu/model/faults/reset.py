@@ -27,7 +27,7 @@ class Params(Settings, frozen=True):
             raise ValueError("expected either mean_interval_ms or at_ms")
 
 
-class Effect(Fault):
+class Reset(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.mean_ns = None if params.mean_interval_ms is None else params.mean_interval_ms * 1e6
         self.at_ns = sorted({to_ns(at) for at in params.at_ms})

@@ -7,7 +7,7 @@ import pytest
 
 from channel_emu.model import ages
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.spelling import SpellingError
+from channel_emu.model.notation import NotationError
 from channel_emu.virtual.simulate import simulate
 from tests.channel_emu.model import exact_forms as exact
 
@@ -64,7 +64,7 @@ def test_age_of_incorrect_information_of_poisson_updates(rate: float, away: floa
         assert found == near(away / (2 * away + rate) / (away + rate))
 
 
-def test_a_source_that_is_spelled_out() -> None:
+def test_a_source_that_is_from_notation() -> None:
     """The metric draws its source itself, another one for each seed."""
     once = metric("incorrect:0.3:0.3", 20, arrivals="poisson:1")
     assert once == pytest.approx(exact.incorrect_without_delay(1.0, 0.3, 0.3), rel=0.15)
@@ -148,5 +148,5 @@ def test_what_is_computed_beyond_the_end_is_not_shown() -> None:
 )
 def test_a_metric_that_cannot_be_read(text: str) -> None:
     saw = ages.Sawtooth(np.array([5]) * MS, np.array([2]) * MS, 15 * MS)
-    with pytest.raises(SpellingError, match=f"metric '{text}'"):
+    with pytest.raises(NotationError, match=f"metric '{text}'"):
         ages.measure(text, saw, 0, "cam00")

@@ -135,7 +135,7 @@ def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) 
         ("{preset: 'mahimahi:a.trace'}", "{discipline: fcfs, faults: {mahimahi: {opportunities_ms: [0, 2, 2, 10]}}}"),
     ],
 )
-def test_short_spellings_stand_for_sections(tmp_path: Path, short: str, long: str) -> None:
+def test_the_short_notation_stands_for_sections(tmp_path: Path, short: str, long: str) -> None:
     """Files are relative to the given folder; the preset's name alone may differ."""
     (tmp_path / "delays.csv").write_text("# a link\ntime_s,delay_us\n0.1,1500\n0.2,20000\n0.3,3000\n")
     (tmp_path / "a.trace").write_text("0\n2\n2\n10\n")
@@ -169,7 +169,7 @@ def test_a_profile_of_errant(tmp_path: Path) -> None:
 
 
 def test_only_listed_faults_are_imported() -> None:
-    names = [f"channel_emu.model.faults.{name}" for name in NAMES]
+    names = [f"channel_emu.model.faults.{name}" for name in (*NAMES, "chance")]
     kept = {name: sys.modules.pop(name) for name in names if name in sys.modules}
     try:
         from channel_emu.model.channel import Channel
@@ -177,6 +177,6 @@ def test_only_listed_faults_are_imported() -> None:
         Channel(read("preset: ch5"), 0).link("a")
         assert not [name for name in names if name in sys.modules]
         Channel(read("faults: {loss: {probability: 0.5}}"), 0).link("a")
-        assert [name for name in names if name in sys.modules] == ["channel_emu.model.faults.loss"]
+        assert [name for name in names if name in sys.modules] == ["channel_emu.model.faults.chance"]
     finally:
         sys.modules.update(kept)

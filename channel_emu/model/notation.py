@@ -12,7 +12,7 @@ from typing import Any
 from freshfield.untrusted import UntrustedError, read_json, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
-_LAWS = {
+_DISTRIBUTIONS = {
     "exp": "exponential",
     "det": "deterministic",
     "gamma": "gamma",
@@ -24,24 +24,24 @@ _MAX_CHARS = 2**26  # in a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
 
-class SpellingError(ValueError):
+class NotationError(ValueError):
     """Text in the short notation that is invalid; the message says what was expected."""
 
 
 def span_ms(text: str) -> float:
-    """Parse ``30ms``, ``3s``, ``2min``, ``250us`` or a bare number of ms. Raises SpellingError."""
+    """Parse ``30ms``, ``3s``, ``2min``, ``250us`` or a bare number of ms. Raises NotationError."""
     found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(us|ms|s|min)?\s*", text)
     try:
         value = float(found[1]) * _UNITS_MS[found[2] or ""] if found else math.nan
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
-        raise SpellingError(f"{text!r} is not a span of time: expected something like 30ms or 3s")
+        raise NotationError(f"{text!r} is not a span of time: expected something like 30ms or 3s")
     return value
 
 
 def rate_per_ms(text: str) -> float:
-    """Parse ``1/30ms``, ``1/30``, ``0.033/ms``, ``5/s`` or a bare number per ms. Raises SpellingError."""
+    """Parse ``1/30ms``, ``1/30``, ``0.033/ms``, ``5/s`` or a bare number per ms. Raises NotationError."""
     above, slash, below = text.partition("/")
     try:
         value = float(above)
@@ -49,9 +49,9 @@ def rate_per_ms(text: str) -> float:
             span = 1.0 if below.strip() == "ms" else 1e3 if below.strip() == "s" else span_ms(below)
             value = value / span
     except (ValueError, ZeroDivisionError):
-        raise SpellingError(f"{text!r} is not a rate: expected something like 1/30ms or 0.03/ms") from None
+        raise NotationError(f"{text!r} is not a rate: expected something like 1/30ms or 0.03/ms") from None
     if not (math.isfinite(value) and value >= 0):
-        raise SpellingError(f"{text!r} is not a rate: expected a finite number of at least 0")
+        raise NotationError(f"{text!r} is not a rate: expected a finite number of at least 0")
     return value
 
 
@@ -61,7 +61,7 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
     key: ``arrivals``, ``service`` or ``chain``.
     text: as the function of that name takes it, or a YAML mapping in braces.
     folder: what file names are relative to.
-    Raises SpellingError.
+    Raises NotationError.
     """
     if text.lstrip().startswith("{"):
         try:
@@ -69,7 +69,7 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
         except UntrustedError:
             found = None
         if not isinstance(found, dict):
-            raise SpellingError(f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
+            raise NotationError(f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
         return found
     if key == "service":
         return service(text, folder)
@@ -79,18 +79,18 @@ def section(key: str, text: str, folder: Path) -> dict[str, Any]:
 def fault(text: str) -> dict[str, Any]:
     """Parse a fault, ``NAME:VALUE``; the value is YAML, a mapping of parameters or the first parameter alone.
 
-    Raises SpellingError.
+    Raises NotationError.
     """
     name, colon, value = text.partition(":")
     try:
         return {name: read_yaml(value) if colon else {}}
     except UntrustedError:
-        raise SpellingError(f"fault {text[:200]!r}: expected something like loss:0.1 or loss:[0.01, 0.3]") from None
+        raise NotationError(f"fault {text[:200]!r}: expected something like loss:0.1 or loss:[0.01, 0.3]") from None
 
 
 def arrivals(text: str) -> dict[str, Any]:
     """Parse ``as-offered``, ``periodic:30ms``, ``poisson:1/30ms`` or, with one rate a chain state,
-    ``mmpp:1/120ms,1/30ms``. Bare ``mmpp`` has these two rates, the thesis's (6.4.2). Raises SpellingError."""
+    ``mmpp:1/120ms,1/30ms``. Bare ``mmpp`` has these two rates, the thesis's (6.4.2). Raises NotationError."""
     kind, _, rest = text.partition(":")
     if kind == "as-offered" and not rest:
         return {"process": "as-offered"}
@@ -101,25 +101,25 @@ def arrivals(text: str) -> dict[str, Any]:
     if kind in ("poisson", "mmpp") and rest:
         rates = [rate_per_ms(word) for word in rest.split(",")]
         return {"process": "poisson", "rate_per_ms": rates if len(rates) > 1 else rates[0]}
-    raise SpellingError(f"{text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or mmpp:1/120ms,1/30ms")
+    raise NotationError(f"{text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or mmpp:1/120ms,1/30ms")
 
 
 def service(text: str, folder: Path) -> dict[str, Any]:
     """Parse ``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE`` or
-    ``none``; or one law with a mean for each chain state, ``exp:30ms,exp:60ms``.
+    ``none``; or one distribution with a mean for each chain state, ``exp:30ms,exp:60ms``.
 
-    folder: what FILE is relative to. Raises SpellingError.
+    folder: what FILE is relative to. Raises NotationError.
     """
     short, _, rest = text.partition(":")
-    law = _LAWS.get(short)
+    law = _DISTRIBUTIONS.get(short)
     if law == "trace" and rest:
         return {"law": "trace", "delays_ms": delays_ms(folder / rest)}
     if "," in text:
         parts = [service(word, folder) for word in text.split(",")]
         if len({json.dumps({k: v for k, v in part.items() if k != "mean_ms"}) for part in parts}) != 1:
-            raise SpellingError(f"{text!r}: expected one law, with a mean for each state")
+            raise NotationError(f"{text!r}: expected one distribution, with a mean for each state")
         if "mean_ms" not in parts[0]:
-            raise SpellingError(f"{text!r}: expected laws with a mean")
+            raise NotationError(f"{text!r}: expected distributions with a mean")
         return {**parts[0], "mean_ms": [part["mean_ms"] for part in parts]}
     words = rest.split(":")
     if law == "none":
@@ -131,12 +131,12 @@ def service(text: str, folder: Path) -> dict[str, Any]:
             return {"law": law, "mean_ms": span_ms(words[0]), _PARAMETER[law]: float(words[1])}
         except ValueError:
             pass
-    raise SpellingError(f"{text!r}: expected exp:60ms, det:10ms, gamma:60ms:2, lognormal:60ms:0.5, trace:FILE or none")
+    raise NotationError(f"{text!r}: expected exp:60ms, det:10ms, gamma:60ms:2, lognormal:60ms:0.5, trace:FILE or none")
 
 
 def chain(text: str) -> dict[str, Any]:
     """Parse ``mu1=1/30,mu2=1/30``, optionally with ``states=low/high``, ``scope=per-camera``,
-    ``initial=low``, ``slots=1ms``. Raises SpellingError."""
+    ``initial=low``, ``slots=1ms``. Raises NotationError."""
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -150,20 +150,20 @@ def chain(text: str) -> dict[str, Any]:
             found |= {"sampled": "slots", "slot_ms": span_ms(value)}
         else:
             expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1, slots=1ms)"
-            raise SpellingError(f"{text!r}: expected {expected}")
+            raise NotationError(f"{text!r}: expected {expected}")
     return found
 
 
 def read_text(path: Path) -> str:
-    """Read a file named on the command line or in a scenario. Raises SpellingError if it cannot be read or is
+    """Read a file named on the command line or in a scenario. Raises NotationError if it cannot be read or is
     too long."""
     try:
         with path.open() as file:
             text = file.read(_MAX_CHARS + 1)
     except (OSError, UnicodeDecodeError) as error:
-        raise SpellingError(f"{path}: cannot be read: {error}") from None
+        raise NotationError(f"{path}: cannot be read: {error}") from None
     if len(text) > _MAX_CHARS:
-        raise SpellingError(f"{path}: more than {_MAX_CHARS} characters")
+        raise NotationError(f"{path}: more than {_MAX_CHARS} characters")
     return text
 
 
@@ -172,7 +172,7 @@ def delays_ms(path: Path) -> list[float]:
 
     The file has one number of ms a line, or is CSV with a header that names a column ``delay_ms``,
     ``delay_us`` or ``delay_s``, or is a trace of this emulator (its drawn delays). Lines that start with #
-    are skipped. Raises SpellingError.
+    are skipped. Raises NotationError.
     """
     text = read_text(path)
     if text.startswith("{"):
@@ -180,7 +180,7 @@ def delays_ms(path: Path) -> list[float]:
             records = [read_json(line) for line in text.split("\n")[1:-1]]
             return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
         except (KeyError, TypeError, ValueError):
-            raise SpellingError(f"{path}: neither delays nor a trace of this emulator") from None
+            raise NotationError(f"{path}: neither delays nor a trace of this emulator") from None
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}
     try:
@@ -189,4 +189,4 @@ def delays_ms(path: Path) -> list[float]:
         column, unit_ms = columns[0] if columns else (0, 1.0)
         return [float(row[column]) * unit_ms for row in rows[bool(columns) :]]
     except (csv.Error, ValueError, IndexError) as error:
-        raise SpellingError(f"{path}: expected a column delay_ms, or one delay in ms a line: {error}") from None
+        raise NotationError(f"{path}: expected a column delay_ms, or one delay in ms a line: {error}") from None
