@@ -104,7 +104,7 @@ figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/th
 	    $(if $(JOBS),--jobs $(JOBS)) $(STUDY) || exit 1; \
 	done  # after Ctrl-C the same command goes on
 	@mkdir -p docs/results/thesis
-	cp $$(ls -d runs/figures/*.json runs/figures/*.csv runs/figures/*.png runs/figures/*-tables.md 2>/dev/null) docs/results/thesis
+	cp $$(ls -d runs/figures/*.json runs/figures/*.csv runs/figures/*.png runs/figures/*.md 2>/dev/null) docs/results/thesis
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)

@@ -33,6 +33,7 @@ In the help of a command, [x] after an option is its default.
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
   edge-server simulate room --seconds 10
+  edge-server compare card all threshold:120 --seeds 8
   edge-server viewpoints tile --budget 8
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
@@ -74,6 +75,7 @@ _COMMANDS = {
         "experiments.training.scheduler.command",
         "learn when to update the field and from which views, rewarded by real field fits",
     ),
+    "compare": ("experiments.compare", "compare what policies show in a scenario, over seeds, with intervals"),
     "simulate": (
         "experiments.virtual.simulate",
         "run a scenario's whole deployment in virtual time, reproducible bit for bit",

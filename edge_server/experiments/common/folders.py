@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from freshfield.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -16,3 +19,19 @@ class Folders:
 
     data: Path | None = None
     lpips: Path | None = None
+
+    def files_of(self, scenario: Scenario) -> list[Path]:
+        """Existing files and folders that a scenario's results depend on: its data set, the files that its channel
+        names, and the weights of LPIPS."""
+        data = scenario.source.get("data")
+        named = [] if data is None else [(self.data or Path()) / str(data)]
+        named += [scenario.path.parent / text for text in _texts(scenario.channel)]
+        return [path for path in (*named, self.lpips) if path is not None and path.exists()]
+
+
+def _texts(section: Any) -> list[str]:
+    """Every text in a section of a scenario."""
+    if isinstance(section, str):
+        return [section]
+    values = section.values() if isinstance(section, dict) else section if isinstance(section, list) else ()
+    return [text for value in values for text in _texts(value)]

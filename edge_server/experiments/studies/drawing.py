@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from edge_server.experiments.common.seed_table import Curve, SeedTable
 from edge_server.experiments.common.statistics import interval
-from edge_server.experiments.studies.study import METRICS, Curve, StudyRequest, Table
+from edge_server.experiments.studies.study import METRICS, StudyRequest
 from edge_server.experiments.studies.trial import Trial, last_images
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
@@ -41,7 +42,7 @@ def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
 
 def draw_metrics(
     path: Path,
-    table: Table,
+    table: SeedTable,
     x: str,
     axis: str,
     metrics: Sequence[str],

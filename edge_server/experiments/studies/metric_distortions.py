@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from edge_server.experiments.common.statistics import Interval, all_of, interval, paired
+from edge_server.experiments.common.seed_table import Row, SeedTable
+from edge_server.experiments.common.statistics import interval
+from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_images
-from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict, number
+from edge_server.experiments.studies.findings import better, better_than_all
+from edge_server.experiments.studies.study import Claim, Study, StudyRequest
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
-from freshfield.files import write_csv
 
 # The thesis's table.
 THESIS = {
@@ -64,58 +66,64 @@ def _with_psnr(reference: Unit, case: str, wanted_db: float) -> Unit:
     return distorted(reference, case, high)
 
 
-class Metrics(Study):
-    name = "metrics"
-    title = "What the three metrics say of three artefacts (figure 3.6)"
-
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        lpips, missing = open_lpips(request.folders.lpips)
-        scores: dict[str, dict[str, list[float | None]]] = {}
-        examples: list[tuple[str, Unit]] = []
-        scene = make_scene("room", {"count": 19, "width": 192, "height": 192})
-        cameras = list(scene.cameras)
-        for seed in request.repeats(8, 19):
-            name = cameras[seed % len(cameras)]
-            reference = scene.render(name, 0.3 * seed).astype(np.float32) / 255.0
-            for case, image in distortions(reference).items():
-                into = scores.setdefault(case, {"psnr": [], "ssim": [], "lpips": []})
-                into["psnr"].append(psnr(image, reference))
-                into["ssim"].append(ssim(image, reference))
-                if lpips is not None:
-                    into["lpips"].append(lpips(image, reference))
-            if not examples:
-                examples = [("reference", reference), *distortions(reference).items()]
-        shown = [(label, (image * 255).astype(np.uint8)) for label, image in examples]
-        draw_images(request.out / "metrics.png", [("room", shown)])
-        rows = []
-        for case, found in scores.items():
-            psnr_db, ssim_, lpips_ = (number(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
-            rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_, "seeds": len(found["psnr"])})
-        write_csv(request.out / "metrics.csv", rows)
-        verdicts = [
-            self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
-            self._ordering(scores, "ssim", "highest for ghosting, against the prose", "local ghosting", False),
-        ]
-        if missing:
-            print(f"  LPIPS is left out: {missing}")
-            return verdicts
-        order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
-        gaps = [_gap(b, a) for a, b in pairwise(order)]
-        text = ", ".join(f"{interval(values).mean:.3f}" for values in order)
-        claim = "brightness shift < ghosting < blur (figure 3.6's table)."
-        rising = all_of(gap.above(0.0) for gap in gaps)
-        return [*verdicts, Verdict("LPIPS", claim, text + ".", rising, min(gaps, key=lambda gap: gap.mean))]
-
-    def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
-        mine = scores[case][metric]
-        gaps = [_gap(v[metric], mine) if lowest else _gap(mine, v[metric]) for c, v in scores.items() if c != case]
-        answer = all_of(gap.above(0.0) for gap in gaps)
-        text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
-        return Verdict(
-            metric.upper(), f"{claim} (figure 3.6's table).", text + ".", answer, min(gaps, key=lambda gap: gap.mean)
-        )
+def _cases(request: StudyRequest) -> list[int]:
+    return list(request.repeats(8, 19))
 
 
-def _gap(a: list[float | None], b: list[float | None]) -> Interval:
-    """a - b, seed by seed."""
-    return paired(dict(enumerate(a)), dict(enumerate(b)))
+def _measure(seeds: Sequence[int], request: StudyRequest) -> list[Row]:
+    """The metrics of each artifact of each camera's image."""
+    lpips, missing = open_lpips(request.folders.lpips)
+    if missing:
+        print(f"  LPIPS is left out: {missing}")
+    rows: list[Row] = []
+    for seed in seeds:
+        reference = _reference(seed)
+        for case, image in distortions(reference).items():
+            found = {"psnr_db": psnr(image, reference), "ssim": ssim(image, reference)}
+            lpips_ = None if lpips is None else lpips(image, reference)
+            rows.append({"scene": "room", "case": case, "seed": seed, **found, "lpips": lpips_})
+    return rows
+
+
+def _reference(seed: int) -> Unit:
+    scene = make_scene("room", {"count": 19, "width": 192, "height": 192})
+    cameras = list(scene.cameras)
+    return scene.render(cameras[seed % len(cameras)], 0.3 * seed).astype(np.float32) / 255.0
+
+
+def _draw(request: StudyRequest, table: SeedTable) -> None:
+    reference = _reference(0)
+    shown = [
+        (label, (im * 255).astype(np.uint8))
+        for label, im in [("reference", reference), *distortions(reference).items()]
+    ]
+    draw_images(request.out / "metrics.png", [("room", shown)])
+
+
+def _table(table: SeedTable) -> str:
+    kinds = (("psnr_db", 2), ("ssim", 4), ("lpips", 4))
+    rows = [
+        [case, *(interval(table.values(metric, case=case).values()).text(digits) for metric, digits in kinds)]
+        for (case,) in table.distinct("case")
+    ]
+    return markdown_table(["artifact", "PSNR (dB)", "SSIM", "LPIPS"], rows)
+
+
+SHIFT, BLUR, GHOST = ({"case": case} for case in THESIS)
+METRIC_DISTORTIONS = Study(
+    "metrics",
+    "What the three metrics say of three artifacts (figure 3.6)",
+    _cases,
+    _measure,
+    ("ssim",),
+    (
+        Claim(
+            "lowest for the brightness shift (figure 3.6's table).", better_than_all(SHIFT, (BLUR, GHOST), worse=True)
+        ),
+        Claim("highest for ghosting, against the prose (figure 3.6's table).", better_than_all(GHOST, (SHIFT, BLUR))),
+        Claim("brightness shift < ghosting (figure 3.6's table).", better(SHIFT, GHOST), metrics=("lpips",)),
+        Claim("ghosting < blur (figure 3.6's table).", better(GHOST, BLUR), metrics=("lpips",)),
+    ),
+    draw=_draw,
+    tables=_table,
+)

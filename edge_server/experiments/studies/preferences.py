@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.result_store import ResultStore, content_key
-from edge_server.experiments.common.source_digest import source_digest
-from edge_server.experiments.common.statistics import interval, paired
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import Row, SeedTable
+from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.study import Study, StudyRequest, Table, Verdict
-from edge_server.experiments.studies.trial import Row, scenario_of
-from edge_server.experiments.studies.viewpoints import FULL, JUDGED, QUICK, SCENES, Workload, plan
+from edge_server.experiments.studies.findings import better, level
+from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
+from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
+from edge_server.experiments.studies.viewpoints import JUDGED, SCENES, Workload, files_of, plan, stage_of, workload
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
-from edge_server.experiments.viewpoints.stage import Stage, open_embedder, open_stage
+from edge_server.experiments.viewpoints.stage import Stage, open_embedder
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
 from edge_server.report.style import figure, label_lines
@@ -25,7 +28,6 @@ from edge_server.viewpoints.experts import TASTES, SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
 from edge_server.viewpoints.policy import PolicyConfig, train_policy
 from edge_server.viewpoints.preference_model import RewardModel, fit_reward, next_pair
-from freshfield.files import write_csv, write_text
 
 ASKED = (10, 20, 40, 60)
 HABITS: dict[str, dict[str, float | bool]] = {
@@ -35,129 +37,155 @@ HABITS: dict[str, dict[str, float | bool]] = {
     "contradicting": {"contradicts": True},
 }
 _UNSEEN = 400  # pairs
-_EMBEDDED = "edges"  # the taste whose policy is also trained with embeddings of the captured pictures (4.8)
 _TRAINED_ON = "10 % wrong"
+# The taste whose policy is also trained with embeddings of the captured pictures (4.8).
+_EMBEDDED = "edges"
 _UPDATES = {True: 30, False: 80}  # of PPO
 _POOL = {True: 60, False: 120}  # reconstructions; a third of them is kept for unseen pairs
+_ARMS = ("random", "coverage", "coverage, short way", "FisherRF")
 
 
-class Preferences(Study):
-    name = "preferences"
-    title = "What preferences of simulated experts teach (figure 4.6, tables 4.2, 4.3)"
+@dataclass(frozen=True)
+class Taught:
+    """A capture: by an arm of ``viewpoints``, or by a policy that was taught by a taste.
 
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        rows: list[Row] = []
-        captures: list[Row] = []
-        verdicts: list[Verdict] = []
-        parts = ["# " + self.title, ""]
-        store = ResultStore.in_lines(request.out / "trials" / "preferences.jsonl")
-        for scene in request.scenes_here(SCENES[request.quick]):
-            answered, captured, text = self._of_scene(request, scene, store)
-            verdicts += judge_answers(scene, answered) + judge_captures(scene, captured)
-            rows += [{"scene": scene, **row} for row in answered]
-            captures += [{"scene": scene, **row} for row in captured]
-            parts += [f"## {scene}", "", text, "", answer_table(answered), "", capture_table(captured), ""]
-        store.close()
-        write_csv(request.out / "preferences.csv", rows)
-        write_csv(request.out / "preferences-captures.csv", captures)
-        write_text(request.out / "preferences-tables.md", "\n".join(parts))
-        return verdicts
+    pool: number of reconstructions that experts compare; None: a capture by an arm.
+    """
 
-    def _of_scene(self, request: StudyRequest, scene: str, store: ResultStore) -> tuple[list[Row], list[Row], str]:
-        """Rows of answers and of captures of one scene, and what was done."""
-        work = QUICK if request.quick else FULL
-        stage = open_stage(str(scenario_of(scene).path), work.candidates, work.size, request.folders.data)
-        pool = []
-        for k in range(_POOL[request.quick]):
-            key = content_key(["pool", scene, k, vars(work), source_digest()], 40)
-            pool.append(store.get(key, compute=partial(reconstruct, stage, k, work)))
-        steps = StepFeatures(stage.candidates)
-        features = np.stack([steps.trajectory(item["order"]) for item in pool])
-        scores = {taste: np.array([item[taste] for item in pool]) for taste in TASTES}
-        seeds = request.repeats(6, 12)
-        rows = [
-            row
-            for taste in TASTES
-            for habit in HABITS
-            for seed in seeds
-            for row in question(features, scores[taste], taste, habit, seed)
-        ]
-        captures, curves = self._policies(request, scene, stage, work, features, scores, store)
-        draw(request.out / f"preferences-{scene}.png", rows, curves)
-        lens = stage.candidates.lens
-        text = (
-            f"Simulated experts only. {len(pool)} reconstructions of {JUDGED} views, {lens.width} x "
-            f"{lens.height} pixels; a third of them kept for {_UNSEEN} unseen pairs. {len(seeds)} seeds. "
-            "Means with 95 % intervals over seeds."
-        )
-        return rows, captures, text
+    arm: str
+    scene: str
+    seed: int
+    work: Workload
+    source: Any
+    pool: int | None = None
+    updates: int = 0
 
-    def _policies(
-        self,
-        request: StudyRequest,
-        scene: str,
-        stage: Stage,
-        work: Workload,
-        features: np.ndarray,
-        scores: dict[str, np.ndarray],
-        store: ResultStore,
-    ) -> tuple[list[Row], dict[str, dict[float, dict[int, float | None]]]]:
-        """Captures by a policy trained for each taste, and by others, with the same first views; and each
-        policy's return against the number of updates (figure 4.6)."""
-        captures: list[Row] = []
-        curves: dict[str, dict[float, dict[int, float | None]]] = {}
-        config = PolicyConfig(views=JUDGED, updates=_UPDATES[request.quick])
-        embed, missing = open_embedder(stage.background)
-        if missing:
-            print(f"  embeddings are left out: {missing}")
-        pictures = [stage.take(k).image for k in range(len(stage.candidates))]
-        seen = embed(pictures).astype(np.float64) if embed else None
+    @property
+    def taste(self) -> str:
+        return self.arm.removeprefix("policy, ").removesuffix(", embeddings")
 
-        def taught(taste: str, label: str, embedded: bool, seed: int) -> Row:
-            """The returns of a training, what the reward model says, and the policy's capture."""
-            expert = SimulatedExpert(taste, scores[taste], np.random.default_rng(seed), wrong=0.1)
-            model = ask(expert, features, ASKED[-1])
-            policy, returns = train_policy(
-                stage.candidates, model.reward, config, seed, seen if embedded else None, embed
-            )
-            if seed == 0:
-                policy.save(request.out / f"policy-{scene}-{label.replace(', ', '-')}.npz")
-            # The seed draws the same first view as for the others.
-            made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=seed)
-            says = f"{expert.label}: {model.says()}"
-            return {"returns": returns, "says": says, "capture": _measured(stage, made, work, seed)}
 
+@dataclass(frozen=True)
+class Reconstruction:
+    """The number of a reconstruction of the pool."""
+
+    scene: str
+    number: int
+    work: Workload
+    source: Any
+
+
+def _cases(request: StudyRequest) -> list[Taught]:
+    work, found = workload(request), []
+    for scene in scenes_here(request, SCENES[request.quick]):
+        about = scene, work, scenario_of(scene).source
+        taught = [f"policy, {taste}" for taste in (*TASTES, f"{_EMBEDDED}, embeddings")]
         for seed in request.repeats(3, 5):
-            for arm in ("random", "coverage", "coverage, short way", "FisherRF"):
-                key = content_key([arm, scene, seed, vars(work), source_digest()], 40)
-                run = partial(_capture, stage, arm, seed, work)
-                captures.append({"arm": arm, "seed": seed, **store.get(key, compute=run)})
-            for taste, embedded in [*((t, False) for t in TASTES), *([(_EMBEDDED, True)] if embed else [])]:
-                label = f"{taste}, embeddings" if embedded else taste
-                about = [label, scene, seed, len(features), vars(work), vars(config), source_digest()]
-                run = partial(taught, taste, label, embedded, seed)
-                found = store.get(content_key(["policy", *about], 40), compute=run)
-                for n in range(0, config.updates, 5):
-                    of_seed = curves.setdefault(label, {}).setdefault(float(n), {})
-                    of_seed[seed] = float(np.mean(found["returns"][n : n + 5]))
-                captures.append({"arm": f"policy, {label}", "seed": seed, **found["capture"]})
-                print(f"  seed {seed}, {found['says']}", flush=True)
-        return captures, curves
+            found += [Taught(arm, scene, seed, *about[1:]) for arm in _ARMS]
+            found += [
+                Taught(arm, scene, seed, *about[1:], _POOL[request.quick], _UPDATES[request.quick]) for arm in taught
+            ]
+    return found
 
 
-def reconstruct(stage: Stage, k: int, work: Workload) -> Row:
+def _measure(cases: Sequence[Taught], request: StudyRequest) -> list[Row]:
+    """Rows of captures (label ``arm``), of answers (labels ``taste``, ``habit``, ``answers``), and of each policy's
+    return (label ``update``)."""
+    rows: list[Row] = []
+    folders = request.folders
+    with open_engine(request, "preferences", threads=1) as engine:
+        for scene in dict.fromkeys(case.scene for case in cases):
+            mine = [case for case in cases if case.scene == scene]
+            asked = [
+                Reconstruction(scene, k, mine[0].work, mine[0].source) for k in range(max(c.pool or 0 for c in mine))
+            ]
+            pool = engine.run(
+                partial(reconstruct, folders=folders),
+                asked,
+                f"{scene}: reconstructions",
+                files=lambda one: files_of(one, folders),
+                group=lambda one: one.scene,
+            )
+            done = engine.run(
+                partial(captured, folders=folders, pool=tuple(map(_frozen, pool))),
+                mine,
+                f"{scene}: captures",
+                files=lambda one: files_of(one, folders),
+                group=lambda one: one.scene,
+            )
+            name = {"scene": scene_label(scene)}
+            rows += [{**name, "arm": c.arm, "seed": c.seed, **found["capture"]} for c, found in zip(mine, done)]
+            rows += [
+                {
+                    **name,
+                    "trained": c.arm,
+                    "seed": c.seed,
+                    "update": n,
+                    "return": float(np.mean(found["returns"][n : n + 5])),
+                }
+                for c, found in zip(mine, done)
+                for n in range(0, len(found["returns"]), 5)
+            ]
+            features, scores = _pool_features(stage_of(scene, mine[0].work, folders), pool)
+            rows += [
+                {**name, **row}
+                for taste in TASTES
+                for habit in HABITS
+                for seed in request.repeats(6, 12)
+                for row in question(features, scores[taste], taste, habit, seed)
+            ]
+    return rows
+
+
+def _frozen(item: Row) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, tuple(v) if isinstance(v, list) else v) for name, v in item.items())
+
+
+def reconstruct(one: Reconstruction, *, folders: Folders) -> Row:
     """A reconstruction of the pool: its views, chosen in various ways, and the score of each taste."""
-    made = varied_plan(stage, k, JUDGED)
-    return {"order": made.order, **_tastes(stage, stage.fit(made.views, work.steps, k))}
+    stage = stage_of(one.scene, one.work, folders)
+    made = varied_plan(stage, one.number, JUDGED)
+    return {"order": made.order, **_tastes(stage, stage.fit(made.views, one.work.steps, one.number))}
+
+
+def _pool_features(stage: Stage, pool: Sequence[Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Features (N, d) of the reconstructions as trajectories, and their scores by taste."""
+    steps = StepFeatures(stage.candidates)
+    features = np.stack([steps.trajectory(list(item["order"])) for item in pool])
+    return features, {taste: np.array([item[taste] for item in pool]) for taste in TASTES}
+
+
+@lru_cache(1)
+def _seen(scene: str, work: Workload, folders: Folders) -> tuple[np.ndarray | None, Any]:
+    """Embeddings of the candidates' pictures, and the embedder; None, None if there is none."""
+    stage = stage_of(scene, work, folders)
+    embed, missing = open_embedder(stage.background)
+    if embed is None:
+        print(f"  embeddings are left out: {missing}")
+        return None, None
+    return embed([stage.take(k).image for k in range(len(stage.candidates))]).astype(np.float64), embed
+
+
+def captured(one: Taught, *, folders: Folders, pool: Sequence[Any]) -> Row:
+    """The capture of an arm, or by a policy trained on the reward of a taste's answers; and the policy's returns."""
+    stage = stage_of(one.scene, one.work, folders)
+    if one.pool is None:
+        made = plan(stage, one.arm, one.seed, JUDGED, one.work)
+        return {"returns": [], "capture": _measured(stage, made, one.work, one.seed)}
+    features, scores = _pool_features(stage, [dict(item) for item in pool[: one.pool]])
+    expert = SimulatedExpert(one.taste, scores[one.taste], np.random.default_rng(one.seed), wrong=0.1)
+    model = ask(expert, features, ASKED[-1])
+    seen, embed = _seen(one.scene, one.work, folders) if one.arm.endswith("embeddings") else (None, None)
+    config = PolicyConfig(views=JUDGED, updates=one.updates)
+    policy, returns = train_policy(stage.candidates, model.reward, config, one.seed, seen, embed)
+    # The seed draws the same first view as for the others.
+    made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=one.seed)
+    return {"returns": returns, "capture": _measured(stage, made, one.work, one.seed)}
 
 
 def _tastes(stage: Stage, field: Field) -> Row:
     """The score of each taste."""
     return {taste: taste_score(stage, field, taste) for taste in TASTES}
-
-
-def _capture(stage: Stage, arm: str, seed: int, work: Workload) -> Row:
-    return _measured(stage, plan(stage, arm, seed, JUDGED, work), work, seed)
 
 
 def _measured(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
@@ -210,103 +238,95 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
                 "agreement": float((expects == said).mean()),
                 "with_taste": float((expects == meant).mean()),
                 "with_itself": float((said == again).mean()),
+                "agreement_share": float((expects == said).mean() / max((said == again).mean(), 1e-9)),
                 "odds": model.odds,
                 "knows": model.knows,
+                "does_not_know": float(not model.knows),
             }
         )
     return rows
 
 
-def _of(rows: list[Row], metric: str, **labels: object) -> dict[int, float | None]:
-    """seed -> value of the rows with these labels."""
-    return {r["seed"]: r[metric] for r in rows if all(r[k] == v for k, v in labels.items())}
+def _draw(request: StudyRequest, table: SeedTable) -> None:
+    """Agreement on unseen pairs against the number of answers; the policies' returns against updates (figure 4.6)."""
+    for (scene,) in table.distinct("scene"):
+        with figure(request.out / f"preferences-{scene}.png", 2, height_inch=2.6) as (_, axes):
+            top, bottom = axes[:, 0]
+            for k, (taste, habit) in enumerate(table.distinct("taste", "habit")):
+                labels = {"scene": scene, "taste": taste, "habit": habit}
+                draw_curve(top, table.curve("answers", "agreement", **labels), f"{taste}, {habit}", k)
+            label_lines(top, "agreement on\nunseen pairs", "answers", f"{scene}: simulated experts")
+            for k, (arm,) in enumerate(table.distinct("trained")):
+                curve = table.curve("update", "return", scene=scene, trained=arm)
+                if curve:
+                    draw_curve(bottom, curve, arm, k)
+            label_lines(bottom, "return", "updates of the policy")
 
 
-def judge_answers(scene: str, rows: list[Row]) -> list[Verdict]:
-    """Verdicts on what the reward model learned in a scene."""
-    verdicts = []
-    for taste in TASTES:
-        here = _of(rows, "agreement", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
-        itself = _of(rows, "with_itself", taste=taste, habit=_TRAINED_ON, answers=ASKED[-1])
-        share = interval([a / b for s in here if (a := here[s]) is not None and (b := itself[s])])
-        verdicts.append(
-            Verdict(
-                f"{scene}, simulated expert, {taste}, 10 % wrong",
-                f"after {ASKED[-1]} answers at least 90 % of the expert's agreement with itself.",
-                f"{share.text(3)} of it, on unseen pairs.",
-                share.above(0.9),
-                share,
-            )
-        )
-    unsure = [not r["knows"] for r in rows if r["habit"] == "contradicting" and r["answers"] == ASKED[-1]]
-    sure = [r["knows"] for r in rows if r["habit"] == "careful" and r["answers"] == ASKED[-1]]
-    verdicts.append(
-        Verdict(
-            f"{scene}, simulated experts, contradicting",
-            "the model says that it does not know.",
-            f"it says so in {sum(unsure)} of {len(unsure)} cases; of careful experts it says that it knows in "
-            f"{sum(sure)} of {len(sure)}.",
-            sum(unsure) >= 0.9 * len(unsure),
-        )
-    )
-    return verdicts
+def _tables(table: SeedTable) -> str:
+    """Agreement on unseen pairs, and captures of ``JUDGED`` views by arm."""
 
+    def mean(metric: str, digits: int, **labels: Any) -> str:
+        return interval(table.values(metric, **labels).values()).text(digits)
 
-def judge_captures(scene: str, captures: list[Row]) -> list[Verdict]:
-    """Verdicts on the captures of a scene by trained policies: quality and way."""
-    verdicts = []
-    for arm in [a for a in dict.fromkeys(c["arm"] for c in captures) if a.startswith("policy")]:
-        for other in ("random", "FisherRF"):
-            gain = paired(_of(captures, "psnr_db", arm=arm), _of(captures, "psnr_db", arm=other))
-            way = paired(_of(captures, "path_m", arm=other), _of(captures, "path_m", arm=arm))
-            about = f"{scene}, {arm}, {JUDGED} views"
-            verdicts += [
-                Verdict(about, f"better than {other} (table 4.3).", f"{gain.text(2)} dB.", gain.above(0.0), gain),
-                Verdict(
-                    f"{about}, path",
-                    f"shorter than {other}'s (table 4.3).",
-                    f"{way.text(2)} m shorter.",
-                    way.above(0.0),
-                    way,
-                ),
-            ]
-    return verdicts
-
-
-def answer_table(rows: list[Row]) -> str:
-    """Agreement on unseen pairs against the number of answers, in Markdown."""
-    lines = []
-    for expert in dict.fromkeys(r["expert"] for r in rows):
-        cells = [interval(list(_of(rows, "agreement", expert=expert, answers=n).values())).text(2) for n in ASKED]
-        itself = interval(list(_of(rows, "with_itself", expert=expert, answers=ASKED[-1]).values()))
-        knows = list(_of(rows, "knows", expert=expert, answers=ASKED[-1]).values())
-        lines.append([expert, *cells, f"{itself.mean:.2f}", f"{sum(map(bool, knows))} of {len(knows)}"])
-    head = ["agreement after", *(f"{n} answers" for n in ASKED), "expert with itself", "says it knows"]
-    return markdown_table(head, lines)
-
-
-def capture_table(captures: list[Row]) -> str:
-    """Captures of ``JUDGED`` views by arm, in Markdown. Scores of the tastes: of pictures, 0 is the truth."""
-    kinds = (("psnr_db", 2), ("ssim", 3), ("path_m", 2), *((taste, 4) for taste in TASTES))
-    lines = [
-        [
-            arm,
-            *(interval(list(_of(captures, m, arm=arm).values())).text(d) for m, d in kinds),
-            f"{interval(list(_of(captures, 'choice_ms', arm=arm).values())).mean:.0f}",
+    parts = ["Simulated experts only; nobody was asked."]
+    for (scene,) in table.distinct("scene"):
+        answers = []
+        for taste, habit in table.distinct("taste", "habit"):
+            of = {"scene": scene, "taste": taste, "habit": habit}
+            knows = list(table.values("knows", **of, answers=ASKED[-1]).values())
+            cells = (mean("agreement", 2, **of, answers=n) for n in ASKED)
+            itself = mean("with_itself", 2, **of, answers=ASKED[-1])
+            answers.append([f"{taste}, {habit}", *cells, itself, f"{sum(map(bool, knows))} of {len(knows)}"])
+        kinds = (("psnr_db", 2), ("ssim", 3), ("path_m", 2), *((taste, 4) for taste in TASTES), ("choice_ms", 0))
+        captures = [[a, *(mean(m, d, scene=scene, arm=a) for m, d in kinds)] for (a,) in table.distinct("arm")]
+        head = ["agreement after", *(f"{n} answers" for n in ASKED), "expert with itself", "says it knows"]
+        parts += [
+            f"## {scene}",
+            markdown_table(head, answers),
+            markdown_table(["8 views of", "PSNR (dB)", "SSIM", "path (m)", *TASTES, "a choice (ms)"], captures),
         ]
-        for arm in dict.fromkeys(c["arm"] for c in captures)
-    ]
-    head = ["views by", "PSNR (dB)", "SSIM", "path (m)", *(f"score, {t}" for t in TASTES), "a choice (ms)"]
-    return markdown_table(head, lines)
+    return "\n\n".join(parts)
 
 
-def draw(path: Path, rows: list[Row], curves: dict[str, dict[float, dict[int, float | None]]]) -> None:
-    """Agreement against answers, and the policies' returns against updates (figure 4.6)."""
-    with figure(path, 2, height_inch=2.8) as (_, axes):
-        for k, expert in enumerate(dict.fromkeys(r["expert"] for r in rows)):
-            curve = {float(n): _of(rows, "agreement", expert=expert, answers=n) for n in ASKED}
-            draw_curve(axes[0, 0], curve, expert, k)
-        label_lines(axes[0, 0], "agreement, unseen pairs", "answers")
-        for k, (taste, curve) in enumerate(curves.items()):
-            draw_curve(axes[1, 0], curve, f"taught by a simulated expert ({taste})", k)
-        label_lines(axes[1, 0], "return of an episode", "updates of PPO")
+PREFERENCES = Study(
+    "preferences",
+    "What preferences of simulated experts teach (figure 4.6, tables 4.2, 4.3)",
+    _cases,
+    _measure,
+    ("psnr_db",),
+    (
+        *(
+            Claim(
+                f"after {ASKED[-1]} answers, one in ten wrong, the model agrees with the expert on unseen pairs at "
+                "least 90 % as often as the expert with itself.",
+                level({"taste": taste, "habit": _TRAINED_ON, "answers": ASKED[-1]}),
+                0.9,
+                {"taste": taste},
+                ("agreement_share",),
+            )
+            for taste in TASTES
+        ),
+        Claim(
+            "contradicting experts: the model says that it does not know, nine times in ten.",
+            level({"habit": "contradicting", "answers": ASKED[-1]}),
+            0.9,
+            {"habit": "contradicting"},
+            ("does_not_know",),
+        ),
+        *(
+            Claim(
+                f"{better_at} than {other}'s (table 4.3).",
+                better({"arm": arm}, {"arm": other}),
+                0.0,
+                {"arm": arm},
+                (m,),
+            )
+            for arm in (f"policy, {taste}" for taste in (*TASTES, f"{_EMBEDDED}, embeddings"))
+            for other in ("random", "FisherRF")
+            for m, better_at in (("psnr_db", "better views"), ("path_m", "a shorter path"))
+        ),
+    ),
+    draw=_draw,
+    tables=_tables,
+)

@@ -1,22 +1,30 @@
-"""Parts of a study: points (labels and a trial), a results table, and verdicts."""
+"""A study is data: cases to measure, metrics, and claims; its verdicts follow from the measured rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.statistics import Interval, interval, paired
-from edge_server.experiments.common.tables import number
-from edge_server.experiments.studies.engine import Engine, StudyError
-from edge_server.experiments.studies.trial import Row, Trial, recording
+from edge_server.experiments.common.seed_table import Row, SeedTable
+from edge_server.experiments.common.statistics import Interval, all_of, any_of, discoveries
+from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.engine import Engine
 from edge_server.report.machine import commit
-from edge_server.scheduler.learned.rewards import W_S, f_w
+from edge_server.scheduler.learned.rewards import W_S
 from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
+# Expected share of wrong verdicts among those that a study decides.
+FALSE_DISCOVERY_RATE = 0.05
+LEAST_DB = 0.1
+
+
+class StudyError(RuntimeError):
+    """A study that cannot be run as asked; the message says what to change."""
 
 
 class Metric(NamedTuple):
@@ -32,7 +40,6 @@ class Metric(NamedTuple):
     least: float
 
 
-LEAST_DB = 0.1
 METRICS = {
     "psnr_db": Metric("PSNR (dB)", False, 2, LEAST_DB),
     "psnr_moving_db": Metric("PSNR, moving pixels (dB)", False, 2, LEAST_DB),
@@ -43,9 +50,11 @@ METRICS = {
     "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
     "f_w": Metric("F_w (6.37)", True, 3, 0.01),
     "f_w_corrected": Metric(f"F_w with w_s = {-W_S:g}", True, 3, 0.01),
+    "reward": Metric("reward", False, 4, 0.0),
+    "path_m": Metric("path (m)", True, 2, 0.0),
+    "does_not_know": Metric("share of cases", False, 2, 0.0),
+    "agreement_share": Metric("share of the expert's agreement with itself", False, 3, 0.0),
 }
-
-Curve = dict[float, dict[int, float | None]]
 
 
 @dataclass(frozen=True)
@@ -55,11 +64,12 @@ class StudyRequest:
     quick: a small pass.
     out: folder of tables and figures.
     seeds: number of repetitions of a point.
-    field: representation of the trials that do not name one themselves.
-    scenes: names of the scenes.
-    jobs: number of processes.
+    scenes: names or files of scenarios.
+    channel: section of a channel, used in place of the study's own. channel_name: what it is called.
+    jobs, ray: as in ``Engine``.
     cases: words in the names of the selected cases, for studies that consist of cases.
     episodes: episodes of one training, for studies that train.
+    field: representation of the trials that do not name one themselves.
     """
 
     quick: bool
@@ -67,7 +77,10 @@ class StudyRequest:
     folders: Folders
     seeds: int | None = None
     scenes: tuple[str, ...] | None = None
+    channel: Mapping[str, Any] | None = None
+    channel_name: str = ""
     jobs: int = 1
+    ray: str | None = None
     cases: tuple[str, ...] = ()
     episodes: int | None = None
     field: str = "splat"
@@ -82,81 +95,85 @@ class StudyRequest:
             )
         return [case for case in cases if any(word in case for word in self.cases)]
 
+    def repeats(self, quick: int, full: int) -> range:
+        """Seeds of a point: the requested number, else that of a quick or full pass."""
+        return range(self.seeds or (quick if self.quick else full))
+
+    def channels(self, own: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+        """The study's channels by name, or the one that was asked for."""
+        given = own if self.channel is None else {self.channel_name: self.channel}
+        return {name: dict(channel) for name, channel in given.items()}
+
     def command(self, study: str) -> str:
         """The command that repeats this request, without folders and processes, which change nothing."""
         words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
         words += [f"--seeds {self.seeds}"] if self.seeds else []
         words += [f"--scene {','.join(self.scenes)}"] if self.scenes else []
+        words += [f"--channel {self.channel_name}"] if self.channel is not None else []
         words += [f"--case {case!r}" for case in self.cases]
         words += [f"--episodes {self.episodes}"] if self.episodes else []
         words += [f"--field {self.field}"] if self.field != "splat" else []
         return " ".join(words)
 
-    def repeats(self, quick: int, full: int) -> range:
-        """Seeds of a point: the requested number, else that of a quick or full pass."""
-        return range(self.seeds or (quick if self.quick else full))
 
-    def scenes_here(self, default: Sequence[str]) -> list[str]:
-        """The requested scenes, else ``default``, without recorded ones that are not in the data folder."""
-        wanted, data = list(self.scenes or default), self.folders.data
-        found = []
-        for scene in wanted:
-            file = recording(scene)
-            if file is None or (data is not None and (data / file).exists()):
-                found.append(scene)
-            else:
-                print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
-        if not found:
-            raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
-        return found
+@dataclass(frozen=True)
+class Finding:
+    """What was found for a claim.
 
-    def trial(self, scene: str, **more: Any) -> Trial:
-        """The usual trial of a scene, with the image size and the steps of a quick or full pass. more:
-        further arguments of ``Trial``."""
-        sized: Row = {"size": 64, "steps": 150} if self.quick else {"size": 128, "steps": 400}
-        if recording(scene) is not None:
-            scale = 2.0 if self.quick else 1.0
-            sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
-        return Trial(scene=scene, **{"field": self.field, **sized, **more})
+    text: in words.
+    differences: what must lie above the claim's bound: each of them, or with ``one_suffices`` one of them.
+    """
 
-    def sweep(
-        self,
-        scene: str,
-        seeds: Iterable[int],
-        conditions: Sequence[tuple[Row, Row]],
-        x: str,
-        values: Mapping[str, Sequence[float]],
-        ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
-    ) -> list[Point]:
-        """Points of every seed: in each condition use-all and each value of each policy; and without delay.
+    text: str
+    differences: tuple[Interval, ...]
+    one_suffices: bool = False
 
-        conditions, ideals: (labels in the table, settings of the trial) of each.
-        x: label that holds the value.
-        values: policy -> its values.
-        """
-        found = []
-        for seed in seeds:
-            for labels, settings in conditions:
-                base, labels = self.trial(scene, seed=seed, **settings), {"scene": scene, **labels}
-                found.append(Point({**labels, "policy": "all"}, base))
-                found += [
-                    Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
-                    for policy, some in values.items()
-                    for value in some
-                ]
-            for labels, settings in ideals:
-                ideal = self.trial(scene, seed=seed, channel={"preset": "ideal"}, **settings)
-                found.append(Point({"scene": scene, **labels, "policy": "no delay"}, ideal))
-        return found
+    def above(self, bound: float) -> bool | None:
+        """Whether the differences lie above the bound, by their 95 % intervals; None where that is undecided."""
+        answers = [d.above(bound) for d in self.differences]
+        return (any_of if self.one_suffices else all_of)(answers)
+
+    def p_value(self, bound: float) -> float:
+        """The p-value of ``above``: of all that must hold the largest; of several of which one suffices the smallest,
+        times their number."""
+        above = self.above(bound)
+        values = [d.p_value(bound) for d in self.differences if above is None or d.above(bound) is above]
+        together = above is not self.one_suffices if above is not None else not self.one_suffices
+        return max(values) if together else min(1.0, len(self.differences) * min(values))
+
+
+Statistic = Callable[[SeedTable, str, Row], Finding | None]
+"""(rows, metric, labels of the verdict) -> what was found; None where nothing was measured."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence that holds where a statistic lies above a bound.
+
+    bound: None: the metric's least difference. By metric, or one for all.
+    where: further labels of the rows that it is about; also named in the verdict.
+    metrics: those that it is about; None: the study's.
+    """
+
+    text: str
+    statistic: Statistic
+    bound: float | Mapping[str, float] | None = 0.0
+    where: Row = field(default_factory=dict)
+    metrics: tuple[str, ...] | None = None
+
+    def bound_of(self, metric: str) -> float:
+        if self.bound is None:
+            return METRICS[metric].least
+        return self.bound if isinstance(self.bound, float | int) else self.bound[metric]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The thesis's claim, the result here, and whether the claim holds.
+    """A claim, the result here, and whether the claim holds.
 
     about: scene and setting.
     holds: None where it is undecided.
-    interval: of the difference that the claim is about; None where it is about several, or a single value.
+    interval: of the difference that the claim is about; None where it is about several.
     """
 
     about: str
@@ -169,140 +186,125 @@ class Verdict:
     def verdict(self) -> str:
         return UNDECIDED if self.holds is None else HOLDS if self.holds else DOES_NOT_HOLD
 
-    def mapping(self) -> Row:
-        """As JSON values; the interval as [mean, low, high]."""
-        interval = None if self.interval is None else self.interval.rounded(4)
-        texts = {name: getattr(self, name) for name in ("about", "claim", "found", "verdict")}
-        return {**texts, "interval": interval}
-
     def line(self) -> str:
         return f"[{self.verdict}] {self.about}: {self.claim} Found: {self.found}"
 
 
+Cases = Callable[[StudyRequest], Sequence[Any]]
+Measure = Callable[[Sequence[Any], StudyRequest], list[Row]]
+
+
 @dataclass(frozen=True)
-class Point:
-    """A trial and its labels in the table."""
-
-    labels: Row
-    trial: Trial
-
-
-@dataclass
-class Table:
-    """Points with their results, in the order of the points."""
-
-    points: list[Point]
-    results: list[Row]
-    rows: list[Row] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.rows = [
-            {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, -W_S)}
-            for p, r in zip(self.points, self.results)
-        ]
-
-    def where(self, **labels: Any) -> list[Row]:
-        """Rows that carry all the given labels."""
-        return [row for row in self.rows if all(row.get(k) == v for k, v in labels.items())]
-
-    def values(self, metric: str, **labels: Any) -> dict[int, float | None]:
-        """seed -> value of the point with these labels."""
-        return {row["seed"]: row[metric] for row in self.where(**labels)}
-
-    def curve(self, x: str, metric: str, **labels: Any) -> Curve:
-        """x -> seed -> value, for the points that have an x and at least one value."""
-        found: Curve = {}
-        for row in self.where(**labels):
-            if row.get(x) is not None:
-                found.setdefault(float(row[x]), {})[row["seed"]] = row[metric]
-        return {k: v for k, v in sorted(found.items()) if any(y is not None for y in v.values())}
-
-    def distinct(self, label: str) -> list[Any]:
-        """The label's values in order of appearance."""
-        return list(dict.fromkeys(row[label] for row in self.rows if row.get(label) is not None))
-
-    def means(self) -> list[Row]:
-        """The labels of each point, and [mean, low, high] over its seeds of everything measured."""
-        groups: dict[str, list[Row]] = {}
-        for point, row in zip(self.points, self.rows):
-            groups.setdefault(repr(point.labels), []).append(row)
-        labels = {repr(p.labels): p.labels for p in self.points}
-        measured = [n for n in (self.results[0] if self.results else {}) if n != "decisions"]
-        return [
-            {**labels[key], **{n: interval(row[n] for row in rows).rounded(4) for n in measured}}
-            for key, rows in groups.items()
-        ]
-
-    def no_delay_gain(self, metric: str, **labels: Any) -> str:
-        """Describe how much better no delay is than using all views: the limit of any scheduler's gain."""
-        kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
-        use_all = self.values(metric, policy="all", **labels)
-        limit = self.values(metric, policy="no delay", **kept)
-        _, lower, digits, least = METRICS[metric]
-        gap = paired(use_all, limit) if lower else paired(limit, use_all)
-        if metric == "aaoi_ms":
-            return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
-        nothing = " (nothing to win)" if gap.above(least) is False else ""
-        return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
-
-
 class Study:
-    """One study. name: of the command. title: one line for people."""
+    """One study.
+
+    name: of the command. title: one line for people, which ends with the thesis's figure.
+    cases: what is measured, for a request.
+    measure: the rows of the cases, one for each seed.
+    panels: labels that tell verdicts apart; a claim is judged once for each of their combinations and metric.
+    draw: draws the figures into the request's folder.
+    tables: Markdown below the verdicts.
+    """
 
     name: str
     title: str
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        """Independent trials; none of a study that makes its own."""
-        return []
-
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        """Draw the figures into ``request.out`` and judge the claims."""
-        raise NotImplementedError
-
-
-class SceneStudy(Study):
-    """A study that has the same points in each scene, and judges one scene after the other.
-
-    scenes: the default scenes.
-    """
-
-    scenes: tuple[str, ...] = ("room",)
-
-    def points(self, request: StudyRequest) -> list[Point]:
-        return [p for scene in request.scenes_here(self.scenes) for p in self.of_scene(request, scene)]
-
-    def report(self, request: StudyRequest, table: Table) -> list[Verdict]:
-        return [v for scene in table.distinct("scene") for v in self.judge(request, table, scene)]
-
-    def of_scene(self, request: StudyRequest, scene: str) -> list[Point]:
-        raise NotImplementedError
-
-    def judge(self, request: StudyRequest, table: Table, scene: str) -> list[Verdict]:
-        raise NotImplementedError
+    cases: Cases
+    measure: Measure
+    metrics: tuple[str, ...]
+    claims: tuple[Claim, ...]
+    panels: tuple[str, ...] = ("scene",)
+    draw: Callable[[StudyRequest, SeedTable], None] | None = None
+    tables: Callable[[SeedTable], str] | None = None
 
 
-def run_study(study: Study, request: StudyRequest, engine: Engine) -> list[Verdict]:
-    """Run the trials without stored results, write OUT/NAME.csv, .json, .md and figures, and return the
-    verdicts. Raises StudyError."""
+def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
+    """Measure the cases without stored results, write OUT/NAME.csv, .json, .md and figures, and return the verdicts.
+    Raises StudyError."""
     request.out.mkdir(parents=True, exist_ok=True)
-    points = study.points(request)
-    table = Table(points, engine.run([p.trial for p in points], study.name))
-    if table.rows:
-        write_csv(request.out / f"{study.name}.csv", table.rows)
-    verdicts = study.report(request, table)
-    text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
-    write_text(request.out / f"{study.name}.md", text)
+    rows = study.measure(study.cases(request), request)
+    write_csv(request.out / f"{study.name}.csv", rows)
+    table = SeedTable(rows)
+    if study.draw is not None:
+        study.draw(request, table)
+    verdicts = judge(study, table)
+    write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
     found = {
         "study": study.name,
         "title": study.title,
         "command": request.command(study.name),
         "quick": request.quick,
-        "seeds": len({p.trial.seed for p in points}) or request.seeds,
-        "field": list(dict.fromkeys(p.trial.field for p in points)),
         "commit": commit(),
-        "verdicts": [v.mapping() for v in verdicts],
-        "rows": table.means(),
+        "verdicts": [
+            {
+                **{name: getattr(v, name) for name in ("about", "claim", "found", "verdict")},
+                "interval": None if v.interval is None else v.interval.rounded(4),
+            }
+            for v in verdicts
+        ],
     }
     write_json(request.out / f"{study.name}.json", found)
     return verdicts
+
+
+def judge(study: Study, table: SeedTable) -> list[Verdict]:
+    """The verdicts on all claims, corrected for their number: of those that are decided, an expected share of
+    ``FALSE_DISCOVERY_RATE`` is wrong (Benjamini-Hochberg); the others are undecided."""
+    found: list[tuple[str, Claim, Finding, float]] = []
+    for values in table.distinct(*study.panels):
+        panel = dict(zip(study.panels, values))
+        for claim in study.claims:
+            labels = {**panel, **claim.where}
+            if any(panel.get(k, v) != v for k, v in claim.where.items()):
+                continue
+            for metric in claim.metrics or study.metrics:
+                finding = claim.statistic(table, metric, labels)
+                if finding is not None and finding.differences:
+                    about = ", ".join([*map(str, dict.fromkeys(labels.values())), METRICS[metric].label])
+                    found.append((about, claim, finding, claim.bound_of(metric)))
+    p_values = [finding.p_value(bound) for _, _, finding, bound in found]
+    tested = [p for p in p_values if p > 0.0]  # the others are without noise, and not a matter of chance
+    decided = iter(discoveries(tested, FALSE_DISCOVERY_RATE))
+    kept = [p == 0.0 or next(decided) for p in p_values]
+    return [
+        Verdict(
+            about,
+            claim.text,
+            finding.text,
+            finding.above(bound) if sure else None,
+            finding.differences[-1] if len(finding.differences) == 1 else None,
+        )
+        for (about, claim, finding, bound), sure in zip(found, kept)
+    ]
+
+
+def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Sequence[Verdict]) -> str:
+    """The study as a page: how it was run, how often each claim holds, and folded, where."""
+    of_claim = {v.claim: [w for w in verdicts if w.claim == v.claim] for v in verdicts}
+    counted = [
+        [claim, *(sum(v.verdict == said for v in of) or "" for said in (HOLDS, DOES_NOT_HOLD, UNDECIDED))]
+        for claim, of in of_claim.items()
+    ]
+    each = [[v.claim, v.about, v.verdict, v.found] for of in of_claim.values() for v in of]
+    figures = sorted(p.name for p in request.out.glob(f"{study.name}*.png"))
+    seeds = len({row["seed"] for row in table.rows})
+    parts = [
+        f"# {study.title}",
+        f"`{request.command(study.name)}`: {'quick pass' if request.quick else 'full run'}, {seeds} seeds a point, "
+        f"commit {commit()}. [Rows]({study.name}.csv), [verdicts]({study.name}.json).",
+        f"Intervals are 95 %. Of the {len(verdicts)} verdicts, those that are decided are corrected for their number "
+        f"(Benjamini-Hochberg, false discovery rate {100 * FALSE_DISCOVERY_RATE:g} %).",
+        markdown_table(["claim", HOLDS, DOES_NOT_HOLD, UNDECIDED], counted),
+        "<details><summary>Where, and what was found</summary>",
+        markdown_table(["claim", "where", "verdict", "found"], each),
+        "</details>",
+        *([study.tables(table)] if study.tables is not None else []),
+        *(f"![{study.title}]({name})" for name in figures),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def open_engine(request: StudyRequest, name: str, threads: int | None = None) -> Engine:
+    """The engine of a study's cases, with results in OUT/results/NAME.jsonl."""
+    return Engine(
+        request.out / "results" / f"{name}.jsonl", request.jobs, request.ray, threads, partial(print, flush=True)
+    )

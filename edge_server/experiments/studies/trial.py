@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,16 @@ from camera_node.capture import Camera
 from camera_node.config import source_config
 from edge_server.config import read_config
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication
+from edge_server.scheduler.learned.rewards import W_S, f_w
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
@@ -40,19 +44,17 @@ _TRUTHS_KEPT = 4096
 _SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
 
-Row = dict[str, Any]
-
 
 @dataclass(frozen=True)
 class Trial:
     """One trial.
 
-    scene: a shipped scenario, or a key of ``SCENARIOS``.
+    scene: a shipped scenario, a key of ``SCENARIOS``, or the file of a scenario.
     channel: the scenario's section.
     policy, value: name of the policy and its parameter.
     size: image width and height of a synthetic world.
     scale: divides the image sizes of a recording.
-    cameras: number of cameras of a synthetic world.
+    cameras: number of cameras of a synthetic world; None: the scenario's own.
     steps: optimizer steps per update.
     scratch: restart the field at each update (thesis); otherwise it stays warm, and the first update has
         ``first_steps``.
@@ -67,7 +69,7 @@ class Trial:
     value: float | None = None
     size: int = 64
     scale: float = 1.0
-    cameras: int = 19
+    cameras: int | None = 19
     speed_m_per_s: float | None = 1.0
     field: str = "splat"
     field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -90,9 +92,6 @@ class Trial:
         """Instant of the first decision."""
         return 900.0 + _STAGGER_MS * (self.seed % 64)
 
-    def mapping(self) -> Row:
-        return dataclasses.asdict(self)
-
     def scenario(self) -> Scenario:
         """The deployment as a scenario. Raises ScenarioError."""
         shipped = scenario_of(self.scene, self.seed)
@@ -102,7 +101,8 @@ class Trial:
             source |= {"width": self.size, "height": self.size, "fps": WORLD_FPS}
             if self.speed_m_per_s is not None and source.get("scene") != "tile":  # nothing moves there
                 source["speed_m_per_s"] = self.speed_m_per_s
-            cameras = {"count": self.cameras, "held_out": ["cam00"]}
+            if self.cameras is not None:
+                cameras = {"count": self.cameras, "held_out": ["cam00"]}
         elif self.scale != 1.0:
             source["scale"] = self.scale * source.get("scale", 1.0)
         edge = {
@@ -114,14 +114,14 @@ class Trial:
             "lpips": edge.get("lpips", "alex"),
         }
         data = {
-            "name": self.scene,
+            "name": shipped.name,
             "seed": self.seed,
             "cameras": cameras,
             "source": source,
             "channel": self.channel,
             "edge": edge,
         }
-        return parse(data, Path(f"study {self.scene}"))
+        return parse(data, shipped.path)
 
     def run_settings(self) -> RunSettings:
         return RunSettings(
@@ -136,8 +136,14 @@ class Trial:
 
 
 def scenario_of(scene: str, seed: int = 0) -> Scenario:
-    """The shipped scenario of a scene. Raises ScenarioError."""
+    """The scenario of a scene. Raises ScenarioError."""
     return load(SCENARIOS.get(scene, scene), seed)
+
+
+@lru_cache
+def scene_label(scene: str) -> str:
+    """What a scene is called in tables. Raises ScenarioError."""
+    return scene if scene in SCENARIOS else scenario_of(scene).path.stem
 
 
 @lru_cache
@@ -146,6 +152,109 @@ def recording(scene: str) -> str | None:
     ScenarioError."""
     source = scenario_of(scene).source
     return None if source.get("kind") == "world" else str(source.get("data", ""))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A trial and its labels in the table."""
+
+    labels: Row
+    trial: Trial
+
+
+def usual_trial(request: StudyRequest, scene: str, **more: Any) -> Trial:
+    """The usual trial of a scene, with the image size and the steps of a quick or full pass. more: further arguments
+    of ``Trial``."""
+    sized: Row = {"size": 64, "steps": 150} if request.quick else {"size": 128, "steps": 400}
+    if recording(scene) is not None:
+        scale = 2.0 if request.quick else 1.0
+        sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
+    elif Path(scene).suffix:  # somebody's own scenario keeps its cameras and its speed
+        sized |= {"cameras": None, "speed_m_per_s": None}
+    return Trial(scene=scene, **{"field": request.field, **sized, **more})
+
+
+def scenes_here(request: StudyRequest, default: Sequence[str]) -> list[str]:
+    """The requested scenes, else ``default``, without recorded ones that are not in the data folder. Raises
+    StudyError if none is left."""
+    wanted, data = list(request.scenes or default), request.folders.data
+    found = []
+    for scene in wanted:
+        file = recording(scene)
+        if file is None or (data is not None and (data / file).exists()):
+            found.append(scene)
+        else:
+            print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
+    if not found:
+        raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
+    return found
+
+
+def sweep(
+    request: StudyRequest,
+    scene: str,
+    seeds: Iterable[int],
+    conditions: Sequence[tuple[Row, Row]],
+    x: str,
+    values: Mapping[str, Sequence[float]],
+    ideals: Sequence[tuple[Row, Row]] = (({}, {}),),
+) -> list[Point]:
+    """Points of every seed: in each condition use-all and each value of each policy; and without delay.
+
+    conditions, ideals: (labels in the table, settings of the trial) of each.
+    x: label that holds the value.
+    values: policy -> its values.
+    """
+    found = []
+    name = scene_label(scene)
+    for seed in seeds:
+        for labels, settings in conditions:
+            base, labels = usual_trial(request, scene, seed=seed, **settings), {"scene": name, **labels}
+            found.append(Point({**labels, "policy": "all"}, base))
+            found += [
+                Point({**labels, "policy": policy, x: value}, dataclasses.replace(base, policy=policy, value=value))
+                for policy, some in values.items()
+                for value in some
+            ]
+        for labels, settings in ideals:
+            ideal = usual_trial(request, scene, seed=seed, channel={"preset": "ideal"}, **settings)
+            found.append(Point({"scene": name, **labels, "policy": "no delay"}, ideal))
+    return found
+
+
+def run_points(points: Sequence[Point], request: StudyRequest) -> list[Row]:
+    """The labels, the seed and the results of each point, also rated by F_w (6.37)."""
+    with open_engine(request, "trials") as engine:
+        results = engine.run(
+            partial(run_input, folders=request.folders),
+            [_input(point.trial) for point in points],
+            "trials",
+            files=lambda one: _files(one, request.folders),
+            group=lambda one: json.dumps([one["stage"], one["trial"]["seed"]], sort_keys=True),
+        )
+    return [
+        {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, -W_S)}
+        for p, r in zip(points, results)
+    ]
+
+
+def _input(trial: Trial) -> Row:
+    """All that determines a trial's result: itself, and what its scenario says."""
+    s = trial.scenario()
+    sections = {"source": s.source, "channel": s.channel, "edge": s.edge, "cameras": s.cameras, "held_out": s.held_out}
+    stage = [*trial.stage, trial.field, trial.field_options]
+    return {"trial": dataclasses.asdict(trial), "scenario": sections, "stage": stage}
+
+
+def _files(one: Row, folders: Folders) -> list[Path]:
+    trial = Trial(**one["trial"])
+    used = folders if trial.lpips else dataclasses.replace(folders, lpips=None)
+    return used.files_of(trial.scenario())
+
+
+def run_input(one: Row, *, folders: Folders) -> Row:
+    """``run_trial`` on the engine."""
+    return run_trial(Trial(**one["trial"]), folders)
 
 
 @dataclass

@@ -140,15 +140,10 @@ class StateLayout:
             row[: len(state)] = self.features(state)
         return out
 
-    def standardized(self, states: Sequence[State]) -> StateLayout:
-        """The layout whose embeddings have mean 0 and standard deviation 1 over the cameras of ``states``:
-        what all frames share says nothing about a decision. Returns itself without semantics or
-        embeddings."""
-        if "semantics" not in self.parts:
-            return self
-        found = [s.embeddings[s.reported] for s in states if s.embeddings is not None]
-        rows = np.concatenate(found).astype(np.float64) if found else np.zeros((0, self.dim))
-        rows = rows[np.isfinite(rows).all(axis=1)]
+    def standardized(self, embeddings: NDArray[np.float64]) -> StateLayout:
+        """The layout with which these ``embeddings`` (n, dim) have mean 0 and standard deviation 1: what all frames
+        share says nothing about a decision. Rows that are not finite are ignored; of fewer than two, itself."""
+        rows = embeddings[np.isfinite(embeddings).all(axis=1)]
         if len(rows) < 2:
             return self
         spread = np.maximum(rows.std(axis=0), _MIN_SPREAD * max(1.0, float(np.abs(rows).max())))

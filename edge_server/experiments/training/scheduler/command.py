@@ -7,30 +7,37 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import read_config
+from edge_server.experiments import compare
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.result_store import content_key
-from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.evaluation import Evaluation, baseline_policies, evaluate_policies
-from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
-from edge_server.experiments.training.scheduler.policy_comparison import LEAD_MS, LEARNT, score_policies
-from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
-from edge_server.experiments.training.scheduler.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.common.seed_table import SeedTable
+from edge_server.experiments.common.tables import number
+from edge_server.experiments.engine import Engine, EngineError
+from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.training.scheduler.evaluation import (
+    BASELINE_POLICIES,
+    LEARNED,
+    Candidate,
+    evaluate,
+    fixed_candidates,
+    summary,
+)
+from edge_server.experiments.training.scheduler.learning_curve import draw_curve
 from edge_server.experiments.training.scheduler.trainer import REPORTS, TrainingConfig, TrainingError, read_log, train
-from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.fields.registry import field_names
-from edge_server.scheduler import STATE_PARTS
+from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
 from edge_server.scheduler.learned.rewards import REWARDS
 from freshfield.files import out_folder, write_csv, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
+
+# Policies that train-scheduler --hold compares the learned one with.
+COMPARED = ("all", "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "age-driven")
 
 DESCRIPTION = """\
 Learn when to update the field and from which views: decisions are drawn from the scenario in virtual time,
@@ -57,15 +64,15 @@ publication. Another camera, which is not trained on either, reports how well th
   --reward corrected  -F_w (6.36-6.38) with the sign of SSIM corrected; default for threshold and wait
   --reward thesis     -F_w as printed, which rewards a worse SSIM
 
-An episode is --decisions decisions at random instants. At each, --tries actions are carried out from copies
+An episode is --decisions decisions at random instants. At each, --samples actions are carried out from copies
 of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as
 in the thesis). In a synthetic scene each episode has its own motion, so that tests are on unseen motions.
 Images are small (--size) and the field is fast (--field), so that there are many decisions.
 
-OUT/policy.npz is the learned policy, OUT/training.csv and .png the learning curve with each term of the
-reward, OUT/evaluation.csv and summary.json its rewards on seeds it was not trained on. With --hold, instead
-of these two, OUT/scores.json has its scores in the unmodified scenario, and OUT/actor.npz the part of the
-policy that decides. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
+OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
+learning curve with each term of the reward, OUT/evaluation.csv and summary.json its rewards on seeds it was
+not trained on. With --hold, instead of these two, OUT/scores.json has what edge-server compare finds in the
+unmodified scenario. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
 """
 
 
@@ -82,15 +89,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def work() -> None:
         args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
-        with WorkerPool(folders, args.jobs, args.out / "evaluations.jsonl") as pool:
-            _train_and_evaluate(args, setting, config, pool)
+        _train_and_evaluate(args, setting, config, folders)
 
     stopped = f"what is finished is in {args.out}: the same command goes on"
-    return run_command("train-scheduler", work, (ScenarioError, DatasetError, TrainingError), stopped)
+    return run_command("train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped)
 
 
-def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool) -> None:
-    print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
+def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders) -> None:
+    print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judging)}")
     if config.reward.fidelity == "whole" and not config.reward.age:
         print(
             "  the reward is of the whole image and has no term of age: where little moves it teaches to "
@@ -98,76 +104,62 @@ def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: Trai
         )
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
-    learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
+    learner = train(setting, config, folders, args.jobs, args.out, lambda line: print(f"  {line}", flush=True))
     # Delete the reports of an earlier call, but only after the training was accepted.
     for name in REPORTS:
         (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
     spent_s = sum(row["seconds"] for row in rows)
     write_csv(args.out / "training.csv", rows)
+    learner.actor.save(args.out / "actor.npz")
     print(f"  {config.episodes} episodes; trained for {spent_s:.0f} s in all", flush=True)
-    if not args.test:
-        draw_curve(args.out / "training.png", rows)
-        return
-    if config.spec.hold_ms:
-        draw_curve(args.out / "training.png", rows)
-        _score(args, setting, learner.actor, pool)
-        return
-    kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
-    omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
-    candidates: dict[str, Maker | Actor] = {**baseline_policies(omegas, kinds), LEARNT: learner.actor}
-    evaluation = evaluate_policies(
-        setting.judged,
-        pool,
-        seeds(config.seed, "test", args.test),
-        candidates,
-        config.reward,
-        lambda line: print(f"  on unseen seeds: {line}", flush=True),
-    )
-    about = {
-        "reward_name": config.reward.name,
-        "on": config.reward.fidelity,
-        "seconds": round(spent_s, 1),
-        "rewarded_from": setting.rewarding,
-        "judged_from": setting.judged.scoring,
-        "motions": setting.draws_motions,
-    }
-    _report(args.out, evaluation, kinds[0], rows, about)
+    draw_curve(args.out / "training.png", rows)
+    if args.test and config.spec.hold_ms:
+        _compare(args)
+    elif args.test:
+        _evaluate(args, setting, config, folders, learner.actor, spent_s)
 
 
-def _score(args: argparse.Namespace, setting: Setting, actor: Actor, pool: WorkerPool) -> None:
-    """Score fixed policies and the learnt one in the unchanged scenario: its own image size, all its training
-    cameras."""
-    scenario = load(args.scenario)
-    report = () if set(setting.report) == set(scenario.held_out) else setting.report
-    scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
-    as_it_is = dataclasses.replace(setting, scenario=scenario, report=report, judging=bool(report))
-    weights = content_key((args.out / "policy.npz").read_bytes().hex(), 16)
-    found = score_policies(
-        as_it_is,
-        pool,
-        seeds(args.seed, "test", args.test),
-        actor,
-        weights,
-        args.out / "runs.jsonl",
-        lambda line: print(f"  {line}", flush=True),
-    )
-    write_json(args.out / "scores.json", found, indent=1)
-    actor.save(args.out / "actor.npz")
+def _compare(args: argparse.Namespace) -> None:
+    """Compare the learned policy with fixed ones in the unmodified scenario, to OUT/scores.json."""
+    learned = f"{BANDIT}{args.out / 'actor.npz'}"
+    words = [args.scenario, "all", learned, *COMPARED[1:], "--seeds", str(args.test), "--jobs", str(args.jobs)]
+    words += ["--json", str(args.out / "scores.json"), "--results", str(args.out / "runs.jsonl")]
+    words += ["--data", str(args.data)] if args.data else []
+    if compare.main(words):
+        raise TrainingError("the learned policy was not compared: see above")
 
 
-def _report(out: Path, evaluation: Evaluation, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
-    write_csv(out / "evaluation.csv", rows_of(evaluation))
-    found = summary(evaluation, LEARNT, fixed)
-    names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
-    levels = {label: found["rewards"][name][0] for label, name in names.items()}
-    # The zero of a reward depends on the cameras, so levels of other cameras cannot be drawn with the curve.
-    shown = {} if about["rewarded_from"] != about["judged_from"] else levels
-    draw_curve(out / "training.png", rows, {k: v for k, v in shown.items() if v is not None})
-    write_json(out / "summary.json", {**found, **about}, indent=1)
-    for line in lines(evaluation, LEARNT, fixed):
-        print(f"  {line}")
-    print(f"  {out / 'policy.npz'}: edge-server run SCENARIO --policy bandit:{out / 'policy.npz'}")
+def _evaluate(
+    args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders, actor: Actor, spent_s: float
+) -> None:
+    """Evaluate the learned policy beside all others on unseen seeds, to OUT/evaluation.csv and summary.json."""
+    kind = "threshold" if config.spec.action == "select" else config.spec.action
+    candidates = [
+        *fixed_candidates([kind], BASELINE_POLICIES, {kind: config.spec.omegas_ms or OMEGAS_MS["threshold"]}),
+        Candidate({"policy": LEARNED}, actor),
+    ]
+    with Engine(args.out / "evaluations.jsonl", args.jobs, threads=1) as engine:
+        found = evaluate(setting, folders, engine, seeds(config.seed, "test", args.test), candidates)
+    table = SeedTable(found.rows(config.reward, setting.judging))
+    write_csv(args.out / "evaluation.csv", table.rows)
+    kept = summary(table, kind)
+    about = {"reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent_s, 1)}
+    about |= {"rewarded_from": setting.rewarding, "judged_from": setting.judging, "motions": setting.draws_motions}
+    write_json(args.out / "summary.json", {**kept, **about}, indent=1)
+    lacking = kept["seeds_without_value"]
+    more = f"; {lacking} more have a decision without a reward" if lacking else ""
+    print(f"  reward {_text(kept['reward'])} on {kept['seeds']} unseen seeds{more}")
+    print(f"  over random {_text(kept['over_random'])}")
+    print(f"  over the best fixed {kind} ({kept['best_fixed']}) {_text(kept['over_best_fixed'])}")
+    print(f"  share of the way from random to hindsight: {_text(kept['share'])}")
+    print(f"  {args.out / 'policy.npz'}: edge-server run SCENARIO --policy {BANDIT}{args.out / 'policy.npz'}")
+
+
+def _text(values: Sequence[float | None]) -> str:
+    """[mean, low, high] for people."""
+    mean, low, high = (number(v, 4) for v in values)
+    return f"{mean} [{low}, {high}]"
 
 
 def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
@@ -196,7 +188,8 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch,
         decisions=args.decisions,
-        lead_ms=LEAD_MS if args.hold else 1000.0,
+        deployed=bool(args.hold),
+        lead_ms=compare.LEAD_S * 1e3 if args.hold else 1000.0,
         span_ms=args.hold * args.decisions or 6000.0,
         compute=read_config(given).compute,
         parts=_parts(args.parts),
@@ -249,7 +242,7 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         hold_ms=args.hold,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
-    return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
+    return TrainingConfig(spec, reward, args.episodes, args.batch, args.samples, args.seed)
 
 
 def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
@@ -288,7 +281,7 @@ def _parser() -> argparse.ArgumentParser:
         help="decide in the running deployment, every MS milliseconds [single decisions]",
     )
     add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
-    add("--tries", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
+    add("--samples", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
     add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select and with --hold, else corrected]")
     add(
         "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"

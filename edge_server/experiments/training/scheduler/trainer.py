@@ -1,20 +1,23 @@
-"""Trains a learner: draw decisions, draw actions, evaluate them by field fits, update the weights.
+"""Trains a learner: roll out episodes with drawn actions, reward their outcomes, update the weights.
 
-Several actions are tried at every decision. The baseline of a try is the mean reward of the other tries of
-its decision (``subtract_sibling_baseline``), which reduces the variance of the policy gradient.
+Several samples are taken of every decision. The baseline of a sample is the mean reward of the others of its decision
+(``sibling_advantages``): an estimate of V(s) (5.24) for this scene and channel, which a function of the state cannot
+know. It reduces the variance of the policy gradient without a bias.
 
-The seed determines everything: episodes by their numbers, actions by the learner's random stream, rewards by
-the field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from
-its last checkpoint, on the same kind of processor.
+The seed determines everything: episodes by their numbers, actions by the episode and the number of the sample, rewards
+by the field fits. The learner is the only state between two batches, so a stopped run continues bit for bit from its
+last checkpoint, on the same kind of processor.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.common import tables
-from edge_server.experiments.common.result_store import content_key
-from edge_server.experiments.training.scheduler.choices import choice_of_action
-from edge_server.experiments.training.scheduler.deployed import Decided, sibling_advantages
-from edge_server.experiments.training.scheduler.episode import Outcome
-from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.workers import Progress, WorkerPool
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.engine import Engine
+from edge_server.experiments.engine.content_key import processor
+from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
+from edge_server.experiments.rollouts.rollout import Run, embeddings_seen, run_rollouts
+from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward, RewardTerms
 from freshfield.files import write_json, write_text
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from edge_server.scheduler.learned.ppo import Learner
 
 Row = dict[str, Any]
+Say = Callable[[str], None]
 _PROGRESS_EVERY_S = 5.0
 # Files that train-scheduler writes after a training.
 REPORTS = ("summary.json", "evaluation.csv")
@@ -53,11 +57,8 @@ class TrainingConfig:
     reward: the reward of an outcome.
     episodes: total number of episodes.
     batch: number of episodes of one update of the weights.
-    tries: actions that are evaluated at every decision. With more than one, the baseline of each is the mean
-        reward of the others: an estimate of V(s) (5.24) for this scene and channel, which a function of the
-        state cannot know.
+    samples: actions that are tried at every decision.
     seed: seed of the episodes and of the learner.
-    checkpoint_every: number of batches between checkpoints.
     Raises TrainingError for values out of range.
     """
 
@@ -65,13 +66,12 @@ class TrainingConfig:
     reward: Reward
     episodes: int = 600
     batch: int = 10
-    tries: int = 2
+    samples: int = 2
     seed: int = 0
-    checkpoint_every: int = 5
 
     def __post_init__(self) -> None:
-        if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
-            raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
+        if min(self.episodes, self.batch, self.samples) < 1:
+            raise TrainingError("episodes, batch and samples: expected at least 1")
 
     @property
     def batches(self) -> int:
@@ -83,18 +83,18 @@ class TrainingConfig:
         return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
 
 
-def train(setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]) -> Learner:
+def train(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int, out: Path, say: Say) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
     Writes OUT/training.jsonl (a line per batch), OUT/training.json and, at the end, OUT/policy.npz. After
-    KeyboardInterrupt the last checkpoint is there.
+    KeyboardInterrupt the checkpoint of the last batch is there.
 
     setting: the setting that decisions are drawn from.
-    pool: draws and evaluates them.
+    jobs: number of processes.
     say: called with lines of progress.
 
-    Returns the trained learner. Raises TrainingError if ``out`` holds a training with other settings, or if
-    the first batch has no reward.
+    Returns the trained learner. Raises TrainingError if ``out`` holds a training with other settings, or if the first
+    batch has no reward.
     """
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = _Checkpoint(out, _settings_key(setting, config))
@@ -106,14 +106,14 @@ def train(setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path,
         # The policy and reports of an earlier training must not be taken for those of this one.
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
-        learner = _new_learner(setting, config, pool)
+        learner = _new_learner(setting, config, folders, jobs)
     learner.reward_fields = dataclasses.asdict(config.reward)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
-        row = _train_batch(setting, config, pool, learner, number, say)
+        engine = Engine(jobs=jobs, threads=1, say=_now_and_then(say))
+        row = _train_batch(setting, config, folders, engine, learner, number)
         rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
-        if (number + 1) % config.checkpoint_every == 0 or number + 1 == config.batches:
-            checkpoint.save(learner, rows)
+        checkpoint.save(learner, rows)
         spent = time.monotonic() - began
         left = spent / (number + 1 - first) * (config.batches - number - 1)
         say(f"{_progress_text(config, row)}; {left:.0f} s left")
@@ -127,41 +127,59 @@ def read_log(out: Path) -> list[Row]:
 
 
 def _train_batch(
-    setting: Setting,
-    config: TrainingConfig,
-    pool: WorkerPool,
-    learner: Learner,
-    number: int,
-    say: Callable[[str], None],
+    setting: Setting, config: TrainingConfig, folders: Folders, engine: Engine, learner: Learner, number: int
 ) -> Row:
-    """Do one update of the weights; returns its row of the log. Raises TrainingError if the first batch has
-    no reward."""
+    """Do one update of the weights; returns its row of the log. After the first, a batch without a decision or a
+    reward changes no weights. Raises TrainingError if the first batch has no reward."""
+    from edge_server.scheduler.learned.ppo import Batch
+
     episode_seeds = config.seeds(number)
-    if config.spec.hold_ms:
-        return _train_deployed_batch(setting, config, pool, learner, number)
-    moments = [m for episode in pool.draw(setting, episode_seeds) for m in episode]
-    pool.forget(setting, episode_seeds)
-    # The tries of one decision are adjacent.
-    each = [m for m in moments for _ in range(config.tries)]
-    states = [m.state for m in each]
-    actions, logps = learner.act(states)
-    requests = [(m.seed, m.number, choice_of_action(config.spec, a, m)) for m, a in zip(each, actions)]
-    before = pool.evaluated
-    outcomes = pool.evaluate(setting, requests, periodic_progress(say, f"fits of batch {number + 1}"))
-    found = [config.reward.of(outcome) for outcome in outcomes]
-    # Rewards that lack a term cannot be compared with others.
-    rewards = np.array([_complete(r) for r in found])
-    if number == 0 and not np.isfinite(rewards).any():
-        raise TrainingError(_missing_reward_reason(outcomes, found))
-    advantages = subtract_sibling_baseline(rewards, config.tries)
-    update = learner.update(learner.batch(states, actions, logps, advantages))
-    row = _row(config, episode_seeds, found, outcomes, actions) | {
-        "decisions": len(moments),
-        "fits": len(each),
-        "carried_out": pool.evaluated - before,
-        "processor_seconds": pool.cost_s(setting, requests),
-    }
+    found = run_rollouts(
+        engine,
+        setting,
+        folders,
+        episode_seeds,
+        {"learner": learner.actor},
+        explore=True,
+        name=f"batch {number + 1}",
+        samples=config.samples,
+    )["learner"]
+    samples = [of[0] for of in found.values()]
+    decided = [d for runs in samples for run in runs for d in run.decided]
+    outcomes = [mean_outcome(list(d.outcomes.values())) for d in decided]
+    terms = [config.reward.of(outcome) for outcome in outcomes]
+    if number == 0 and not any(t.complete for t in terms):
+        raise TrainingError(_missing_reward_reason(outcomes, terms))
+    row = _row(config, episode_seeds, terms, outcomes, [d.action for d in decided])
+    row |= {"decisions": sum(len(runs[0].decided) for runs in samples), "fits": len(decided)}
+    if not decided:  # nothing arrived in any of its episodes
+        return row
+    update = learner.update(
+        Batch(
+            np.array([d.features for d in decided]),
+            np.array([d.action for d in decided]),
+            np.array([d.logp for d in decided]),
+            np.concatenate([a for runs in samples for a in sibling_advantages(runs, config.reward)]),
+        )
+    )
     return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
+
+
+def sibling_advantages(runs: Sequence[Run], reward: Reward) -> list[NDArray[np.float64]]:
+    """For each sample of an episode its rewards minus the mean of the other samples in the same slot (leave-one-out
+    baseline); NaN for a missing reward, or if no other sample has one there. With a single sample its rewards."""
+    rewards = [
+        np.array([_complete(reward.of(mean_outcome(list(d.outcomes.values())))) for d in run.decided]) for run in runs
+    ]
+    if len(runs) == 1:
+        return rewards
+    slots = [[d.slot for d in run.decided] for run in runs]
+    known = [{s: r for s, r in zip(*one) if np.isfinite(r)} for one in zip(slots, rewards)]
+    found = []
+    for k, mine in enumerate(slots):
+        others = [[of[s] for j, of in enumerate(known) if j != k and s in of] for s in mine]
+        found.append(rewards[k] - np.array([np.mean(o) if o else np.nan for o in others]))
+    return found
 
 
 def _row(
@@ -169,7 +187,7 @@ def _row(
     episode_seeds: range,
     found: Sequence[RewardTerms],
     outcomes: Sequence[Outcome],
-    actions: Iterable[Any],
+    actions: Sequence[Any],
 ) -> Row:
     """The part of a batch's row of the log that describes its decisions."""
     first = config.seeds(0)[0]
@@ -186,50 +204,22 @@ def _row(
     return row
 
 
-def _train_deployed_batch(
-    setting: Setting, config: TrainingConfig, pool: WorkerPool, learner: Learner, number: int
-) -> Row:
-    """``_train_batch`` for a learner that decides in the running deployment (``deployed``). After the first,
-    a batch without a decision or a reward changes no weights."""
-    episode_seeds = config.seeds(number)
-    each: list[Decided] = []
-    advantages: list[NDArray[np.float64]] = []
-    for tries in pool.play(setting, episode_seeds, learner.actor, config.tries):
-        rewards = [[_complete(config.reward.of(d.outcome)) for d in one] for one in tries]
-        advantages += sibling_advantages(tries, config.spec.hold_ms, rewards)
-        each += [d for one in tries for d in one]
-    found = [config.reward.of(d.outcome) for d in each]
-    if number == 0 and not any(r.complete for r in found):
-        raise TrainingError(_missing_reward_reason([d.outcome for d in each], found))
-    decisions = [d.decision for d in each]
-    row = _row(config, episode_seeds, found, [d.outcome for d in each], [d.action for d in decisions])
-    if not each:  # nothing arrived in any of its episodes
-        return row | {"decisions": 0}
-    batch = learner.batch(
-        [d.state for d in decisions],
-        np.array([d.action for d in decisions]),
-        np.array([d.logp for d in decisions]),
-        np.concatenate(advantages),
-    )
-    update = dataclasses.asdict(learner.update(batch))
-    return row | {"decisions": len(each)} | {k: v for k, v in update.items() if k != "reward"}
-
-
 def _complete(found: RewardTerms) -> float:
+    """A reward that lacks a term cannot be compared with others: NaN."""
     return float("nan") if found.total is None or not found.complete else found.total
 
 
-def periodic_progress(say: Callable[[str], None], what: str) -> Progress:
-    """Progress of evaluations that prints a line every few seconds."""
+def _now_and_then(say: Say) -> Say:
+    """``say`` at most every few seconds."""
     last_s = time.monotonic()
 
-    def progress(done: int, count: int) -> None:
+    def sometimes(line: str) -> None:
         nonlocal last_s
         if time.monotonic() - last_s >= _PROGRESS_EVERY_S:
             last_s = time.monotonic()
-            say(f"{done}/{count} {what}")
+            say(line)
 
-    return progress
+    return sometimes
 
 
 def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
@@ -247,52 +237,28 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
     )
 
 
-def subtract_sibling_baseline(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
-    """Subtract from each reward the mean reward of its siblings, the other tries of the same decision
-    (leave-one-out baseline), which reduces the variance of the gradient without a bias.
-
-    rewards: (B,), the tries of one decision next to each other; NaN for a missing reward.
-    tries: number of tries of a decision; with one there are no siblings and the rewards are returned.
-
-    Returns (B,); NaN if the reward or those of all siblings are NaN.
-    """
-    if tries == 1:
-        return rewards
-    table = rewards.reshape(-1, tries)
-    known = np.isfinite(table)
-    filled = np.where(known, table, 0.0)
-    count = known.sum(axis=1, keepdims=True) - known
-    with np.errstate(divide="ignore", invalid="ignore"):
-        others = (filled.sum(axis=1, keepdims=True) - filled) / count
-    return np.where(known, table - others, np.nan).reshape(-1)
-
-
-def _new_learner(setting: Setting, config: TrainingConfig, pool: WorkerPool) -> Learner:
+def _new_learner(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int) -> Learner:
     from edge_server.scheduler.learned.ppo import Learner
 
     spec = config.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
-        if spec.hold_ms:
-            untrained = Learner(spec, config.seed).actor
-            played = pool.play(setting, config.seeds(0), untrained, 1)
-            states = [d.decision.state for tries in played for one in tries for d in one]
-        else:
-            states = [m.state for e in pool.draw(setting, config.seeds(0)) for m in e]
-        spec = dataclasses.replace(spec, layout=spec.layout.standardized(states))
+        work = partial(embeddings_seen, setting=setting, folders=folders)
+        rows = Engine(jobs=jobs, threads=1, say=lambda line: None).run(work, list(config.seeds(0)))
+        seen = np.array([z for of in rows for z in of], np.float64).reshape(-1, spec.layout.dim)
+        spec = dataclasses.replace(spec, layout=spec.layout.standardized(seen))
     return Learner(spec, config.seed)
 
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    """Checkpoint of a training. The weights are written first, under a new name, then the file that names
-    them, so the checkpoint is complete whenever the process is stopped."""
+    """Checkpoint of a training. The weights are written first, under a new name, then the file that names them, so
+    the checkpoint is complete whenever the process is stopped."""
 
     out: Path
     key: str
 
     def load(self) -> tuple[Learner | None, list[Row]]:
-        """The learner and the rows of its log; (None, []) if there is no training here. Raises
-        TrainingError."""
+        """The learner and the rows of its log; (None, []) if there is no training here. Raises TrainingError."""
         from edge_server.scheduler.learned.ppo import Learner
 
         path = self.out / "training.json"
@@ -325,9 +291,8 @@ class _Checkpoint:
 
 
 def _settings_key(setting: Setting, config: TrainingConfig) -> str:
-    settings = dataclasses.asdict(config)
-    settings.pop("checkpoint_every")  # does not affect what is learned
-    return content_key(json.dumps([setting.key, settings], sort_keys=True, default=str), 24)
+    parts = [processor(), setting.key, dataclasses.asdict(config)]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:24]
 
 
 def _progress_text(config: TrainingConfig, row: Row) -> str:

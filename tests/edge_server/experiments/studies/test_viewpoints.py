@@ -9,73 +9,69 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.experiments.studies import preferences, viewpoints
-from edge_server.experiments.studies.engine import Engine
-from edge_server.experiments.studies.study import StudyRequest, run_study
+from edge_server.experiments.studies.study import StudyRequest, judge, run_study
 from edge_server.experiments.viewpoints.reconstructions import varied_plan
 from edge_server.fields import Rendering, View
 from edge_server.viewpoints.candidates import half_hemisphere
 from freshfield.geometry import Pinhole
+from tests.edge_server.experiments.studies.invented import answers
 
 TINY = viewpoints.Workload((3, 8), 16, 3, 24)
 
 
-def rows(better_db):
-    return [
-        {
-            "arm": arm,
-            "seed": s,
-            "views": v,
-            "psnr_db": 20 + v * better_db + 0.01 * s + (arm != "random") * better_db,
-            "path_m": 5.0 - better_db + 0.01 * s * (arm == "random"),
-        }
-        for arm in viewpoints.ARMS
-        for s in range(4)
-        for v in (3, 8)
-    ]
-
-
 def test_verdicts_of_viewpoints_follow_the_figures():
     for better, answer in ((1.0, "holds"), (-1.0, "does not hold")):
-        found = {v.about: v.verdict for v in viewpoints.judge("tile", rows(better), (3, 8))}
-        assert found["tile, random"] == found["tile, FisherRF, 8 views"] == answer
-
-
-def test_verdicts_of_preferences_follow_the_figures():
-    def answers(share, knows):
-        return [
+        rows = [
             {
-                "taste": t,
-                "habit": h,
-                "answers": 60,
+                "scene": "tile",
+                "arm": arm,
                 "seed": s,
-                "agreement": 0.82 * share + 0.001 * s,
-                "with_itself": 0.82,
-                "knows": knows,
+                "views": v,
+                "psnr_db": 20 + v * better + 0.01 * s * (v + (arm != "random")) + (arm != "random") * better,
+                "path_m": 5.0 - better * (arm != "random") + 0.01 * s * (arm == "random"),
             }
-            for t in preferences.TASTES
-            for h in preferences.HABITS
+            for arm in viewpoints.ARMS
             for s in range(4)
+            for v in (3, 8)
         ]
-
-    assert {v.verdict for v in preferences.judge_answers("tile", answers(0.95, False))} == {"holds"}
-    assert {v.verdict for v in preferences.judge_answers("tile", answers(0.85, True))} == {"does not hold"}
+        assert answers(judge(viewpoints.VIEWPOINTS, SeedTable(rows))) == {answer}
 
 
-def test_a_policy_is_judged_by_quality_and_by_its_way():
-    captures = [
-        {"arm": arm, "seed": s, "psnr_db": db + 0.01 * s, "path_m": m + 0.01 * s * (arm == "random")}
-        for arm, db, m in (("random", 20.0, 5.0), ("FisherRF", 22.0, 2.0), ("policy, edges", 21.0, 3.0))
+@pytest.mark.parametrize(("share", "knows", "said"), [(0.95, False, "holds"), (0.85, True, "does not hold")])
+def test_verdicts_of_preferences_follow_the_answers(share, knows, said):
+    rows = [
+        {
+            "scene": "tile",
+            "taste": t,
+            "habit": h,
+            "answers": 60,
+            "seed": s,
+            "agreement_share": share + 0.001 * s,
+            "does_not_know": float(not knows),
+        }
+        for t in preferences.TASTES
+        for h in preferences.HABITS
         for s in range(4)
     ]
-    found = {(v.about, v.claim): v.verdict for v in preferences.judge_captures("tile", captures)}
-    about = "tile, policy, edges, 8 views"
+    found = judge(preferences.PREFERENCES, SeedTable(rows))
+    assert answers(found) == {said} and len(found) == len(preferences.TASTES) + 1
+
+
+def test_a_policy_is_judged_by_quality_and_by_its_path():
+    captures = [
+        {"scene": "tile", "arm": arm, "seed": s, "psnr_db": db + 0.01 * s * k, "path_m": m + 0.01 * s * k}
+        for k, (arm, db, m) in enumerate((("random", 20.0, 5.0), ("FisherRF", 22.0, 2.0), ("policy, edges", 21.0, 3.0)))
+        for s in range(4)
+    ]
+    found = {v.claim: v.verdict for v in judge(preferences.PREFERENCES, SeedTable(captures))}
     assert found == {
-        (about, "better than random (table 4.3)."): "holds",
-        (about, "better than FisherRF (table 4.3)."): "does not hold",
-        (f"{about}, path", "shorter than random's (table 4.3)."): "holds",
-        (f"{about}, path", "shorter than FisherRF's (table 4.3)."): "does not hold",
+        "better views than random's (table 4.3).": "holds",
+        "a shorter path than random's (table 4.3).": "holds",
+        "better views than FisherRF's (table 4.3).": "does not hold",
+        "a shorter path than FisherRF's (table 4.3).": "does not hold",
     }
 
 
@@ -110,23 +106,21 @@ def test_plans_to_compare_have_the_views_asked_for_where_candidates_are_few():
 @pytest.mark.slow
 def test_both_studies_run_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(viewpoints, "QUICK", TINY)
-    monkeypatch.setattr(preferences, "QUICK", TINY)
     monkeypatch.setattr(preferences, "_POOL", {True: 15})
     monkeypatch.setattr(preferences, "_UPDATES", {True: 1})
     monkeypatch.setattr(preferences, "ASKED", (3, 6))
     request = StudyRequest(True, tmp_path, Folders(), seeds=2)
-    for study in (viewpoints.Viewpoints(), preferences.Preferences()):
-        assert run_study(study, request, Engine(tmp_path))
-        assert "simulated" not in study.name and (tmp_path / f"{study.name}-tables.md").exists()
-    assert "Simulated experts only" in (tmp_path / "preferences-tables.md").read_text()
+    for study in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
+        assert run_study(study, request)
+    assert "Simulated experts only" in (tmp_path / "preferences.md").read_text()
     table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
     assert {r["arm"] for r in table} == set(viewpoints.ARMS) and len(table) == len(viewpoints.ARMS) * 2 * 2
     first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage" and r["views"] == "3"}
     assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
-    assert (tmp_path / "policy-tile-edges.npz").exists() and (tmp_path / "viewpoints-tile-paths.png").exists()
+    assert (tmp_path / "viewpoints-tile-paths.png").exists() and (tmp_path / "preferences-tile.png").exists()
 
     # The same command again finds everything done: not even a policy is trained.
-    before = (tmp_path / "preferences-captures.csv").read_bytes()
+    before = (tmp_path / "preferences.csv").read_bytes()
     monkeypatch.setattr(preferences, "train_policy", None)
-    run_study(preferences.Preferences(), request, Engine(tmp_path))
-    assert (tmp_path / "preferences-captures.csv").read_bytes() == before
+    run_study(preferences.PREFERENCES, request)
+    assert (tmp_path / "preferences.csv").read_bytes() == before

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from edge_server.experiments.training.scheduler.episode import Outcome
+from edge_server.experiments.rollouts.episode import Outcome
 from edge_server.fidelity.scorer import Score
 from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import REWARDS, f_w, make_reward

@@ -47,7 +47,8 @@ def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_
         z[4] = 1e6  # of a camera that is silent: nobody's
         z[0] = np.nan
         states.append(replace(s, embeddings=z))
-    layout = StateLayout(("semantics",), dim=3).standardized(states)
+    seen = np.concatenate([s.embeddings[s.reported] for s in states]).astype(np.float64)
+    layout = StateLayout(("semantics",), dim=3).standardized(seen)
     z = np.sqrt(3) * np.concatenate([layout.features(s)[1:4, :3] for s in states])
     np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=1e-3)
     np.testing.assert_allclose(z.std(axis=0), 1.0, atol=1e-3)
@@ -57,7 +58,7 @@ def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_
 def test_an_embedding_that_hardly_varies_is_not_blown_up_to_noise():
     s = state(4, np.random.default_rng(2), d=2)
     still = np.full((4, 2), 3.0, np.float32) + np.float32([[0, 0], [1e-6, 0], [0, 0], [0, 0]])
-    layout = StateLayout(("semantics",), dim=2).standardized([replace(s, embeddings=still)])
+    layout = StateLayout(("semantics",), dim=2).standardized(still.astype(np.float64))
     assert np.abs(layout.features(replace(s, embeddings=still))[:, :2]).max() < 1e-2
 
 

@@ -1,0 +1,192 @@
+"""``edge-server compare``: what policies show in a scenario, over seeds, in virtual time with computing charged.
+
+All policies run with the same channels, motions and instants, so that differences are paired by seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.config import ComputeConfig, read_config
+from edge_server.experiments.common.arguments import add_folders, at_least, command_parser, folders_of, run_command
+from edge_server.experiments.common.channels import read_channel
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import Row, SeedTable
+from edge_server.experiments.common.statistics import discoveries, interval, paired
+from edge_server.experiments.engine import Engine, EngineError
+from edge_server.experiments.rollouts.rollout import run_rollouts
+from edge_server.experiments.rollouts.setting import Setting, seeds
+from edge_server.report.machine import commit, machine
+from edge_server.scheduler import STATE_PARTS, short_name
+from freshfield.files import out_file, write_json
+from freshfield.machine_load import usable_cores
+from freshfield.scenario import Scenario, ScenarioError, load
+
+DESCRIPTION = """\
+Compare what policies show in a scenario: every policy runs with the same seeds, each of which draws a channel,
+a motion (in a synthetic scene) and the instants at which the shown image is scored on the held-out cameras.
+Computing is charged as edge.compute says. The first policy is the one that the others are compared with.
+
+  edge-server compare room19 all threshold:120 wait:60 --seeds 8
+  edge-server compare card all bandit:runs/card/policy.npz --seeds 14 --json scores.json
+  edge-server compare room19 all freshest-k:6 --channel my-channel.yaml
+
+Intervals are 95 % (Student's t, over seeds; differences paired by seed). A star marks the differences that are
+decided at a false discovery rate of 5 % over all of them (Benjamini-Hochberg).
+"""
+# Decisions have no effect until the layers of a field have begun.
+LEAD_S, SPAN_S = 5.0, 8.0
+# metric -> (head of its column, digits, whether it is compared)
+COLUMNS = {
+    "psnr_db": ("shown (dB)", 2, True),
+    "psnr_moving_db": ("moving pixels (dB)", 2, True),
+    "ssim": ("SSIM", 3, False),
+    "lpips": ("LPIPS", 3, False),
+    "views": ("views", 1, False),
+    "aaoi_ms": ("their age (ms)", 0, False),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    errors = (ScenarioError, DatasetError, EngineError, ValueError)
+    stopped = f"finished runs are kept in {args.results}" if args.results else "nothing was kept: see --results"
+    return run_command("compare", lambda: _run(args), errors, stopped)
+
+
+def _run(args: argparse.Namespace) -> None:
+    setting = setting_of(load(args.scenario), args.seconds, args.channel, args.costs, args.slower)
+    labels = _labels(args.policies)
+    with Engine(args.results, args.jobs, threads=1) as engine:
+        table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
+        own = None if args.json is None else _own_seed(setting, folders_of(args), engine, labels)
+    print(as_text(table, list(labels)))
+    if args.json is not None:
+        about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
+        about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}
+        about |= {"compute": dataclasses.asdict(setting.compute), "machine": machine(), "commit": commit()}
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        write_json(args.json, {**about, "policies": as_json(table, list(labels), own or {})}, indent=1)
+
+
+def setting_of(
+    scenario: Scenario, seconds: float, channel: str | None = None, costs: Path | None = None, slower: float = 1.0
+) -> Setting:
+    """The setting of a comparison in a scenario as it stands.
+
+    seconds: scored, after the lead. channel: as in ``read_channel``. costs: a file of ``edge-server costs``.
+    slower: factor on all costs.
+    Raises ScenarioError or ValueError.
+    """
+    edge = {**scenario.edge, "policy": {"name": "all"}}
+    if costs is not None:
+        edge["compute"] = str(costs.resolve())
+    scenario = dataclasses.replace(scenario, edge=edge)
+    if channel is not None:
+        scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])
+    charged = dataclasses.asdict(read_config(scenario).compute)
+    if not slower > 0.0 or (slower != 1.0 and not any(charged.values())):
+        raise ValueError(f"--slower {slower:g}: expected more than 0, and a scenario or --costs that charge something")
+    compute = ComputeConfig(**{name: slower * ms for name, ms in charged.items()})
+    return Setting(
+        scenario, deployed=True, lead_ms=LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute, parts=STATE_PARTS
+    )
+
+
+def compare(
+    setting: Setting, folders: Folders, engine: Engine, policies: Mapping[str, str], seeds: Sequence[int]
+) -> SeedTable:
+    """A row for each policy and seed with the means of an episode's shown images and updates.
+
+    policies: label -> policy as people write it. Raises ScenarioError, DatasetError, ValueError or EngineError.
+    """
+    found = run_rollouts(engine, setting, folders, seeds, policies, name="compare")
+    return SeedTable(
+        [
+            {"policy": label, "seed": seed, **dataclasses.asdict(whole)}
+            for label, by_seed in found.items()
+            for seed, repeats in by_seed.items()
+            if (whole := repeats[0][0].whole) is not None
+        ]
+    )
+
+
+def as_text(table: SeedTable, labels: Sequence[str]) -> str:
+    """The table for people: means with intervals, and differences to the first policy."""
+    first, others = labels[0], labels[1:]
+    compared = [(label, metric) for label in others for metric, (_, _, of) in COLUMNS.items() if of]
+    gaps = {at: paired(table.values(at[1], policy=at[0]), table.values(at[1], policy=first)) for at in compared}
+    same = [gap.low == gap.high == 0.0 for gap in gaps.values()]  # decided, but no difference
+    p_values = [1.0 if equal else gap.p_value(0.0) for equal, gap in zip(same, gaps.values())]
+    stars = dict(zip(gaps, discoveries(p_values)))
+    head = ["policy"]
+    for name, _, of in COLUMNS.values():
+        head += [name, f"minus {first}"] if of else [name]
+    lines = [head]
+    for label in labels:
+        cells = [label]
+        for metric, (_, digits, of) in COLUMNS.items():
+            cells.append(interval(table.values(metric, policy=label).values()).text(digits))
+            if of:
+                gap = gaps.get((label, metric))
+                cells.append("" if gap is None else gap.text(digits) + " *" * stars[label, metric])
+        lines.append(cells)
+    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths)).rstrip() for line in lines)
+
+
+def as_json(table: SeedTable, labels: Sequence[str], own: Mapping[str, Row]) -> dict[str, Any]:
+    """The comparison as JSON values, which the page shows if ``edge.scores`` names the file: for each policy
+    ``own_seed`` (with the scenario's own seed), and [mean, low, high] of each metric and of its difference to the
+    first policy."""
+    found: dict[str, Any] = {}
+    for label in labels:
+        row: dict[str, Any] = {"own_seed": own[label]} if label in own else {}
+        for metric, (_, _, of) in COLUMNS.items():
+            values = table.values(metric, policy=label)
+            row[metric] = interval(values.values()).rounded(4)
+            if of:
+                row[f"{metric}_over_{labels[0]}"] = paired(values, table.values(metric, policy=labels[0])).rounded(4)
+        found[label] = row
+    return found
+
+
+def _own_seed(setting: Setting, folders: Folders, engine: Engine, labels: Mapping[str, str]) -> dict[str, Row]:
+    """What each policy shows with the scenario's own seed and motion."""
+    as_it_is = dataclasses.replace(setting, motions=False)
+    table = compare(as_it_is, folders, engine, labels, [setting.scenario.seed])
+    return {row["policy"]: {name: row[name] for name in COLUMNS} for row in table.rows}
+
+
+def _labels(policies: Sequence[str]) -> dict[str, str]:
+    """Label -> policy; a learned policy is named without its folder where that tells it apart."""
+    short = [short_name(policy) for policy in policies]
+    return {label if short.count(label) == 1 else policy: policy for label, policy in zip(short, policies)}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser("compare", DESCRIPTION)
+    add = parser.add_argument
+    add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
+    add(
+        "policies",
+        nargs="+",
+        metavar="POLICY",
+        help="as edge.policy, with its value: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+    )
+    add("--seeds", type=at_least(1), default=8, metavar="N", help="number of seeds [%(default)s]")
+    add("--channel", metavar="FILE|PRESET", help="a channel in place of the scenario's: a file, or a preset")
+    add("--seconds", type=float, default=SPAN_S, metavar="S", help=f"seconds scored, after {LEAD_S:g} [%(default)g]")
+    add("--costs", type=Path, metavar="FILE", help="file written by `edge-server costs` [edge.compute of the scenario]")
+    add("--slower", type=float, default=1.0, metavar="K", help="computing takes K times as long [%(default)g]")
+    add("--jobs", type=at_least(1), default=usable_cores(), metavar="N", help="worker processes [%(default)s]")
+    add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE, which edge.scores may name")
+    add("--results", type=out_file, metavar="FILE", help="keep finished runs in FILE, and use those it has [none]")
+    add_folders(parser)
+    return parser

@@ -1,0 +1,328 @@
+"""One rollout for training, evaluation and comparison: an episode in which an actor decides, whole in one process.
+
+An actor makes a policy from a random generator: a fixed one by name, or one with a learned actor's weights. In a
+``deployed`` setting the policy decides in a running deployment, with computing charged, and the outcome of a decision
+is what is shown until the next one; it also depends on all earlier decisions. Otherwise it decides at single
+instants, each time from the same field, so that the outcomes of several samples of one decision are comparable
+(``episode``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from edge_server.config import read_config
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.engine import Engine
+from edge_server.experiments.rollouts.episode import SCORES, Choice, Episode, EpisodeFactory, Outcome
+from edge_server.experiments.rollouts.setting import Setting
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.live.state import Publication
+from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.bandit import BanditPolicy
+from edge_server.scheduler.learned.decision import Decision
+from edge_server.scheduler.learned.learner_spec import Spec
+
+# Period of the instants at which the shown image is scored, in a running deployment.
+SHOWN_EVERY_MS = 125.0
+# Number of settings whose images a process keeps.
+_FACTORIES_KEPT = 3
+_FACTORIES: dict[tuple[str, Folders], EpisodeFactory] = {}
+
+PolicyMaker = Callable[[np.random.Generator], Policy]
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A decision and its outcome, as plain values.
+
+    slot: number of the decision; those of one slot in several samples of an episode are comparable.
+    outcomes: by the camera that scored; in a running deployment by "", the mean over all cameras.
+    features, action, logp: what a learned policy saw ((N, width)), its action ((N,) bool, or the index of an omega) and
+        its log-probability; None and 0 for other policies.
+    """
+
+    slot: int
+    outcomes: dict[str, Outcome]
+    features: list[list[float]] | None = None
+    action: Any = None
+    logp: float = 0.0
+
+    @staticmethod
+    def of_policy(slot: int, outcomes: dict[str, Outcome], decision: Decision | None) -> Decided:
+        """With the last decision of a learned policy; None: of another one."""
+        if decision is None:
+            return Decided(slot, outcomes)
+        features = decision.actor.spec.layout.features(decision.state)
+        return Decided(slot, outcomes, features.tolist(), decision.action.tolist(), decision.logp)
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Decided:
+        """From what ``dataclasses.asdict`` gave."""
+        return Decided(**{**data, "outcomes": {c: Outcome(**o) for c, o in data["outcomes"].items()}})
+
+
+@dataclass(frozen=True)
+class Run:
+    """One sample of an episode. whole: the outcome of all of it; None unless in a running deployment."""
+
+    decided: list[Decided]
+    whole: Outcome | None = None
+
+
+def rollout(
+    factory: EpisodeFactory, seed: int, make: PolicyMaker, samples: int = 1, cameras: tuple[str, ...] | None = None
+) -> list[Run]:
+    """Runs of the episode of ``seed`` under a policy, each with random numbers of its own. The result depends on the
+    arguments only.
+
+    make: makes the policy of each run.
+    cameras: held-out cameras that score; None: those that reward.
+    """
+    play = _deployed if factory.setting.deployed else _single_decisions
+    return [play(factory, seed, make(np.random.default_rng([seed, k])), cameras) for k in range(samples)]
+
+
+# --- single decisions -------------------------------------------------------------------------------------
+
+
+def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple[str, ...] | None) -> Run:
+    episode = factory.episode(seed)
+    decided = []
+    for number in range(len(episode.moments)):
+        outcomes = episode.evaluate(number, choose(policy, episode, number), cameras)
+        decided.append(Decided.of_policy(number, outcomes, policy.last_decision))
+    return Run(decided)
+
+
+def choose(policy: Policy, episode: Episode, number: int) -> Choice:
+    """Plan, wait and select with ``policy`` at a decision, as in the live loop. A policy that would wait past the
+    channel's record uses all newest frames at its end."""
+    moment = episode.moments[number]
+
+    def epoch(at_ns: int) -> Epoch:
+        newest = moment.newest(at_ns)
+        generated = {c: arrival.generated_ns for c, arrival in newest.items()}
+        received = {c: arrival.received_ns for c, arrival in newest.items()}
+        known = at_ns == moment.now_ns
+        return Epoch(
+            at_ns, number, generated, lambda parts=(): moment.state if known else episode.state(newest, at_ns), received
+        )
+
+    plan = policy.plan(epoch(moment.now_ns))
+    at_ns = min(max(moment.now_ns, plan.wait_until_ns), moment.until_ns)
+    cameras = policy.select(epoch(at_ns), plan)
+    while not cameras:
+        arrives_ns = moment.next_arrival_ns(at_ns)
+        if arrives_ns is None:
+            at_ns = moment.until_ns
+            cameras = tuple(moment.newest(at_ns))
+            break
+        at_ns = arrives_ns
+        cameras = policy.select(epoch(at_ns), plan)
+    return Choice(tuple(cameras), at_ns)
+
+
+# --- a running deployment ---------------------------------------------------------------------------------
+
+
+def _deployed(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple[str, ...] | None) -> Run:
+    """Run an episode under ``policy``: the decisions after the lead of a learned policy, and the outcome of all that
+    was shown after it."""
+    setting, scenario = factory.setting, factory.scenario(seed)
+    edge, stage, field = read_config(scenario), factory.stage(seed), factory.field(seed)
+    field.reset()
+    decisions: list[Decision] = []
+
+    def published(publication: Publication) -> None:
+        last = policy.last_decision
+        if last is not None and (not decisions or decisions[-1].now_ns != last.now_ns):
+            decisions.append(last.without_frames())
+
+    settings = RunSettings(
+        steps=edge.steps,
+        compute=setting.compute,
+        grace_ms=edge.grace_ms,
+        epoch_ms=edge.update_ms,
+        score_every_ms=None,
+        shown_every_ms=SHOWN_EVERY_MS,
+    )
+    deployment = build_deployment(
+        scenario,
+        settings,
+        field=field,
+        cameras=stage.cameras,
+        truth=stage.truth(cameras or setting.rewarding),
+        embedder=factory.embedder,
+        on_published=published,
+    )
+    deployment.updates.policy = policy
+    deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
+    lead_ns, end_ns = round(setting.lead_ms * 1e6), deployment.clock.now_ns()
+
+    def outcome(begin_ns: int, until_ns: int) -> Outcome:
+        """Means of the images shown and of the updates published in [begin, until)."""
+        shown = [s for s in deployment.shown if begin_ns <= s.published_ns < until_ns]
+        updates = [p for p in deployment.publications if begin_ns <= p.published_ns < until_ns]
+        return Outcome(
+            **{name: mean_or_none([getattr(s, name) for s in shown]) for name in SCORES},
+            aaoi_ms=mean_or_none([p.aaoi_ms for p in updates]),
+            views=mean_or_none([p.views for p in updates]) or 0.0,
+            wait_ms=mean_or_none([p.update_ms for p in updates]) or 0.0,
+        )
+
+    kept = [d for d in decisions if d.now_ns >= lead_ns]
+    ends = [*(d.now_ns for d in kept[1:]), end_ns]
+    hold_ns = round((kept[0].actor.spec.hold_ms if kept else 0.0) * 1e6) or 1
+    decided = [Decided.of_policy(d.now_ns // hold_ns, {"": outcome(d.now_ns, end)}, d) for d, end in zip(kept, ends)]
+    return Run(decided, outcome(lead_ns, end_ns))
+
+
+# --- actors ------------------------------------------------------------------------------------------------
+
+
+def named(name: str) -> PolicyMaker:
+    """Maker of a policy as people write it, such as ``threshold:120``. Raises ValueError."""
+    return partial(_make_named, *parse_policy(name))
+
+
+def _make_named(name: str, value: float | None, rng: np.random.Generator) -> Policy:
+    return make_policy(name, value, rng)
+
+
+def learned(actor: Actor, explore: bool = False) -> PolicyMaker:
+    """Maker of a policy with these weights. explore: actions are drawn; otherwise the most probable ones."""
+    return partial(_make_learned, actor, explore)
+
+
+def _make_learned(actor: Actor, explore: bool, rng: np.random.Generator) -> Policy:
+    return BanditPolicy(actor, "learned", rng, explore=explore)
+
+
+def choice_of_action(spec: Spec, action: Any, episode: Episode, number: int) -> Choice:
+    """The choice of a learner's action: (N,) bool, or an index into the specification's omegas. An empty set uses the
+    first frame that arrives."""
+    moment = episode.moments[number]
+    if spec.action != "select":
+        policy = make_policy(spec.action, spec.omegas_ms[int(action)], np.random.default_rng(0))
+        return choose(policy, episode, number)
+    cameras = tuple(c for c, chosen in zip(moment.cameras, action) if chosen)
+    use_all = make_policy("all", None, np.random.default_rng(0))
+    return Choice(cameras, moment.now_ns) if cameras else choose(use_all, episode, number)
+
+
+# --- on the engine -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """What determines the runs of one episode under one actor.
+
+    setting: its key. actor: name of a policy, or digest of the weights.
+    repeats: how often, each time with a field of another seed.
+    """
+
+    setting: str
+    seed: int
+    actor: str
+    samples: int = 1
+    cameras: tuple[str, ...] = ()
+    repeats: int = 1
+
+
+def run_rollouts(
+    engine: Engine,
+    setting: Setting,
+    folders: Folders,
+    seeds: Sequence[int],
+    actors: Mapping[str, str | Actor],
+    *,
+    explore: bool = False,
+    name: str = "rollouts",
+    **job: Any,
+) -> dict[str, dict[int, list[list[Run]]]]:
+    """Actor -> seed -> runs, for each of the job's repeats and samples.
+
+    actors: by name: a policy as people write it, or a learned actor.
+    explore: whether learned actors draw their actions.
+    job: further fields of ``Job``.
+    Raises ScenarioError, DatasetError, ValueError or EngineError.
+    """
+    loaded = {n: _loaded(who) for n, who in actors.items()}
+    digests = {n: who if isinstance(who, str) else _digest(who) for n, who in loaded.items()}
+    makers = {n: named(who) if isinstance(who, str) else learned(who, explore) for n, who in loaded.items()}
+    by_digest = {digests[n]: makers[n] for n in actors}
+    files = folders.files_of(setting.scenario)
+    jobs = [Job(setting.key, seed, digests[n], **job) for seed in seeds for n in actors]
+    found = engine.run(
+        partial(_carry_out, setting=setting, folders=folders, makers=by_digest),
+        jobs,
+        name,
+        files=lambda one: files,
+        group=lambda one: one.seed,  # one process renders the images of an episode, once
+        batch=len(actors),
+    )
+    kept: dict[str, dict[int, list[list[Run]]]] = {n: {} for n in actors}
+    for (seed, n), repeats in zip([(seed, n) for seed in seeds for n in actors], found):
+        kept[n][seed] = [[_run_of(run) for run in runs] for runs in repeats]
+    return kept
+
+
+def _carry_out(job: Job, *, setting: Setting, folders: Folders, makers: Mapping[str, PolicyMaker]) -> Any:
+    """``rollout`` of a job, once for each of its repeats, as JSON values."""
+    return [
+        [
+            dataclasses.asdict(run)
+            for run in rollout(
+                _factory(dataclasses.replace(setting, repeat=setting.repeat + k), folders),
+                job.seed,
+                makers[job.actor],
+                job.samples,
+                job.cameras or None,
+            )
+        ]
+        for k in range(job.repeats)
+    ]
+
+
+def embeddings_seen(seed: int, *, setting: Setting, folders: Folders) -> list[list[float]]:
+    """The embeddings of all frames that are newest at the decisions of an episode."""
+    states = [moment.state for moment in _factory(setting, folders).episode(seed).moments]
+    return [row for s in states if s.embeddings is not None for row in s.embeddings[s.reported].tolist()]
+
+
+def _run_of(data: Mapping[str, Any]) -> Run:
+    whole = data["whole"]
+    return Run([Decided.from_json(d) for d in data["decided"]], None if whole is None else Outcome(**whole))
+
+
+def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
+    at = (setting.key, folders)
+    if at not in _FACTORIES:
+        while len(_FACTORIES) >= _FACTORIES_KEPT:
+            _FACTORIES.pop(next(iter(_FACTORIES)))
+        _FACTORIES[at] = EpisodeFactory(setting, folders)
+    return _FACTORIES[at]
+
+
+def _digest(actor: Actor) -> str:
+    found = hashlib.sha256(json.dumps(actor.spec.as_json(), sort_keys=True).encode())
+    for name, weights in sorted(actor.weights.items()):
+        found.update(name.encode() + weights.tobytes())
+    return found.hexdigest()[:24]
+
+
+def _loaded(who: str | Actor) -> str | Actor:
+    """The actor in the file of ``bandit:FILE``, so that results are keyed by its weights; anything else as it is."""
+    return Actor.load(who.removeprefix(BANDIT)) if isinstance(who, str) and who.startswith(BANDIT) else who

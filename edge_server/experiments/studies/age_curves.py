@@ -1,0 +1,225 @@
+"""Fidelity against the age of used views: figures 5.6 to 5.8, equation 5.8."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
+from edge_server.experiments.common.statistics import optimum
+from edge_server.experiments.studies.drawing import draw_curve, draw_metrics, draw_trials
+from edge_server.experiments.studies.findings import interior, optimum_falls, optimum_grows
+from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest
+from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
+from edge_server.report.style import CYCLE, figure, label_lines
+
+GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)
+QUICK_GAMMAS = (15.0, 30.0, 51.0, 80.0, 120.0, 200.0, 400.0)
+SHOWN = (21.0, 51.0, 120.0)
+CHANNELS = {name: {"preset": "ch5", "discipline": name} for name in ("drop-new", "parallel")}
+MAT_METRICS = ("psnr_db", "psnr_moving_db", "shown_psnr_db", "shown_psnr_moving_db", "ssim", "lpips")
+
+# --- figures 5.6 and 5.7 -----------------------------------------------------------------------------------
+
+
+def _mat_cases(request: StudyRequest) -> list[Point]:
+    gammas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS}
+    found = []
+    for scene in scenes_here(request, ("room", "kitchen")):
+        ours = recording(scene) is None
+        channels = list(request.channels(CHANNELS).items())
+        some = channels if ours or not request.quick else channels[:1]
+        conditions = [({"channel": name}, {"channel": channel}) for name, channel in some]
+        found += sweep(request, scene, request.repeats(10 if ours else 4, 40), conditions, "gamma_ms", gammas)
+    return found
+
+
+def _draw_mat(request: StudyRequest, table: SeedTable) -> None:
+    for (scene,) in table.distinct("scene"):
+        channels = [c for s, c in table.distinct("scene", "channel") if s == scene]
+        draw_metrics(
+            request.out / f"mat-{scene}.png",
+            table,
+            "gamma_ms",
+            "maximum age (ms)",
+            MAT_METRICS,
+            [(c, {"scene": scene, "channel": c, "policy": "threshold"}) for c in channels],
+            f"{scene}: threshold on age, from scratch",
+            [("no delay", {"scene": scene, "policy": "no delay"})],
+        )
+    draw_instants(request, "mat", "threshold", SHOWN, {"preset": "ch5"})
+
+
+def draw_instants(
+    request: StudyRequest, name: str, policy: str, values: tuple[float, ...], channel: Row, **settings: Any
+) -> None:
+    """Draw one instant of each scene under three values of a policy (figures 5.7, 6.4), to OUT/NAME-pictures.png."""
+    own = next(iter(request.channels({"": channel}).values()))
+    common: Row = {"seed": 3, "channel": own, "lpips": False, "policy": policy, **settings}
+    rows = [
+        (scene, [usual_trial(request, scene, value=v, **common) for v in values])
+        for scene in scenes_here(request, ("room", "kitchen"))
+    ]
+    draw_trials(request.out / f"{name}-pictures.png", request, rows)
+
+
+MAT = Study(
+    "mat",
+    "Fidelity against the maximum age of used views (figures 5.6, 5.7)",
+    _mat_cases,
+    run_points,
+    MAT_METRICS,
+    (
+        Claim(
+            "fidelity first rises and then falls as the maximum age grows (5.6; best at 51 ms there).",
+            interior("gamma_ms"),
+            bound=None,
+            where={"policy": "threshold"},
+        ),
+    ),
+    ("scene", "channel"),
+    _draw_mat,
+)
+
+# --- figure 5.8 ----------------------------------------------------------------------------------------------
+
+DELAYS_MS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0)
+QUICK_DELAYS_MS = (20.0, 60.0, 180.0)
+# The same thresholds for every delay: if the grid grew with the delay, every optimum would grow with it.
+DELAY_GAMMAS = (30.0, 45.0, 60.0, 75.0, 90.0, 120.0, 165.0, 240.0, 330.0, 480.0, 700.0, 1000.0)
+QUICK_DELAY_GAMMAS = (45.0, 75.0, 120.0, 180.0, 300.0, 500.0, 900.0)
+
+
+def with_mean_delay(channel: Row, mean_ms: float) -> Row:
+    """The channel with exponential delays of that mean."""
+    return {**channel, "service": {"law": "exponential", "mean_ms": mean_ms}}
+
+
+def _delay_cases(request: StudyRequest) -> list[Point]:
+    every = {"every_ms": 1500.0}
+    gammas = {"threshold": QUICK_DELAY_GAMMAS if request.quick else DELAY_GAMMAS}
+    (channel,) = request.channels({"ch5": {"preset": "ch5"}}).values()
+    delays = [
+        ({"delay_ms": ms}, {"channel": with_mean_delay(channel, ms), **every})
+        for ms in (QUICK_DELAYS_MS if request.quick else DELAYS_MS)
+    ]
+    seeds = request.repeats(8, 40)
+    return [
+        p
+        for scene in scenes_here(request, ("room",))
+        for p in sweep(request, scene, seeds, delays, "gamma_ms", gammas, [({}, every)])
+    ]
+
+
+def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
+    for (scene,) in table.distinct("scene"):
+        with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
+            top, bottom = axes[:, 0]
+            delays = [delay for (delay,) in table.distinct("delay_ms")]
+            for k, metric in enumerate(MAT_DELAY.metrics):
+                _, lower, _, least = METRICS[metric]
+                curves = {d: table.curve("gamma_ms", metric, scene=scene, delay_ms=d) for d in delays}
+                best = {d: optimum(curve, lower, least) for d, curve in curves.items() if curve}
+                spread = [[o.x - o.low for o in best.values()], [o.high - o.x for o in best.values()]]
+                style: dict[str, Any] = {"marker": "o", "markersize": 4, "capsize": 2, "color": CYCLE[k]}
+                xs = [d * (1 + 0.02 * (k - 1.5)) for d in best]
+                top.errorbar(xs, [o.x for o in best.values()], spread, label=METRICS[metric].label, **style)
+            label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
+            for k, delay in enumerate(delays):
+                curve = table.curve("gamma_ms", "psnr_moving_db", scene=scene, delay_ms=delay)
+                draw_curve(bottom, curve, f"{delay:g} ms", k)
+            label_lines(bottom, METRICS["psnr_moving_db"].label, "threshold (ms)")
+
+
+MAT_DELAY = Study(
+    "mat-delay",
+    "The best maximum age against the mean delay (figure 5.8)",
+    _delay_cases,
+    run_points,
+    ("psnr_db", "psnr_moving_db", "ssim", "lpips"),
+    (
+        Claim(
+            "the best threshold, inside the range, grows with the mean delay (5.8).",
+            optimum_grows("delay_ms", "gamma_ms"),
+            where={"policy": "threshold"},
+        ),
+    ),
+    draw=_draw_delay,
+)
+
+# --- equation 5.8 --------------------------------------------------------------------------------------------
+
+# Weights of one second of age relative to a mean squared error of 0.01 (20 dB).
+LAMBDAS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
+QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
+# Sums of ages: of all cameras at the edge, as in (5.8), or of the used views, as in (6.35).
+SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
+
+
+def _lambda_cases(request: StudyRequest) -> list[Point]:
+    # The trials of the thresholds are those of ``mat``, and known if that study was run.
+    conditions = [
+        ({"channel": name}, {"channel": channel})
+        for name, channel in request.channels({"drop-new": CHANNELS["drop-new"]}).items()
+    ]
+    omegas = {"threshold": QUICK_GAMMAS if request.quick else GAMMAS, "wait": QUICK_WAITS if request.quick else WAITS}
+    seeds = request.repeats(10, 40)
+    scenes = scenes_here(request, ("room",))
+    return [p for s in scenes for p in sweep(request, s, seeds, conditions, "omega_ms", omegas)]
+
+
+def loss(row: Row, metric: str, column: str, weight: float) -> float:
+    """(5.8) for one update: squared error in units of 0.01, plus the weighted sum of ages in seconds."""
+    age_ms = row["aaoi_ms"] * row["views"] if column == "used_age_sum_ms" else row[column]
+    return float(10.0 ** (-row[metric] / 10.0) / 0.01 + weight * age_ms / 1e3)
+
+
+def _losses(table: SeedTable, metric: str, labels: Row) -> dict[float, Curve]:
+    """lambda -> omega -> seed -> loss."""
+    labels = dict(labels)
+    column = SUMS[labels.pop("ages")]
+    rows = [r for r in table.where(**labels) if r[metric] is not None and np.isfinite(r[metric])]
+    found: dict[float, Curve] = {}
+    for weight, row in product(LAMBDAS, rows):
+        curve = found.setdefault(weight, {})
+        curve.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, metric, column, weight)
+    return found
+
+
+def _draw_lambda(request: StudyRequest, table: SeedTable) -> None:
+    for (scene,) in table.distinct("scene"):
+        with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            at = axes[0, 0]
+            for k, (metric, policy, ages) in enumerate(product(LAMBDA.metrics, ("threshold", "wait"), SUMS)):
+                curves = _losses(table, metric, {"scene": scene, "policy": policy, "ages": ages})
+                best = [optimum(curve, True).x for curve in curves.values()]
+                label = f"{policy}, {METRICS[metric].label}, {ages}"
+                line = "-" if k < len(CYCLE) else "--"
+                at.plot(
+                    range(len(best)), best, line, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)], label=label
+                )
+            at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
+            per = "lambda (per 0.01 of squared error and second of age)"
+            label_lines(at, "best omega (ms)", per, scene)
+
+
+LAMBDA = Study(
+    "lambda",
+    "The weight of timeliness in the objective (equation 5.8)",
+    _lambda_cases,
+    run_points,
+    ("psnr_moving_db", "psnr_db"),
+    tuple(
+        Claim(
+            "a larger lambda buys freshness: the best omega falls (5.8).",
+            optimum_falls(_losses, "ages"),
+            where={"policy": policy, "ages": ages},
+        )
+        for policy, ages in product(("threshold", "wait"), SUMS)
+    ),
+    ("scene", "channel"),
+    _draw_lambda,
+)

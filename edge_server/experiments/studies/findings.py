@@ -1,0 +1,249 @@
+"""Statistics of claims: curves with an optimum, plateaus, trends, and differences of two policies.
+
+Each function makes a ``Statistic`` from the names of labels; differences are positive where the first is better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from edge_server.experiments.common.seed_table import TRAINING, Curve, PerSeed, Row, SeedTable, difference
+from edge_server.experiments.common.statistics import (
+    Interval,
+    at_its_best,
+    crossed,
+    interval,
+    move_of_optimum,
+    optimum,
+    paired,
+    share_closed,
+)
+from edge_server.experiments.common.tables import number
+from edge_server.experiments.studies.study import METRICS, Finding, Statistic
+
+NO_DELAY, USE_ALL = "no delay", "all"
+
+
+def no_delay_gain(table: SeedTable, metric: str, labels: Row) -> str:
+    """How much better no delay is than using all views: the limit of any scheduler's gain."""
+    _, lower, digits, least = METRICS[metric]
+    limit = table.values(metric, **{k: v for k, v in labels.items() if k in ("scene", "field")}, policy=NO_DELAY)
+    if not limit:
+        return "the limit without delay was not measured"
+    if metric == "aaoi_ms":
+        return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
+    use_all = table.values(metric, **{**labels, "policy": USE_ALL})
+    gap = paired(use_all, limit) if lower else paired(limit, use_all)
+    nothing = " (nothing to win)" if gap.above(least) is False else ""
+    return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
+
+
+def interior(x: str) -> Statistic:
+    """The curve over ``x`` is better somewhere inside than at both ends."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        curve = table.curve(x, metric, **labels)
+        if not curve:
+            return None
+        best = optimum(curve, lower)
+        text = (
+            f"best at {best.x:g}{best.spread}, {best.over_first.text(digits)} better than the smallest and "
+            f"{best.over_last.text(digits)} than the largest; {no_delay_gain(table, metric, labels)}."
+        )
+        return Finding(text, (best.over_first, best.over_last))
+
+    return found
+
+
+def plateau(x: str, start: float) -> Statistic:
+    """From ``start`` on the curve stays near its best: at the first point from there, and at the last one. The
+    differences are those of the points minus the best, which is chosen on other seeds."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        curve = table.curve(x, metric, **labels)
+        later = [at for at in curve if at >= start]
+        if not later:
+            return None
+        best = at_its_best(curve, lower)
+        ends = {at: _gain(curve[at], best, lower) for at in (later[0], later[-1])}
+        text = ", ".join(f"at {at:g} {gap.text(digits)}" for at, gap in ends.items())
+        return Finding(f"better than the best ({optimum(curve, lower).x:g}): {text}.", tuple(ends.values()))
+
+    return found
+
+
+def trend(x: str, rises: bool | None = None) -> Statistic:
+    """The last point of the curve is better than the first; with ``rises`` higher."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        curve = table.curve(x, metric, **labels)
+        if not curve:
+            return None
+        first, last = min(curve), max(curve)
+        change = _gain(curve[last], curve[first], lower if rises is None else not rises)
+        ends = (number(interval(curve[at].values()).mean, digits) for at in (first, last))
+        text = f"from {first:g} to {last:g}: {' to '.join(ends)}; {no_delay_gain(table, metric, labels)}."
+        return Finding(text, (change,))
+
+    return found
+
+
+def optimum_grows(parameter: str, x: str) -> Statistic:
+    """The best ``x`` grows with ``parameter``: the slope over the parameters whose curve has an optimum inside. A curve
+    that only saturates has none, however early it comes near its top. The best x is the smallest within the least
+    difference of the best."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, _, least = METRICS[metric]
+        curves = {
+            value: curve
+            for (value,) in table.distinct(parameter)
+            if (curve := table.curve(x, metric, **{**labels, parameter: value}))
+        }
+        best = {value: optimum(curve, lower, least) for value, curve in curves.items()}
+        inside = {value: o.interior(least) for value, o in best.items()}
+        peaked = {value: curves[value] for value in curves if inside[value] is True}
+        text = ", ".join(
+            f"{value:g}: {o.x:g}{o.spread}{'' if inside[value] else ', no optimum inside is shown'}"
+            for value, o in best.items()
+        )
+        if len(peaked) < 2:
+            # Without two optima nothing can grow: that is as sure as that a side of each other curve does not fall.
+            flat = [o for value, o in best.items() if inside[value] is not True]
+            sides = [_less(side, least) for o in flat for side in (o.over_first, o.over_last)]
+            return Finding(f"best by {parameter} {text}; fewer than two have an optimum inside.", tuple(sides))
+        slope, _ = move_of_optimum(peaked, lower, least)
+        return Finding(f"best by {parameter} {text}; {slope} per unit where there is one.", (slope,))
+
+    return found
+
+
+def optimum_falls(curves: Any, apart: str) -> Statistic:
+    """The best x falls as a parameter rises.
+
+    curves: (table, metric, labels) -> parameter -> curve of losses. apart: a label of verdicts, not of rows.
+    """
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        of: dict[float, Curve] = curves(table, metric, labels)
+        if not of or not all(of.values()):
+            return None
+        rest = {k: v for k, v in labels.items() if k != apart}
+        best = ", ".join(f"{value:g}: {optimum(curve, True).x:g}" for value, curve in of.items())
+        _, move = move_of_optimum(of, lower_is_better=True)
+        fall = Interval(-move.mean, -move.high, -move.low, move.count)
+        text = f"best by parameter {best}; it falls by {fall}; {no_delay_gain(table, metric, rest)}."
+        return Finding(text, (fall,))
+
+    return found
+
+
+def better(mine: Row, other: Row) -> Statistic:
+    """``mine`` is better than ``other``, by labels; ``best``: the label of values of which the best is taken, chosen on
+    the other half of the seeds. Repeated trainings count with their spread."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in (mine, other))
+        if not (ours and theirs):
+            return None
+        gap = difference(theirs, ours) if lower else difference(ours, theirs)
+        if not gap.count:
+            return None
+        trained = TRAINING in {key for row in table.where(**{**labels, **mine}) for key in row}
+        of_runs = f"{len(ours)} trainings and " if len(ours) > 1 else "one training and " if trained else ""
+        same = ": it does the very same" if gap.low == gap.high == 0.0 else ""
+        base = crossed(theirs).mean
+        share = f" ({100.0 * gap.mean / abs(base):+.1f} %)" if metric == "reward" and _far_from_zero(theirs) else ""
+        return Finding(f"{gap.text(digits)} better{share} over {of_runs}{gap.count} seeds{same}.", (gap,))
+
+    return found
+
+
+def better_than_all(mine: Row, others: Sequence[Row], one_suffices: bool = False, worse: bool = False) -> Statistic:
+    """``mine`` is better than each of ``others``. worse: each of ``others`` is better than ``mine``; with
+    ``one_suffices``, one of them is."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        gaps: dict[str, Interval] = {}
+        for other in others:
+            pair = (other, mine) if one_suffices or worse else (mine, other)
+            ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in pair)
+            gap = difference(theirs, ours) if lower else difference(ours, theirs)
+            if gap.count:
+                gaps[" ".join(str(v) for k, v in other.items() if k != "best")] = gap
+        text = ", ".join(f"{name} {gap.text(digits)}" for name, gap in gaps.items())
+        return Finding(f"differences: {text}.", tuple(gaps.values()), one_suffices) if gaps else None
+
+    return found
+
+
+def level(mine: Row) -> Statistic:
+    """The mean of ``mine``, for claims that it lies above a bound."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        by_seed: dict[int, list[float]] = {}
+        for row in table.where(**{**labels, **mine}):
+            if row.get(metric) is not None:
+                by_seed.setdefault(row["seed"], []).append(row[metric])
+        mean = interval([sum(values) / len(values) for values in by_seed.values()])
+        return Finding(f"{mean.text(METRICS[metric].digits)} over {mean.count} seeds.", (mean,)) if mean.count else None
+
+    return found
+
+
+def no_worse(mine: Row, other: Row) -> Statistic:
+    """The difference of ``mine`` and ``other`` as a share of the size of the latter, for claims whose bound is a small
+    negative share. None where that is too near its zero for a percentage."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        _, lower, digits, _ = METRICS[metric]
+        ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in (mine, other))
+        if not (ours and theirs and _far_from_zero(theirs)):
+            return None
+        gap, base = difference(ours, theirs), abs(crossed(theirs).mean)
+        share = dataclasses.replace(gap, mean=gap.mean / base, low=gap.low / base, high=gap.high / base)
+        return Finding(f"{gap.text(digits)}, that is {100 * share.mean:+.2f} %.", (share,))
+
+    return found
+
+
+def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
+    """``mine`` is more than half of the way from ``base`` to ``limit``."""
+
+    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        (low,), (high,) = (table.runs(metric, **{**labels, **of}) or [{}] for of in (base, limit))
+        half: PerSeed = {s: None if (a := low[s]) is None or (b := high.get(s)) is None else (a + b) / 2 for s in low}
+        ours = table.runs(metric, **{**labels, **mine})
+        above = difference(ours, [half])
+        if not above.count:
+            return None
+        share = share_closed({s: _mean([run.get(s) for run in ours]) for s in ours[0]}, low, high)
+        return Finding(f"{share.text(2)} of the way (interval over seeds alone).", (above,))
+
+    return found
+
+
+def _less(of: Interval, amount: float) -> Interval:
+    return dataclasses.replace(of, mean=of.mean - amount, low=of.low - amount, high=of.high - amount)
+
+
+def _gain(a: PerSeed, b: Any, lower: bool) -> Interval:
+    """a - b, seed by seed, positive where a is better."""
+    return paired(b, a) if lower else paired(a, b)
+
+
+def _far_from_zero(runs: Sequence[PerSeed]) -> bool:
+    base = crossed(runs)
+    return base.low > 0.0 or base.high < 0.0
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None

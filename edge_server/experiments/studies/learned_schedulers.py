@@ -1,0 +1,450 @@
+"""Studies of learned schedulers: figures 5.9 and 6.8, and what the thesis left open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+from edge_server.experiments.common.seed_table import Row
+from edge_server.experiments.studies.findings import better, better_than_all, half_way, no_worse
+from edge_server.experiments.studies.learning import (
+    FOUR_VIEWPOINTS,
+    LearningCase,
+    RewardChoice,
+    Training,
+    measure,
+    room,
+)
+from edge_server.experiments.studies.study import Claim, Study, StudyError, StudyRequest
+from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
+from edge_server.scheduler.learned.learner_spec import Action
+
+LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}
+THRESHOLD, WAIT, WAIT_ARRIVED = ({"policy": p, "best": "value"} for p in ("threshold", "wait", "wait-arrived"))
+ELSEWHERE, REWARDED = {"judged_from": "elsewhere"}, {"judged_from": "where it is rewarded"}
+PANELS = ("case", "judged_by")
+# The thesis's weight of a millisecond of age, and a fifth of it. With the thesis's weight (6.5) a single
+# young view is better than any number of views that are 30 ms older, so there is little to decide.
+THESIS_AGE, LESS_AGE = -0.015, -0.003
+
+
+def _chosen(request: StudyRequest, cases: Sequence[LearningCase], quick: int) -> list[LearningCase]:
+    """The cases that were asked for; by default all, or the first ``quick`` in a quick pass."""
+    by_name = {case.name: case for case in cases}
+    return [by_name[name] for name in request.chosen(list(by_name), list(by_name)[:quick])]
+
+
+def embeddings_missing() -> str | None:
+    """One-line reason why policies cannot use images here; None if they can."""
+    from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+
+    try:
+        make_embedder(EmbeddingConfig())
+    except EmbeddingError as error:
+        return str(error)
+    return None
+
+
+def _usable(variants: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The variants of the state; without those that need embeddings if no embedder is available."""
+    if missing := embeddings_missing():
+        print(f"  semantics are left out: {missing}")
+        return {name: parts for name, parts in variants.items() if "semantics" not in parts}
+    return variants
+
+
+# --- figure 5.9 ----------------------------------------------------------------------------------------------
+
+# Cameras that reward: one, as in the thesis, or four all round, so that a policy cannot optimize for a single
+# viewpoint.
+VIEWPOINTS = {"one viewpoint": ("cam00",), "four viewpoints": FOUR_VIEWPOINTS}
+# (pixels of the PSNR, viewpoints, whether updates start from scratch, cost of a view). The first has the
+# thesis's reward and start. Without a cost views hardly ever harm, so using all is hard to beat.
+SELECT_CASES = (
+    ("whole", "one viewpoint", True, 0.0),
+    ("whole", "one viewpoint", False, 0.0),
+    ("moving", "one viewpoint", False, 0.0),
+    ("whole", "four viewpoints", False, 0.0),
+    ("whole", "four viewpoints", False, 0.003),
+)
+
+
+def _select_cases(request: StudyRequest) -> list[LearningCase]:
+    found = []
+    for on, viewpoints, scratch, price in SELECT_CASES:
+        priced = f", priced, {price:g} a view" if price else ""
+        name = f"{on}, {viewpoints}, {'from nothing' if scratch else 'warm'}{priced}"
+        reward = RewardChoice("set", on, {"views": -price})
+        setting = room("ch5", held_out=VIEWPOINTS[viewpoints], scratch=scratch)
+        training = Training("learned", "select", {True: 120, False: 600})
+        found.append(LearningCase(name, setting, {"its reward": reward}, [training], ["threshold"], BASELINE_POLICIES))
+    return _chosen(request, found, len(found))
+
+
+PPO_SELECT = Study(
+    "ppo-select",
+    "A scheduler that learns which views to use (figure 5.9)",
+    _select_cases,
+    measure("ppo-select"),
+    ("reward",),
+    tuple(
+        claim
+        for where in (REWARDED, ELSEWHERE)
+        for claim in (
+            Claim(
+                "better than a uniformly random set; the thesis has +16.7 % over its first episodes (5.6.2).",
+                better(LEARNED, RANDOM),
+                where=where,
+            ),
+            Claim("better than every fixed threshold (5.6.2).", better(LEARNED, THRESHOLD), where=where),
+            Claim("better than using all.", better(LEARNED, ALL), where=where),
+            Claim(
+                "better than each policy without learning.",
+                better_than_all(LEARNED, tuple({"policy": p} for p in BASELINE_POLICIES[2:])),
+                where=where,
+            ),
+            Claim(
+                "most of what could be won is won: more than half of the way from random to hindsight.",
+                half_way(LEARNED, RANDOM, {"policy": "hindsight"}),
+                where=where,
+            ),
+            Claim(
+                "the best threshold differs between decisions: who knew it beforehand would win.",
+                better({"policy": "hindsight threshold"}, THRESHOLD),
+                where=where,
+            ),
+        )
+    ),
+    PANELS,
+)
+
+# --- figure 6.8 ----------------------------------------------------------------------------------------------
+
+# (channel, weight of age, pixels of the PSNR). A traffic state of ch6 lasts 30 ms, less than a decision; one
+# of ch6-slow and swing lasts 3 s, and the best omega differs between the states of swing.
+WAIT_CASES = (
+    ("swing", LESS_AGE, "whole"),
+    ("ch6-slow", THESIS_AGE, "whole"),
+    ("swing", LESS_AGE, "moving"),
+    ("ch6", THESIS_AGE, "whole"),
+    ("swing", THESIS_AGE, "whole"),
+    ("ch6-slow", LESS_AGE, "whole"),
+    ("ch6", LESS_AGE, "whole"),
+)
+
+
+def _wait_cases(request: StudyRequest) -> list[LearningCase]:
+    found = []
+    for channel, age, pixels in WAIT_CASES:
+        name = f"{channel}{', where it moves' if pixels == 'moving' else ''}, age {age:g}/ms"
+        kinds: tuple[Action, ...] = ("wait", "threshold")
+        trainings = [Training(f"learned {kind}", kind, {True: 90, False: 600}) for kind in kinds]
+        reward = RewardChoice("corrected", pixels, {"age": age})
+        found.append(
+            LearningCase(name, room(channel), {"its reward": reward}, trainings, kinds, ("random",), (16, 100))
+        )
+    return _chosen(request, found, 2)
+
+
+PPO_WAIT = Study(
+    "ppo-wait",
+    "A scheduler that learns how long to wait, or how old is too old (figure 6.8)",
+    _wait_cases,
+    measure("ppo-wait"),
+    ("reward",),
+    (
+        *(
+            claim
+            for best in (WAIT, THRESHOLD)
+            for kind in (best["policy"],)
+            for claim in (
+                Claim(
+                    f"{kind}: better than its best fixed omega.",
+                    better({"policy": f"learned {kind}"}, best),
+                    where=ELSEWHERE,
+                ),
+                Claim(
+                    f"{kind}: no worse than its best fixed omega by 1 %.",
+                    no_worse({"policy": f"learned {kind}"}, best),
+                    -0.01,
+                    ELSEWHERE,
+                ),
+                Claim(
+                    f"{kind}: better than a uniformly random set.",
+                    better({"policy": f"learned {kind}"}, RANDOM),
+                    where=ELSEWHERE,
+                ),
+                Claim(
+                    f"{kind}: the best omega differs between decisions: who knew it beforehand would win.",
+                    better({"policy": f"hindsight {kind}"}, best),
+                    where=ELSEWHERE,
+                ),
+            )
+        ),
+        Claim(
+            "waiting beats thresholds, both learned (6.5.3: by 6 %).",
+            better({"policy": "learned wait"}, {"policy": "learned threshold"}),
+            where=ELSEWHERE,
+        ),
+    ),
+    PANELS,
+)
+
+# --- the state's parts (6.33) --------------------------------------------------------------------------------
+
+WHICH_VIEWS = {
+    "age": ("age",),
+    "age, pose": ("age", "pose"),
+    "Z, age": ("semantics", "age"),
+    "Z, age, pose": ("semantics", "age", "pose"),
+}
+WHOLE = "Z, age, pose"
+LEFT_OUT = {
+    WHOLE: WHICH_VIEWS[WHOLE],
+    "age, pose": ("age", "pose"),
+    "Z, pose": ("semantics", "pose"),
+    "Z, age": ("semantics", "age"),
+}
+
+
+def _state_case(name: str, kinds: Sequence[Action], variants: dict[str, tuple[str, ...]], flush: bool) -> LearningCase:
+    variants = _usable(variants)
+    # All variants have the same decisions, drawn with all parts that any of them uses.
+    parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
+    select = kinds == ("select",)
+    setting = room("ch5" if select else "ch6", held_out=FOUR_VIEWPOINTS, parts=parts, flush=flush)
+    reward = RewardChoice("set", "moving") if select else RewardChoice("corrected", weights={"age": THESIS_AGE})
+    trainings = [
+        Training(f"{kind} by {variant}", kind, {True: 100, False: 600}, used)
+        for kind, (variant, used) in product(kinds, variants.items())
+    ]
+    return LearningCase(name, setting, {"its reward": reward}, trainings, ["threshold"] if select else kinds)
+
+
+def _ablation_cases(request: StudyRequest) -> list[LearningCase]:
+    cases = {
+        "which views": (("select",), WHICH_VIEWS, False),
+        "chapter 6": (("threshold", "wait", "wait-arrived"), LEFT_OUT, False),
+        "wait after a flush": (("wait",), LEFT_OUT, True),
+    }
+    chosen = request.chosen(list(cases), list(cases)[:1])
+    return [_state_case(name, *cases[name]) for name in chosen]  # type: ignore[arg-type]  # actions
+
+
+ABLATION = Study(
+    "ablation",
+    "What each part of the state is worth: age, pose, semantics (6.33)",
+    _ablation_cases,
+    measure("ablation"),
+    ("reward",),
+    (
+        *(
+            Claim(
+                f"{kind} by {variant}: better than the best fixed one.",
+                better({"policy": f"{kind} by {variant}"}, {"policy": fixed, "best": "value"}),
+                where=ELSEWHERE,
+            )
+            for kind, fixed, variants in (
+                ("select", "threshold", WHICH_VIEWS),
+                ("threshold", "threshold", LEFT_OUT),
+                ("wait", "wait", LEFT_OUT),
+                ("wait-arrived", "wait-arrived", LEFT_OUT),
+            )
+            for variant in variants
+        ),
+        *(
+            Claim(
+                f"{kind}: better by {WHOLE} than by {variant}.",
+                better({"policy": f"{kind} by {WHOLE}"}, {"policy": f"{kind} by {variant}"}),
+                where=ELSEWHERE,
+            )
+            for kind, variants in (("select", WHICH_VIEWS), ("threshold", LEFT_OUT), ("wait", LEFT_OUT))
+            for variant in variants
+            if variant != WHOLE
+        ),
+        Claim(
+            "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5), at the best "
+            "fixed omega of each.",
+            better(WAIT_ARRIVED, WAIT),
+            where=ELSEWHERE,
+        ),
+    ),
+    PANELS,
+)
+
+# --- the reward's weights (6.36-6.38) ------------------------------------------------------------------------
+
+# The thesis's, ours with the corrected sign, and variants with a lower weight of age.
+WEIGHTED = {
+    "thesis": RewardChoice("thesis"),
+    "corrected": RewardChoice("corrected"),
+    "age a fifth": RewardChoice("corrected", weights={"age": LESS_AGE}),
+    "age a fiftieth": RewardChoice("corrected", weights={"age": THESIS_AGE / 50}),
+    "moving": RewardChoice("corrected", "moving", {"age": LESS_AGE}),
+}
+
+
+def _weight_cases(request: StudyRequest) -> list[LearningCase]:
+    trainings = [
+        Training(f"learned by {name}", "wait", {True: 40, False: 600}, reward=reward)
+        for name, reward in WEIGHTED.items()
+    ]
+    return [LearningCase("swing", room("swing"), WEIGHTED, trainings, ["wait"], ("random",), (8, 100))]
+
+
+WEIGHTS = Study(
+    "weights",
+    "Sensitivity to the weights of the reward (6.36-6.38)",
+    _weight_cases,
+    measure("weights"),
+    ("reward",),
+    tuple(
+        claim
+        for name in WEIGHTED
+        for where in ({**ELSEWHERE, "judged_by": name},)
+        for claim in (
+            Claim(
+                "what was learned by it is better than the best fixed wait.",
+                better({"policy": f"learned by {name}"}, WAIT),
+                where=where,
+            ),
+            Claim(
+                "it matters: what was learned by other weights is worse by these.",
+                better_than_all(
+                    {"policy": f"learned by {name}"},
+                    tuple({"policy": f"learned by {o}"} for o in WEIGHTED if o != name),
+                ),
+                where=where,
+            ),
+        )
+    ),
+    PANELS,
+)
+
+# --- a channel that changes during use -----------------------------------------------------------------------
+
+SLOW = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 200.0}}
+LOSSY = {"preset": "ch5", "faults": {"loss": {"probability": 0.5}}}
+# Of the camera nearest to the one that rewards, and the price of a view where it is set.
+DYING, PRICE = "cam01", 0.003
+# name -> (channel, cameras that send nothing)
+CHANGES: dict[str, tuple[str | Row, tuple[str, ...]]] = {
+    "delays three times as long": (SLOW, ()),
+    "bursts": ("swing", ()),
+    "one camera dies": ("ch5", (DYING,)),
+    "half of the frames lost": (LOSSY, ()),
+    "the best camera dies where views cost": ("ch5", (DYING,)),
+}
+
+
+def _drift_cases(request: StudyRequest) -> list[LearningCase]:
+    found = []
+    for name, (channel, silent) in CHANGES.items():
+        priced = "cost" in name
+        action: Action = "select" if priced else "threshold"
+        reward = (
+            RewardChoice("set", weights={"views": -PRICE})
+            if priced
+            else RewardChoice("corrected", weights={"age": LESS_AGE})
+        )
+        trainings = [
+            Training("learned before", action, {True: 40, False: 600}, setting=room("ch5")),
+            Training("learned afterwards", action, {True: 40, False: 600}),
+        ]
+        found.append(
+            LearningCase(
+                name, room(channel, silent=silent), {"its reward": reward}, trainings, ["threshold"], seeds=(8, 100)
+            )
+        )
+    return _chosen(request, found, 1)
+
+
+DRIFT = Study(
+    "drift",
+    "The channel changes during use: what was learned before, and what is learned afterwards",
+    _drift_cases,
+    measure("drift"),
+    ("reward",),
+    (
+        Claim(
+            "what is learned on the new channel is better than what was learned on the old.",
+            better({"policy": "learned afterwards"}, {"policy": "learned before"}),
+            where=ELSEWHERE,
+        ),
+        Claim(
+            "what was learned on the old channel is still better than the best fixed threshold.",
+            better({"policy": "learned before"}, THRESHOLD),
+            where=ELSEWHERE,
+        ),
+    ),
+    PANELS,
+)
+
+# --- semantics where images can help -------------------------------------------------------------------------
+
+# A workshop where a person walks or stands on one of four sides, only images show which one, and each view has a
+# cost: with free views there is nothing to choose. The cameras look outward: one a side for the reward and one a
+# side for the evaluation. One update per second, so that a view of the motion since the last one is worth its cost.
+# With moving pixels only the PSNR counts, because SSIM and the distance are of the whole image.
+SIDES = {"held_out": ("cam00", "cam08", "cam15", "cam16"), "report": ("cam14", "cam11", "cam06", "cam07")}
+VIEW_COST = {"views": -0.002}
+SIGHTS = {
+    "somebody moves": (1.0, RewardChoice("set", "moving", {**VIEW_COST, "ssim": 0.0, "distance": 0.0})),
+    "nothing moves": (0.0, RewardChoice("set", weights=VIEW_COST)),
+}
+
+
+def _semantics_cases(request: StudyRequest) -> list[LearningCase]:
+    if missing := embeddings_missing():
+        raise StudyError(f"semantics: {missing}")
+    parts = ("semantics", "age", "pose")
+    trainings = [
+        Training(f"learned {name}", "select", {True: 300, False: 1200}, used)
+        for name, used in (("with", parts), ("without", parts[1:]))
+    ]
+    found = []
+    for name, (speed, reward) in SIGHTS.items():
+        setting = room(
+            "ch5",
+            scene="tower",
+            speed_m_per_s=speed,
+            params={"movers": "person"},
+            parts=parts,
+            steps=40,
+            refresh_ms=900.0,
+            **SIDES,
+        )
+        found.append(LearningCase(name, setting, {"its reward": reward}, trainings, ["threshold"], BASELINE_POLICIES))
+    return _chosen(request, found, len(found))
+
+
+WITH, WITHOUT = {"policy": "learned with"}, {"policy": "learned without"}
+SEMANTICS = Study(
+    "semantics",
+    "Where semantics help, and whether they cost anything where they do not (6.31-6.33)",
+    _semantics_cases,
+    measure("semantics"),
+    ("reward",),
+    (
+        Claim(
+            "semantics help where something important moves.",
+            better(WITH, WITHOUT),
+            where={"case": "somebody moves", **ELSEWHERE},
+        ),
+        Claim(
+            "semantics cost no more than 1 % where nothing moves.",
+            no_worse(WITH, WITHOUT),
+            -0.01,
+            {"case": "nothing moves", **ELSEWHERE},
+        ),
+        *(
+            Claim(
+                f"{name} semantics: better than all that does not learn.",
+                better_than_all(policy, (THRESHOLD, *({"policy": p} for p in BASELINE_POLICIES))),
+                where=ELSEWHERE,
+            )
+            for name, policy in (("with", WITH), ("without", WITHOUT))
+        ),
+    ),
+    PANELS,
+)

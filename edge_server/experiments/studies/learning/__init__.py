@@ -1,1 +1,0 @@
-"""Studies of learned schedulers."""

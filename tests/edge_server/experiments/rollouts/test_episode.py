@@ -1,0 +1,170 @@
+"""Drawn decisions: the buffer as the deployment has it, choices carried out as the deployment would."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory
+from edge_server.experiments.rollouts.rollout import choice_of_action, choose, named
+from edge_server.experiments.rollouts.setting import GRID_MS, PURPOSES, seeds
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.fields.registry import make_field
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.bandit import BanditPolicy
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from freshfield.scenario import ScenarioError
+from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting
+
+FAULTS = {"preset": "ch6", "faults": {"loss": {"probability": 0.1}, "duplication": {"probability": 0.3}}}
+
+
+@pytest.fixture(scope="module")
+def factory() -> EpisodeFactory:
+    return EpisodeFactory(setting(), NOTHING)
+
+
+def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) -> VirtualDeployment:
+    """The same deployment with its own edge, which decides first at an instant."""
+    what = scenario(**more)
+    edge = {**what.edge, "policy": {"name": policy, "value": value}}
+    terms = RunSettings(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
+    field = make_field("splat", FIELD, seed=setting().field_seed(seed))
+    return build_deployment(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
+
+
+@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
+def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
+    factory = EpisodeFactory(setting(channel), NOTHING)
+    for moment in factory.episode(11).moments:
+        for wait_ms in (0, 35, 180):
+            at_ns = moment.now_ns + wait_ms * 10**6
+            live = deployed("all", None, 11, 10**13, channel=channel)
+            live.run(at_ns / 1e9)
+            newest = live.updates.buffer.newest()
+            assert newest
+            assert {c: (a.generated_ns, a.received_ns) for c, a in moment.newest(at_ns).items()} == {
+                c: (b.generated_ns, b.received_ns) for c, b in newest.items()
+            }
+
+
+@pytest.mark.parametrize(
+    "policy",
+    ["all", "threshold:70", "wait:60", "wait-arrived:60", "wait-flush:60", "freshest-k:2", "periodic:400", "bandit:"],
+)
+def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
+    if policy.startswith("bandit:"):
+        learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
+        learner.save(tmp_path / "policy.npz")
+        policy = f"bandit:{tmp_path / 'policy.npz'}"
+    flush = policy.startswith("wait-flush")
+    factory = EpisodeFactory(setting(compute=Compute(5.0), flush=flush), NOTHING)
+    episode = factory.episode(5)
+    moment = episode.moments[0]
+    choice = choose(named(policy)(np.random.default_rng(0)), episode, 0)
+    found = episode.evaluate(0, choice)["cam00"]
+    name, _, value = (policy, "", "") if policy.startswith("bandit:") else policy.partition(":")
+    live = deployed(name, float(value) if value else None, 5, moment.now_ns)
+    live.run(moment.now_ns / 1e9 + 1.0)
+    expected = live.publications[0]
+    assert set(expected.selected) == set(choice.cameras)
+    assert (found.psnr_db, found.psnr_moving_db, found.ssim) == (
+        expected.psnr_db,
+        expected.psnr_moving_db,
+        expected.ssim,
+    )
+    assert found.aaoi_ms == expected.aaoi_ms and found.views == len(expected.selected)
+    assert moment.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
+
+
+@pytest.mark.parametrize("scratch", [True, False])
+def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
+    factory = EpisodeFactory(setting(scratch=scratch), NOTHING)
+    episode = factory.episode(2)
+    asked = [
+        (k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments) for n in (1, 2, 4)
+    ]
+    forwards = [episode.evaluate(*a) for a in asked]
+    fresh = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
+    backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
+    assert forwards == backwards
+    assert len({o["cam00"].psnr_db for o in forwards}) == len(forwards)
+
+
+def test_a_warm_field_remembers_what_a_new_one_cannot_know():
+    one = Choice(("cam01",), 0)
+    found = {}
+    for scratch in (True, False):
+        factory = EpisodeFactory(setting(scratch=scratch, warm_steps=60, steps=2), NOTHING)
+        for seed in range(3):
+            for moment in factory.episode(seed).moments:
+                choice = dataclasses.replace(one, at_ns=moment.now_ns)
+                outcome = factory.episode(seed).evaluate(moment.number, choice)
+                found.setdefault(scratch, []).append(outcome["cam00"].psnr_db)
+    assert np.mean(found[False]) > np.mean(found[True]) + 1.0
+
+
+def test_instants_lie_on_the_grid_within_the_span_and_differ_between_seeds(factory):
+    of = {seed: factory.episode(seed).instants_ns for seed in range(6)}
+    for instants in of.values():
+        assert all(ns % (GRID_MS * 10**6) == 0 and 0.8 <= ns / 1e9 < 1.4 for ns in instants)
+        assert instants == sorted(instants)
+    assert len({tuple(v) for v in of.values()}) == 6
+
+
+def test_a_state_has_ages_and_poses_of_who_reported(factory):
+    moment = factory.episode(0).moments[1]
+    newest = moment.newest(moment.now_ns)
+    assert list(moment.state.reported) == [c in newest for c in moment.cameras]
+    for row, camera in enumerate(moment.cameras):
+        if camera in newest:
+            assert moment.state.ages_ms[row] == (moment.now_ns - newest[camera].generated_ns) / 1e6
+    poses = moment.state.poses[moment.state.reported]
+    assert np.isfinite(poses).all() and len(np.unique(poses, axis=0)) == len(poses)
+    assert moment.state.embeddings is None
+
+
+def test_actions_of_a_learner_mean_what_the_live_policies_do(factory):
+    episode = factory.episode(4)
+    moment = episode.moments[0]
+    spec = Spec("threshold", omegas_ms=(40.0, 90.0))
+    live = choose(named("threshold:90")(np.random.default_rng(0)), episode, 0)
+    assert choice_of_action(spec, 1, episode, 0) == live
+    wait = choice_of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, episode, 0)
+    assert wait.at_ns >= moment.now_ns + 50 * 10**6
+    picked = choice_of_action(Spec("select"), np.array([True, False, True, False]), episode, 0)
+    assert picked.cameras == (moment.cameras[0], moment.cameras[2]) and picked.at_ns == moment.now_ns
+
+
+def test_where_nothing_arrives_all_there_is_is_used_at_the_end(factory):
+    episode = factory.episode(4)
+    late = choose(make_policy("wait", 1e6, np.random.default_rng(0)), episode, 0)
+    assert late.at_ns == episode.moments[0].until_ns and late.cameras
+
+
+def test_a_learned_policy_that_waits_for_a_first_frame_sees_the_state_of_that_instant():
+    factory = EpisodeFactory(setting({"preset": "ch5", "faults": {"blackout": {"windows_ms": [[0, 1500]]}}}), NOTHING)
+    learner = Learner(Spec("select", StateLayout(("age",)), hidden=8), seed=4)
+    policy = BanditPolicy(learner.actor, "learned", np.random.default_rng(0))
+    episode = factory.episode(2)
+    assert not episode.moments[0].state.reported.any()
+    choice = choose(policy, episode, 0)
+    assert choice.cameras and choice.at_ns > episode.moments[0].now_ns
+    assert policy.last_decision is not None and policy.last_decision.state.reported.sum() == len(choice.cameras)
+
+
+def test_seeds_of_two_purposes_or_runs_never_meet():
+    ranges = [set(seeds(run, purpose, 500)) for run in (0, 1, 2) for purpose in PURPOSES]
+    assert len(set.union(*ranges)) == sum(map(len, ranges))
+    with pytest.raises(ValueError, match="at most 1000000"):
+        seeds(0, "train", 1, first=10**6)
+
+
+def test_a_setting_without_a_held_out_camera_is_refused():
+    with pytest.raises(ScenarioError, match="held_out"):
+        dataclasses.replace(setting(), scenario=scenario(cameras={"count": 5}))

@@ -1,0 +1,108 @@
+"""One rollout: it depends on its arguments only, and decides in a running deployment as ``simulate`` does."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edge_server.config import ComputeConfig
+from edge_server.experiments.engine import Engine
+from edge_server.experiments.rollouts.episode import EpisodeFactory
+from edge_server.experiments.rollouts.rollout import Run, learned, named, rollout, run_rollouts
+from edge_server.experiments.rollouts.setting import Setting, seeds
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.experiments.rollouts.small import NOTHING, reported, setting
+
+SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
+
+
+def deployed(**more) -> Setting:
+    """Updates that follow arrivals, with computing charged."""
+    small = setting(
+        compute=ComputeConfig(ms_per_step=2.0, ms_per_view=1.0), deployed=True, lead_ms=400.0, span_ms=1200.0
+    )
+    edge = {**small.scenario.edge, "updates": "arrivals", "update_ms": 50.0, "steps": 2, "grace_ms": 0.0, **more}
+    return dataclasses.replace(small, scenario=dataclasses.replace(small.scenario, edge=edge))
+
+
+def test_samples_have_actions_of_their_own_and_share_the_episode():
+    factory = EpisodeFactory(setting(), NOTHING)
+    actor = Learner(SELECT, 0).actor
+    runs = rollout(factory, 3, learned(actor, explore=True), 3)
+    assert runs == rollout(EpisodeFactory(setting(), NOTHING), 3, learned(actor, explore=True), 3)
+    assert len({str([d.action for d in run.decided]) for run in runs}) > 1
+    assert len({str([d.features for d in run.decided]) for run in runs}) == 1
+    state = factory.episode(3).moments[1].state
+    one = runs[0].decided[1]
+    assert one.features == SELECT.layout.features(state).tolist() and one.slot == 1
+    greedy = rollout(factory, 3, learned(actor), 2)
+    assert greedy[0] == greedy[1] and greedy[0].decided[0].logp < 0.0
+    fixed = rollout(factory, 3, named("all"))[0].decided
+    assert fixed[0].features is None and fixed[0].outcomes["cam00"].views >= 3.0
+
+
+@pytest.mark.parametrize("what", [setting(), deployed()], ids=["single decisions", "deployed"])
+def test_two_processes_give_what_one_gives(what: Setting, tmp_path):
+    spec = SELECT if not what.deployed else dataclasses.replace(SELECT, hold_ms=300.0)
+    actors = {"all": "all", "random": "random", "learned": Learner(spec, 0).actor}
+    found = [
+        run_rollouts(
+            Engine(jobs=jobs, threads=1, say=lambda line: None),
+            what,
+            NOTHING,
+            seeds(0, "test", 3),
+            actors,
+            explore=True,
+            samples=2,
+        )
+        for jobs in (1, 2)
+    ]
+    assert found[0] == found[1] and found[0].keys() == actors.keys()
+    runs = found[0]["learned"][seeds(0, "test", 1)[0]][0]
+    assert len(runs) == 2 and isinstance(runs[0], Run)
+
+
+def test_repeats_have_fields_of_other_seeds_and_cameras_score_by_name():
+    engine = Engine(threads=1, say=lambda line: None)
+    found = run_rollouts(engine, reported(), NOTHING, [5], {"all": "all"}, repeats=2, cameras=("cam00", "cam04"))[
+        "all"
+    ][5]
+    outcomes = [repeat[0].decided[0].outcomes for repeat in found]
+    assert [set(of) for of in outcomes] == [{"cam00", "cam04"}] * 2
+    assert outcomes[0]["cam00"].psnr_db != outcomes[1]["cam00"].psnr_db
+    assert outcomes[0]["cam00"].aaoi_ms == outcomes[1]["cam04"].aaoi_ms
+
+
+def test_results_are_kept_by_weights_and_not_by_the_names_of_their_files(tmp_path):
+    def known() -> int:
+        return len((tmp_path / "known.jsonl").read_text().splitlines())
+
+    def roll(path) -> None:
+        with Engine(tmp_path / "known.jsonl", threads=1, say=lambda line: None) as engine:
+            run_rollouts(engine, setting(), NOTHING, [5], {"mine": f"bandit:{path}"})
+
+    a, b = tmp_path / "a.npz", tmp_path / "b.npz"
+    Learner(SELECT, 0).actor.save(a)
+    b.write_bytes(a.read_bytes())
+    roll(a)
+    roll(b)
+    assert known() == 1
+    Learner(SELECT, 1).actor.save(a)
+    roll(a)
+    assert known() == 2
+
+
+def test_a_running_deployment_decides_as_often_as_an_update_lasts():
+    hold = dataclasses.replace(SELECT, hold_ms=300.0)
+    (run,) = rollout(EpisodeFactory(deployed(), NOTHING), 5, learned(Learner(hold, 0).actor))
+    assert run.whole is not None and run.whole.psnr_db > 5.0
+    assert [d.slot for d in run.decided] == sorted({d.slot for d in run.decided}) and len(run.decided) == 4
+    assert {tuple(d.outcomes) for d in run.decided} == {("",)}
+    means = [d.outcomes[""].psnr_db for d in run.decided]
+    assert min(means) <= run.whole.psnr_db <= max(means)
+    (all_run,) = rollout(EpisodeFactory(deployed(), NOTHING), 5, named("all"))
+    assert all_run.decided == [] and all_run.whole is not None and np.isclose(all_run.whole.views, 4.0)

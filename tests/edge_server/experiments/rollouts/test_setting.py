@@ -1,0 +1,113 @@
+"""What an evaluation is: who rewards and who reports, which motion, from which field, with whose luck."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic import make_scene
+from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome
+from edge_server.experiments.rollouts.setting import Setting
+from edge_server.experiments.studies.learning import room
+from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, reported, scenario, setting
+
+
+def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
+    """What using everything comes to at the first decision of an episode."""
+    episode = EpisodeFactory(what, NOTHING).episode(seed)
+    moment = episode.moments[0]
+    return episode.evaluate(0, Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns), (camera,))[camera]
+
+
+def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
+    what = reported()
+    assert what.rewarding == ("cam00",) and what.judging == ("cam04",)
+    moment = EpisodeFactory(what, NOTHING).episode(5).moments[0]
+    assert moment.cameras == ("cam01", "cam02", "cam03")
+    rewarded, judged = one_of(what), one_of(what, camera="cam04")
+    turned = dataclasses.replace(what, report=("cam00",))
+    assert one_of(turned, camera="cam04") == judged and one_of(turned) == rewarded
+    assert rewarded.psnr_db != judged.psnr_db and rewarded.aaoi_ms == judged.aaoi_ms
+
+
+def test_where_nobody_reports_it_is_judged_by_who_rewards():
+    assert setting().judging == setting().rewarding == ("cam00",)
+    for report, said in ((("cam03",), "cam03 is not held out"), (("cam00", "cam04"), "only reports")):
+        with pytest.raises(ValueError, match=said):
+            dataclasses.replace(reported(), report=report)
+
+
+def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one():
+    factory = EpisodeFactory(setting(motions=True), NOTHING)
+    images = {}
+    for seed in (1, 2, 2_000_001):
+        stage = factory.stage(seed)
+        params = {"count": 5, "width": 24, "height": 24, "supersample": 1, "speed_m_per_s": 2.0}
+        scene = make_scene("room", {**params, "motion_seed": seed})
+        images[seed] = stage.truths["cam00"].view("cam00", 10**9)[0]
+        assert np.array_equal(images[seed], scene.render("cam00", 1.0))
+        frames = stage.cameras[0].source._frames
+        assert np.array_equal(frames.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
+    assert len({image.tobytes() for image in images.values()}) == 3
+    # What it was: one walk for all seeds, of training and of testing.
+    same = EpisodeFactory(setting(motions=False), NOTHING)
+    assert same.stage(1) is same.stage(2_000_001)
+
+
+def test_motions_are_drawn_where_something_moves_and_nowhere_else():
+    still = {**RAW["source"], "speed_m_per_s": 0.0}
+    tile = {"kind": "world", "scene": "tile", "width": 24, "height": 24, "params": {"supersample": 1}}
+    for source in (still, tile):
+        what = dataclasses.replace(setting(motions=True), scenario=scenario(source=source))
+        assert "motion_seed" not in EpisodeFactory(what, NOTHING).scenario(3).source
+    assert EpisodeFactory(setting(motions=True), NOTHING).scenario(3).source["motion_seed"] == 3
+
+
+def test_an_outcome_with_a_drawn_motion_is_the_same_whoever_asks():
+    what = setting(motions=True)
+    factory = EpisodeFactory(what, NOTHING)
+    for seed in (1, 2):
+        factory.episode(seed)
+    moment = factory.episode(5).moments[0]
+    choice = Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns)
+    assert factory.episode(5).evaluate(0, choice) == {"cam00": one_of(what)}
+
+
+def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
+    """Frames of two episodes have the same numbers."""
+    what = setting(motions=True, parts=("semantics", "age"), decisions=1)
+    factory = EpisodeFactory(what, NOTHING)
+    after_others = [factory.episode(seed).moments[0].state.embeddings for seed in (1, 2)][1]
+    alone = EpisodeFactory(what, NOTHING).episode(2).moments[0].state.embeddings
+    assert after_others.any() and np.array_equal(after_others, alone)
+
+
+def test_decisions_start_from_a_warm_field_unless_the_thesis_is_asked_for():
+    assert not Setting(scenario()).scratch
+    assert not room().scratch and room(scratch=True).scratch
+
+
+def test_the_scenarios_seed_and_the_repeat_decide_the_fields_luck_and_so_does_the_episode():
+    a = setting()
+    other = dataclasses.replace(a.scenario, seed=a.scenario.seed + 99)
+    b, again = dataclasses.replace(a, scenario=other), dataclasses.replace(a, repeat=1)
+    assert len({what.key for what in (a, b, again)}) == 3
+    assert len({what.field_seed(seed) for what in (a, b, again) for seed in range(20)}) == 60
+    found = [one_of(what).psnr_db for what in (a, b, again)]
+    assert len(set(found)) == 3 and one_of(a).psnr_db == found[0]
+
+
+def test_a_silent_camera_never_reports_and_is_another_setting():
+    what = setting(silent=("cam02",))
+    assert what.key != setting().key
+    factory = EpisodeFactory(what, NOTHING)
+    for seed in range(3):
+        for moment in factory.episode(seed).moments:
+            assert moment.cameras == ("cam01", "cam02", "cam03", "cam04")
+            assert not any(a.camera == "cam02" for a in moment.arrivals)
+            assert not moment.state.reported[1] and np.isnan(moment.state.ages_ms[1])
+            assert moment.state.reported[[0, 2, 3]].all()
+    with pytest.raises(ValueError, match="not a training camera"):
+        setting(silent=("cam00",))

@@ -1,0 +1,280 @@
+"""The studies of trials: their points are sound, their verdicts follow from the figures and can come out either way."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import SeedTable
+from edge_server.experiments.common.statistics import Interval
+from edge_server.experiments.studies.command import main
+from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES, make_study
+from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
+from edge_server.scheduler import make_policy
+from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, request, verdicts
+
+
+@pytest.mark.parametrize("name", ON_A_CHANNEL)
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
+    points = make_study(name).cases(StudyRequest(quick, tmp_path, Folders(), seeds=1))
+    distinct = {(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}
+    assert points and len(distinct) == len(points)
+    for point in points:
+        scenario = point.trial.scenario()
+        assert len(scenario.training) == 18 and scenario.held_out
+        make_policy(point.trial.policy, point.trial.value, scenario.rng("policy"))
+
+
+def test_every_study_is_what_its_name_says():
+    for name in STUDIES:
+        study = make_study(name)
+        assert study.name == name and study.claims and study.metrics
+
+
+OWN_SCENE = """
+name: mine
+cameras: {count: 4, held_out: [cam03]}
+source: {kind: world, scene: room, width: 40, height: 30, fps: 10}
+channel: {preset: ch5}
+edge: {lpips: none}
+"""
+
+
+@pytest.mark.parametrize("name", ON_A_CHANNEL)
+def test_a_study_takes_anybodys_channel_and_scene(name: str, tmp_path: Path):
+    scene = tmp_path / "mine.yaml"
+    scene.write_text(OWN_SCENE)
+    channel = {"service": {"law": "deterministic", "mean_ms": 77.0}, "discipline": "fcfs"}
+    asked = request(tmp_path, seeds=1, scenes=(str(scene),), channel=channel, channel_name="slow")
+    points = make_study(name).cases(asked)
+    used = [p for p in points if p.trial.channel != {"preset": "ideal"}]
+    assert used and {p.trial.channel["discipline"] for p in used} == {"fcfs"}
+    assert {p.labels["scene"] for p in points} == {"mine"}
+    assert {(s.cameras, s.held_out, s.source["fps"]) for s in (p.trial.scenario() for p in points[:3])} == {
+        (("cam00", "cam01", "cam02", "cam03"), ("cam03",), points[0].trial.scenario().source["fps"])
+    }
+
+
+@pytest.mark.slow  # some seconds of fits
+def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr("edge_server.experiments.studies.waiting_curves.QUICK_OMEGAS", (60.0, 120.0))
+    scene, channel, out = tmp_path / "mine.yaml", tmp_path / "slow.yaml", tmp_path / "out"
+    scene.write_text(OWN_SCENE)
+    channel.write_text("{service: 'det:40ms', discipline: drop-new}")
+    words = ["--scene", str(scene), "--channel", str(channel), "--seeds", "1", "--jobs", "1", "--out", str(out)]
+    assert main(["omega", "--quick", *words]) == 0
+    assert "mine, slow, threshold" in capsys.readouterr().out
+    assert {row["channel"] for row in csv.DictReader((out / "omega.csv").open())} == {"slow", ""}
+    known = (out / "results/trials.jsonl").read_bytes()
+    assert main(["omega", "--quick", *words]) == 0  # everything is known
+    assert (out / "results/trials.jsonl").read_bytes() == known
+
+
+def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
+    assert answers(verdicts("mat", tmp_path, peak(80.0))) == {"holds"}
+    assert answers(verdicts("mat", tmp_path, peak(4000.0))) == {"does not hold"}
+
+
+def at_delay(peak_of):
+    """A rule whose best threshold follows the mean delay as ``peak_of`` says."""
+
+    def rule(trial):
+        return peak(peak_of(trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]))(trial)
+
+    return rule
+
+
+def test_mat_delay_finds_a_rising_best_threshold_and_no_other(tmp_path: Path):
+    assert answers(verdicts("mat-delay", tmp_path, at_delay(lambda delay: 60.0 + 1.5 * delay))) == {"holds"}
+    falling = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 400.0 - 1.5 * delay))
+    assert answers(falling) == {"does not hold"}
+    assert "holds" not in answers(verdicts("mat-delay", tmp_path, at_delay(lambda delay: 150.0)))
+
+
+@pytest.mark.parametrize("top", [lambda delay: 2.0 * delay, lambda delay: 4.0 * delay])
+def test_a_curve_that_saturates_has_no_best_threshold_that_could_grow(tmp_path: Path, top):
+    """The larger the delay, the later all views are admitted: the highest of near-ties moves with that, no optimum
+    does."""
+
+    def rule(trial):
+        value, delay = trial.value or 1000.0, trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]
+        return figures(2.0 * min(value / top(delay), 1.0) + 0.2 * noise(trial.seed, value), value)
+
+    assert answers(verdicts("mat-delay", tmp_path, rule)) == {"does not hold"}
+
+
+@pytest.mark.parametrize("only", [lambda x: math.log(x), lambda x: -math.log(x), lambda x: 0.0])
+def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, only):
+    def rule(trial):
+        value = trial.value or 1000.0
+        return figures(only(value) + noise(trial.seed, value), value)
+
+    assert "holds" not in answers(verdicts("mat-delay", tmp_path, rule))
+
+
+@pytest.mark.parametrize("name", [n for n in ON_A_CHANNEL if n != "representations"])
+def test_one_seed_decides_nothing(name, tmp_path: Path):
+    assert answers(verdicts(name, tmp_path, peak(90.0), seeds=1)) == {"undecided"}
+
+
+def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
+    def rule(trial):
+        row = peak(200.0)(trial)
+        return {**row, "age_sum_ms": 2000.0} if trial.policy == "threshold" else row
+
+    found = verdicts("lambda", tmp_path, rule)
+    assert answers(found, "threshold, all cameras (5.8)") == {"does not hold"}
+    assert answers(found, "threshold, used views (6.35)") == {"holds"}
+    assert answers(found, "wait, all cameras (5.8)") == {"holds"}
+
+
+def test_omega_tells_a_plateau_from_a_peak_and_from_a_curve_that_still_rises(tmp_path: Path):
+    def shaped(shape):
+        def rule(trial):
+            if trial.policy == "wait":
+                return figures(shape(trial.value) + noise(trial.seed, trial.value), trial.value)
+            return peak(60.0)(trial)
+
+        return verdicts("omega", tmp_path, rule)
+
+    found = shaped(lambda value: 2.0 * (1 - math.exp(-value / 20.0)))
+    assert answers(found, "high traffic, threshold, PSNR (dB)", "optimum between") == {"holds"}
+    assert answers(found, "high traffic, wait, PSNR (dB)", "plateau") == {"holds"}
+    assert answers(found, "high traffic, wait-flush, PSNR (dB)", "plateau") == {"does not hold"}
+    assert answers(found, "high traffic, wait, F_w (6.37)", "freshness counts") == {"does not hold"}
+    rising = shaped(lambda value: value / 60.0)
+    assert answers(rising, "high traffic, wait, PSNR (dB)", "plateau") == {"does not hold"}
+
+
+@pytest.mark.parametrize(("gain", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
+def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: Path):
+    def rule(trial):
+        better = gain * ((trial.policy == "wait-arrived") + 3.0 * (trial.policy == "threshold"))
+        return figures(2.0 + better + noise(trial.seed, 1.0), 50.0)
+
+    found = [v for v in verdicts("omega", tmp_path, rule) if "that arrive meanwhile" in v.claim]
+    assert answers(found) == {said} and len(found) == 8 * 3
+    assert all("wait-arrived" in v.about for v in found)
+
+
+def test_the_sign_of_ssim_in_f_w_can_turn_what_is_better(tmp_path: Path):
+    def rule(trial):
+        row = figures(noise(trial.seed, 1.0), 50.0)
+        return {**row, "ssim": 0.9 if trial.policy == "wait-arrived" else 0.5}
+
+    found = verdicts("omega", tmp_path, rule)
+    assert answers(found, "F_w (6.37)", "arrive meanwhile") == {"does not hold"}
+    assert answers(found, "F_w with w_s = -0.2", "arrive meanwhile") == {"holds"}
+
+
+def test_images_judges_both_directions_and_finds_an_optimum_between_few_and_stale(tmp_path: Path):
+    for sign, answer in ((1, "holds"), (-1, "does not hold")):
+
+        def rule(trial, sign=sign):
+            count = trial.value or 18.0
+            return figures(sign * math.log(count) + noise(trial.seed, count), 30.0 * count**sign)
+
+        assert answers(verdicts("images", tmp_path, rule), "more images") == {answer}
+    for best, answer in ((8.0, "holds"), (18.0, "does not hold")):
+
+        def peaked(trial, best=best):
+            count = trial.value or 18.0
+            return figures(2.0 - abs(math.log(count / best)) + noise(trial.seed, count), 30.0 * count)
+
+        assert answers(verdicts("images", tmp_path, peaked), "better than all") == {answer}
+
+
+def test_representations_are_judged_each_for_itself(tmp_path: Path):
+    def rule(trial):
+        return peak(75.0 if trial.field == "splat" else 9000.0)(trial)
+
+    found = verdicts("representations", tmp_path, rule)
+    assert answers(found, "splat, threshold, PSNR (dB)") == {"holds"}
+    assert answers(found, "ngp, threshold, PSNR (dB)") == {"does not hold"}
+
+
+def test_phase_says_what_can_be_won(tmp_path: Path):
+    gains = {"all": 0.0, "threshold": 0.8, "wait": -0.5}
+
+    def rule(trial):
+        gain = 2.0 if trial.channel.get("preset") == "ideal" else gains[trial.policy]
+        return figures(gain + noise(trial.seed, trial.value), 50.0)
+
+    assert answers(verdicts("phase", tmp_path, rule)) == {"holds"}
+    gains |= {"threshold": -1.0}
+    assert answers(verdicts("phase", tmp_path, rule), "giving up") == {"does not hold"}
+
+
+# --- verdicts ------------------------------------------------------------------------------------------------
+
+
+def test_verdicts_are_corrected_for_their_number():
+    """One in twenty comparisons of equals has an interval that leaves out 0: of a hundred none is decided, and what is
+    certain stays so."""
+
+    def at(table, metric, labels):
+        return Finding("", (Interval(*table.values(metric, **labels)[0]),))
+
+    lucky, certain, equal = (1.0, 0.01, 1.99, 10), (1.0, 0.9, 1.1, 10), (0.0, -1.0, 1.0, 10)
+    claim = Claim("is better.", at)
+    study = Study("s", "s", lambda _: [], lambda cases, _: [], ("reward",), (claim,), ("scene",))
+    rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
+    assert [v.verdict for v in judge(study, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
+    assert [v.verdict for v in judge(study, SeedTable(rows[:2]))] == ["holds", "holds"]
+
+
+def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part_and_one_of_several_costs_their_number():
+    sure, weak, below = Interval(1.0, 0.9, 1.1, 10), Interval(1.0, 0.1, 1.9, 10), Interval(-1.0, -1.9, -0.1, 10)
+    assert Finding("", (sure, weak)).above(0.0) is True
+    assert Finding("", (sure, weak)).p_value(0.0) == weak.p_value(0.0) > sure.p_value(0.0)
+    assert Finding("", (sure, below)).above(0.0) is False
+    assert Finding("", (sure, below)).p_value(0.0) == 2 * below.p_value(0.0)
+    assert Finding("", (sure, below), one_suffices=True).above(0.0) is True
+    assert Finding("", (sure, below), one_suffices=True).p_value(0.0) == 2 * sure.p_value(0.0)
+    assert Finding("", (below, below), one_suffices=True).p_value(0.0) == below.p_value(0.0)
+
+
+def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
+    assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["command"] == "edge-server study metrics --quick --seeds 2"
+    assert found["verdicts"] and all(v["verdict"] for v in found["verdicts"])
+    page = (tmp_path / "metrics.md").read_text()
+    assert page.startswith("# What the three metrics say") and "2 seeds a point" in page
+    assert "false discovery rate 5 %" in page and "![" in page and "local ghosting" in page
+    assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["mat", "--seeds", "0"], "--seeds"),
+        (["mat", "--scene", "moon"], "moon"),
+        (["mat", "--scene", "cell"], "its camera moves"),
+        (["mat", "--jobs", "0"], "--jobs"),
+        (["mat", "--channel", "nowhere.yaml"], "nowhere.yaml"),
+        (["mat", "--channel", "sms"], "sms"),
+        (["metrics", "--channel", "ch5"], "--channel is for mat"),
+        (["preferences", "--scene", "tower"], "its cameras look outward"),
+        (["ppo-wait", "--scene", "tower"], "scenes of its own"),
+        (["mat", "--case", "room"], "--case is for ppo-select"),
+        (["mat", "--episodes", "3"], "--episodes is for ppo-select"),
+        (["ppo-wait", "--case", "ch7"], "none has 'ch7' in its name"),
+    ],
+)
+def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, capsys):
+    assert main([*words, "--quick", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert why in error and error.count("\n") == 1
+
+
+def test_a_study_without_rows_of_a_claim_says_nothing_of_it(tmp_path: Path):
+    study = make_study("images")
+    empty = Study(study.name, study.title, lambda _: [], lambda cases, _: [], study.metrics, study.claims, study.panels)
+    assert run_study(empty, request(tmp_path)) == []
