@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 # Commands with options and a main of their own, imported only when called: command -> (module, help).
 _COMMANDS = {
     "fit": ("experiments.fitting.command", "fit a recorded data set without a network and report fidelity over time"),
-    "frontier": ("experiments.frontier.command", "sweep the effort of fits and updates, plot fidelity against seconds"),
+    "frontier": ("experiments.frontier.command", "sweep the time of fits and updates, plot fidelity against seconds"),
     "train-scheduler": (
         "experiments.training.scheduler.command",
         "learn when to update the field and from which views, rewarded by real field fits",

@@ -6,9 +6,9 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,13 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
 from edge_server.edge_defaults import FIELD
 from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
-from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
-from edge_server.experiments.frontier import effort_sweep, update_time
+from edge_server.experiments.engine import Engine
+from edge_server.experiments.frontier import from_scratch, update_time
+from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
-from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
+from edge_server.experiments.frontier.update_time import MEDIUM, Charged, MovingRun, MovingScene, live_settings
 from edge_server.experiments.virtual.virtual_deployment import Compute
-from edge_server.fidelity.lpips import Lpips
-from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
@@ -39,8 +39,8 @@ Fidelity against time, in two figures.
   edge-server frontier --scene room --seeds 3 --lpips ~/data/lpips
   edge-server frontier --scene ~/data/lego --scale 2 --holdout 8 --field all
 
-1. From scratch: PSNR, SSIM and LPIPS on a held-out camera against seconds of fitting, for each effort level
-   of the field, with the Pareto front marked. The time of a step on this machine is measured on the way.
+1. From scratch: PSNR, SSIM and LPIPS on a held-out camera against seconds of fitting, for each
+   representation, with the Pareto front marked. The time of a step on this machine is measured on the way.
 2. Live: the scene moves, the network delays, and an update that takes longer shows an older world. The whole
    deployment runs in virtual time, which charges the measured time of an update of the moving scene (a step,
    and the rest), so this figure is the same bit for bit for one seed and one such measurement. It says how
@@ -50,8 +50,8 @@ Fidelity against time, in two figures.
 The last line says which edge.update_ms figure 2 recommends. The page and the report of a scenario that names
 the file (frontier: OUT/frontier.json) draw it, with the run's own point.
 
-Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command continues where it stopped;
-with other settings, points are measured anew.
+Every finished point is kept in OUT/results.jsonl. After Ctrl-C the same command continues where it stopped;
+with other settings or other code, points are measured anew.
 """
 
 
@@ -67,7 +67,6 @@ class Sweep:
     speeds: speeds of the moving scene, m/s.
     update_s: seconds per update.
     run_s: virtual seconds of a moving run; six updates if those take longer.
-    efforts: effort levels of the moving runs.
     warm_steps: steps of the warm field before a moving run.
     size: image width and height of the still scene.
     """
@@ -77,10 +76,9 @@ class Sweep:
     speeds: tuple[float, ...]
     update_s: tuple[float, ...]
     run_s: float
-    efforts: tuple[str, ...]
     warm_steps: int
     size: int
-    moving: update_time.MovingScene
+    moving: MovingScene
 
 
 QUICK = Sweep(
@@ -89,10 +87,9 @@ QUICK = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
     run_s=4.0,
-    efforts=("low", "medium", "layers"),
     warm_steps=150,
     size=128,
-    moving=update_time.MovingScene(cameras=13, size=64),
+    moving=MovingScene(cameras=13, size=64),
 )
 FULL = Sweep(
     seeds=3,
@@ -100,23 +97,16 @@ FULL = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
     run_s=20.0,
-    efforts=("low", "medium", "high", "layers"),
     warm_steps=600,
     size=128,
-    moving=update_time.MovingScene(cameras=19, size=128),
+    moving=MovingScene(cameras=19, size=128),
 )
 
 LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
 
 # The sweep of the shipped points, for scenarios without a frontier of their own. Unlike --quick, it measures
 # the cost of a step with as many and as large views as the runs have.
-SHIPPED = replace(
-    FULL,
-    planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
-    update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
-    run_s=8.0,
-    efforts=("low", "medium", "layers"),
-)
+SHIPPED = replace(FULL, planned_s=(0.5, 1.0, 2.0, 4.0, 8.0), update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0), run_s=8.0)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (DatasetError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
-    stopped = f"what was measured is in {frontier.file.path}: the same command goes on"
+    stopped = f"what was measured is in {args.out}: the same command goes on"
     return run_command("frontier", frontier.run, (), stopped)
 
 
@@ -170,222 +160,127 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     if unknown := set(fields) - set(field_names()):
         raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     options = parse_options(args.option)
-    levels = [level for field in fields for level in effort_sweep.efforts(field, options)]
-    for level in levels:
-        make_field(level.field, level.options)  # rejects wrong options now, not between two measurements
-    still = open_still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
-    args.out.mkdir(parents=True, exist_ok=True)
-    file = FrontierFile(args.out / "frontier.json")
+    for field in fields:
+        make_field(field, options)  # rejects wrong options now, not between two measurements
+    still = Still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
+    from_scratch.views_of(still)
+    weights = weights_folder(args.lpips)
     lpips, missing = open_lpips(args.lpips)
-    return Frontier(args.out, file, sweep, still, args.scene, fields, levels, lpips, missing, args.seed, args.points)
-
-
-class FrontierFile:
-    """The file frontier.json: every finished point with its settings, written after each new point."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.data: Row = {"points": {}}
-        if path.is_file():
-            try:
-                self.data["points"] = dict(json.loads(path.read_text())["points"])
-            except (ValueError, KeyError, TypeError):
-                print(f"{path}: not readable, measured anew", flush=True)
-        self._store = ResultStore(self.data["points"], lambda *_: self.write())
-
-    def get(self, settings: Row, compute: Callable[[], Row]) -> tuple[Row, bool]:
-        """The point with these settings, and whether it had to be measured."""
-        key = content_key(settings)
-        known = self._store.find(key, settings=settings) is not None
-        return self._store.get(key, compute=compute, settings=settings), not known
-
-    def write(self, **more: Any) -> None:
-        self.data.update(more)
-        write_json(self.path, self.data)
+    engine = Engine(args.out / "results.jsonl")
+    seeds = range(args.seed, args.seed + sweep.seeds)
+    found = weights if lpips is not None else None
+    return Frontier(args.out, engine, sweep, still, fields, options, seeds, found, missing, args.points)
 
 
 @dataclass
 class Frontier:
-    """A run of the command: measures the missing points, then writes tables, CSV, figures and conclusion."""
+    """A run of the command: measures the missing points, then writes tables, CSV, figures and conclusion.
+
+    weights, lpips_missing: folder of LPIPS weights, or why there are none.
+    points: a file for the points of figure 2.
+    """
 
     out: Path
-    file: FrontierFile
+    engine: Engine
     sweep: Sweep
-    still: MultiviewStill
-    scene: str
+    still: Still
     fields: tuple[str, ...]
-    levels: list[effort_sweep.Effort]
-    lpips: Lpips | None
+    options: dict[str, Any]
+    seeds: range
+    weights: Path | None
     lpips_missing: str | None
-    seed: int
     points: Path | None = None
 
     def run(self) -> None:
-        begun = time.perf_counter()
-        print(f"{self.still.describe()}, {len(self.still.held_out)} held out", flush=True)
-        rows = effort_sweep.medians(self._from_scratch())
-        effort_sweep.mark_front(rows)
-        charged: dict[str, Compute] = {}
-        if self.scene == "room":
-            charged = self._charged()
-            updates = self._updates(charged)
-        else:
-            updates = []
+        """Measure and write everything."""
+        begun, still = time.perf_counter(), from_scratch.views_of(self.still)
+        print(f"{still.describe()}, {len(still.held_out)} held out", flush=True)
+        with self.engine:
+            rows = self._from_scratch()
+            charged, updates = self._live() if self.still.scene == "room" else ({}, [])
+        if self.still.scene != "room":
             why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
-            if self.scene in SCENES:
-                why = f"nothing moves in {self.scene}"
+            if self.still.scene in SCENES:
+                why = f"nothing moves in {self.still.scene}"
             print(f"figure 2 left out: {why}", flush=True)
-        self.file.write(
-            scene=self.still.describe(),
-            fields=list(self.fields),
-            policy=self.sweep.moving.policy,
-            channel=self.sweep.moving.channel,
-            lpips_network=self.lpips.network if self.lpips else None,
-            lpips_missing=self.lpips_missing,
-            machine=machine(),
-            versions=versions(),
-            ms_per_step=effort_sweep.costs(rows),
-            charged={label: asdict(compute) for label, compute in charged.items()},
-            from_scratch=rows,
-            updates=updates,
-        )
-        print(write_output(self.out, self.file.data), flush=True)
+        about = {"scene": still.describe(), "policy": self.sweep.moving.policy, "channel": self.sweep.moving.channel}
+        data = {
+            **about,
+            "machine": machine(),
+            "versions": versions(),
+            "fields": list(self.fields),
+            "lpips_network": "alex" if self.weights else None,
+            "lpips_missing": self.lpips_missing,
+            "ms_per_step": from_scratch.costs(rows),
+            "charged": charged,
+            "from_scratch": rows,
+            "updates": updates,
+        }
+        write_json(self.out / "frontier.json", data)
+        print(write_output(self.out, data), flush=True)
         if self.points is not None:
-            about = {k: self.file.data[k] for k in ("scene", "policy", "channel", "machine")}
-            write_json(self.points, {**about, "updates": [*self._other_points(), *updates]})
-        print(f"{self.file.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
+            others = [row for row in self._other_points() if row["field"] not in self.fields]
+            write_json(self.points, {**about, "machine": data["machine"], "updates": [*others, *updates]})
+        print(f"{self.out / 'frontier.json'} ({time.perf_counter() - begun:.0f} s)", flush=True)
         print(recommendation(updates), flush=True)
 
     def _other_points(self) -> list[Row]:
-        """Points in the FILE of --points of representations and efforts that are not measured now."""
+        """The points that the file of ``points`` has already."""
         assert self.points is not None
-        known = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
-        return [row for row in known if f"{row['field']} {row['effort']}" not in {e.label for e in self._live}]
-
-    @property
-    def _seeds(self) -> range:
-        return range(self.seed, self.seed + self.sweep.seeds)
+        known: list[Row] = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
+        return known
 
     def _from_scratch(self) -> list[Row]:
-        levels = [e for e in self.levels if e.still]
-        todo = [(s, e, p) for s in self._seeds for e in levels for p in self.sweep.planned_s]
-        points = []
-        for number, (seed, effort, planned_s) in enumerate(todo, 1):
-            settings: Row = {
-                "figure": 1,
-                "scene": self.still.describe(),
-                **_settings(effort),
-                "seconds": planned_s,
-                "seed": seed,
-                "lpips": self.lpips is not None,
-            }
-            measure = partial(effort_sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
-            point, new = self.file.get(settings, measure)
-            points.append({**point, "planned_s": planned_s, "effort": effort.label})
-            print(
-                f"[{number}/{len(todo)}] {effort.label:22} {planned_s:5.2f} s {point['steps']:6d} steps  "
-                f"PSNR {_db(point['psnr_db'])}{_known(new)}",
-                flush=True,
-            )
-        return points
+        """Rows of figure 1."""
+        every = product(self.seeds, self.fields, self.sweep.planned_s)
+        fits = [Fit(self.still, field, seconds, seed, self.options) for seed, field, seconds in every]
+        points = self.engine.run(
+            partial(from_scratch.fit_from_scratch, weights=self.weights),
+            fits,
+            "from scratch",
+            files=lambda fit: [*fit.still.files, self.weights],
+            describe=lambda fit, row: (
+                f"{fit.field:10} {fit.seconds:5.2f} s {row['steps']:6d} steps  PSNR {_db(row['psnr_db'])}"
+            ),
+        )
+        return from_scratch.curves(fits, points)
 
-    @property
-    def _live(self) -> list[effort_sweep.Effort]:
-        return [e for e in self.levels if e.name in self.sweep.efforts]
-
-    def _charged(self) -> dict[str, Compute]:
-        """Cost of an update of each effort in virtual time, measured on this machine with the number of
-        images of the moving scene and the image size of figure 1."""
-        sweep, found = self.sweep, {}
+    def _live(self) -> tuple[Row, list[Row]]:
+        """What updates are charged, and the rows of figure 2 as means over the seeds."""
+        sweep, settings = self.sweep, live_settings(self.fields, self.options)
+        # With the number of images of the moving scene and the image size of figure 1.
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
-        for effort in self._live:
-            settings: Row = {
-                "figure": "charged",
-                **asdict(moving),
-                "speed_m_per_s": speed,
-                **_settings(effort),
-                "warm_steps": sweep.warm_steps,
-            }
-            measure = partial(_measured_compute, moving, speed, effort, sweep.warm_steps)
-            row, new = self.file.get(settings, measure)
-            compute = found[effort.label] = Compute(**{k: v for k, v in row.items() if k != "settings"})
-            print(
-                f"updates of a moving scene, {effort.label}: {compute.ms_per_step:.1f} ms a step, "
-                f"{compute.ms_per_view:.1f} ms a new view, {compute.ms_per_update:.1f} ms for everything "
-                f"else{_known(new)}",
-                flush=True,
-            )
-        return found
-
-    def _updates(self, charged: dict[str, Compute]) -> list[Row]:
-        """Rows of figure 2 for every update time, effort and speed, as means over the seeds."""
-        sweep, rows = self.sweep, []
-        runs = list(product(self._live, sweep.speeds, self._seeds))
-        times = {e.name: (LAYERS_S, *sweep.update_s) if e.name == "layers" else sweep.update_s for e in self._live}
-        count = sum(len(times[effort.name]) for effort, _, _ in runs)
-        for effort, speed, seed in runs:
-            # Made only for the first new point, so a resumed sweep makes only those that it still needs.
-            of = (sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
-            start = cache(partial(update_time.WarmStart, *of))
-            compute = charged[effort.label]
-            for update_s in times[effort.name]:
-                seconds, layers = max(sweep.run_s, 6.0 * update_s), effort.name == "layers"
-                steps = update_time.static_steps(update_s) if layers else update_time.steps_for(update_s, compute)
-                every_s = update_s if layers else 0.0
-                settings: Row = {
-                    "figure": 2,
-                    **asdict(sweep.moving),
-                    "speed_m_per_s": speed,
-                    **_settings(effort),
-                    "warm_steps": sweep.warm_steps,
-                    "steps": steps,
-                    "seed": seed,
-                    "seconds": seconds,
-                    "compute": asdict(compute),
-                    "lpips": self.lpips is not None,
-                    "every_s": every_s,
-                }
-                point, new = self.file.get(
-                    settings, partial(_moving_run, start, steps, compute, seconds, self.lpips, every_s)
-                )
-                rows.append(
-                    {
-                        **point,
-                        "field": effort.field,
-                        "effort": effort.name,
-                        "options": effort.options,
-                        "speed_m_per_s": speed,
-                        "planned_update_s": update_s,
-                        "seed": seed,
-                    }
-                )
-                print(
-                    f"[{len(rows)}/{count}] {effort.label:16} {speed:g} m/s, "
-                    f"update {point['update_s']:5.2f} s  shown {_db(point['shown_psnr_db'])}  "
-                    f"moving {_db(point['shown_psnr_moving_db'])}{_known(new)}",
-                    flush=True,
-                )
-        return update_time.mean_over_seeds(rows)
-
-
-def _settings(effort: effort_sweep.Effort) -> Row:
-    """Settings of an effort that determine a result."""
-    digest = settings_digest(effort.field, effort.options)
-    return {"field": effort.field, "options": effort.options, "defaults": digest}
-
-
-def _moving_run(start: Callable[[], update_time.WarmStart], *how: Any) -> Row:
-    return start().run(*how)
-
-
-def _measured_compute(
-    moving: update_time.MovingScene, speed: float, effort: effort_sweep.Effort, warm_steps: int
-) -> Row:
-    return asdict(update_time.measure_compute(moving, speed, effort.field, effort.options, warm_steps))
-
-
-def _known(new: bool) -> str:
-    return "" if new else "  (known)"
+        asked = [Charged(moving, speed, setting, sweep.warm_steps) for setting in settings]
+        measured = self.engine.run(
+            update_time.measure_compute,
+            asked,
+            "cost of updates",
+            describe=lambda one, row: (
+                f"{one.setting.label}: {row['ms_per_step']:.1f} ms a step, {row['ms_per_view']:.1f} ms a new view, "
+                f"{row['ms_per_update']:.1f} ms for everything else"
+            ),
+        )
+        runs = []
+        for (setting, row), speed, seed in product(zip(settings, measured), sweep.speeds, self.seeds):
+            times = sweep.update_s if setting.name == MEDIUM else (LAYERS_S, *sweep.update_s)
+            compute = Compute(**row)
+            runs += [
+                MovingRun(sweep.moving, speed, setting, seed, sweep.warm_steps, s, max(sweep.run_s, 6.0 * s), compute)
+                for s in times
+            ]
+        points = self.engine.run(
+            partial(update_time.run_updates, weights=self.weights),
+            runs,
+            "updates",
+            files=lambda run: [self.weights],
+            describe=lambda run, row: (
+                f"{run.setting.label:16} {run.speed:g} m/s, update {row['update_s']:5.2f} s  "
+                f"shown {_db(row['shown_psnr_db'])}  moving {_db(row['shown_psnr_moving_db'])}"
+            ),
+        )
+        rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
+        charged = {setting.label: row for setting, row in zip(settings, measured)}
+        return charged, update_time.mean_over_seeds(rows)
 
 
 def _db(value: float | None) -> str:

@@ -16,7 +16,7 @@ from edge_server.report.style import CYCLE, INK, figure
 from freshfield.files import write_csv
 
 Row = dict[str, Any]
-_LINES = {"low": "--", "high": "-.", "layers": (0, (5, 1, 1, 1, 1, 1))}
+_LINES = {"layers": "--"}
 _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
@@ -35,13 +35,13 @@ def write_output(out: Path, data: Row) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Table of effort levels and seconds with PSNR, SSIM and LPIPS; a star marks the Pareto front."""
+    """Table of representations and seconds with PSNR, SSIM and LPIPS; a star marks the Pareto front."""
     digits = {"seconds": 2, "steps": 0, "ms_per_step": 2, "psnr_db": 2, "ssim": 3, "lpips": 3}
     cells = [
-        (row["effort"], *(number(row[name], n) for name, n in digits.items()), "*" if row["on_front"] else "")
+        (row["field"], *(number(row[name], n) for name, n in digits.items()), "*" if row["on_front"] else "")
         for row in rows
     ]
-    head = ("effort", "seconds", "steps", "ms a step", "PSNR, dB", "SSIM", "LPIPS", "")
+    head = ("representation", "seconds", "steps", "ms a step", "PSNR, dB", "SSIM", "LPIPS", "")
     front = "* on the Pareto front: nothing measured is both faster and more accurate"
     return f"{markdown_table(head, cells)}\n{front}"
 
@@ -59,7 +59,7 @@ def updates_table(rows: Sequence[Row]) -> str:
         "psnr_moving_db": 2,
     }
     cells = [(_label(row), *(number(row[name], n) for name, n in digits.items())) for row in rows]
-    head = "field, effort|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
+    head = "field, setting|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
     about = "shown: at random instants, the newest publication carried on; age: of its views then"
     return f"{markdown_table(head.split('|'), cells)}\n{about}"
 
@@ -92,22 +92,21 @@ def conclusion(rows: Sequence[Row]) -> str:
 
 
 def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Draw PSNR, SSIM and LPIPS of every effort level against seconds from scratch, with the PSNR front
+    """Draw PSNR, SSIM and LPIPS of every representation against seconds from scratch, with the PSNR front
     marked."""
     shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
-    efforts = list(dict.fromkeys(row["effort"] for row in rows))
-    looks = _line_styles([tuple(effort.split(" ", 1)) for effort in efforts])
+    fields = list(dict.fromkeys(row["field"] for row in rows))
     front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
     with figure(path, len(shown), height_inch=2.7, sharex=True) as (fig, axes):
         for ax, (key, label) in zip(axes[:, 0], shown):
-            for effort, look in zip(efforts, looks):
-                group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
+            for field, look in zip(fields, _line_styles([(field,) for field in fields])):
+                group = sorted((r for r in rows if r["field"] == field), key=lambda r: r["seconds"])
                 ax.plot(
                     [r["seconds"] for r in group],
                     [r[key] for r in group],
                     marker=".",
                     **look,
-                    label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
+                    label=f"{field} ({data['ms_per_step'][field]:.1f} ms a step)",
                 )
             if key == "psnr_db":
                 _encircle(ax, [r["seconds"] for r in front], [r[key] for r in front], "Pareto front")
@@ -121,18 +120,18 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
     """Draw the shown fidelity against seconds per update: a column for each speed, a color for each
-    representation, a line style for each effort, the best of all encircled. The published fidelity is drawn
+    representation, a line style for each setting, the best of all encircled. The published fidelity is drawn
     for one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
-    efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
-    main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
+    settings = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
+    main = next((who for who in settings if who[1] == "medium"), settings[-1])
     panels = (("psnr_db", "shown, whole image (dB)"), ("psnr_moving_db", "shown where it moves (dB)"))
     with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
         for row, (key, label) in enumerate(panels):
             axes[row, 0].set_ylabel(label)
             for ax, speed in zip(axes[row], speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[f"shown_{key}"] is not None]
-                for who, look in zip(efforts, _line_styles(efforts)):
+                for who, look in zip(settings, _line_styles(settings)):
                     group = sorted((r for r in here if (r["field"], r["effort"]) == who), key=lambda r: r["update_s"])
                     x = [r["update_s"] for r in group]
                     shown = [r[f"shown_{key}"] for r in group]
@@ -163,11 +162,11 @@ def _encircle(axes: Axes, x: Sequence[float], y: Sequence[float], label: str) ->
     axes.plot(x, y, "o", markersize=9, mfc="none", color=INK, label=label)
 
 
-def _line_styles(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
-    """Color and line style of each (representation, effort)."""
-    fields = list(dict.fromkeys(who[0] for who in efforts))
+def _line_styles(settings: Sequence[tuple[str, ...]]) -> list[Row]:
+    """Color and line style of each (representation, setting)."""
+    fields = list(dict.fromkeys(who[0] for who in settings))
     return [
-        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")} for who in efforts
+        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")} for who in settings
     ]
 
 

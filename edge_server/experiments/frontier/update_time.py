@@ -9,10 +9,12 @@ alone.
 
 from __future__ import annotations
 
+import json
 import statistics
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +22,13 @@ import numpy as np
 
 from camera_node.capture import Camera
 from edge_server.experiments.common.tables import mean_or_none, over_seeds
+from edge_server.experiments.frontier.from_scratch import lpips_of
 from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
 from edge_server.fidelity.scorer import SHOWN, PerceptualMetric, Scorer
 from edge_server.fields import Budget, Field, View
+from edge_server.fields.registry import make_field, option_help
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
@@ -40,6 +44,7 @@ _FEW, _MANY, _UPDATES, _BETWEEN_NS = 4, 20, 5, 250_000_000
 # Of a field in layers: seconds until it is warm, update time meanwhile, and steps per second of its static
 # field, which run on another core.
 _LEAD_S, _LEAD_UPDATE_S, _STATIC_STEPS_PER_S = 8.0, 0.02, 250.0
+MEDIUM, LAYERS = "medium", "layers"
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 SHOWN_METRICS = tuple(f"shown_{name}" for name in SHOWN)
 
@@ -56,7 +61,7 @@ class MovingScene:
     policy: str = "all"
     policy_value: float | None = None
 
-    def scenario(self, speed_m_per_s: float, field: str, options: dict[str, Any], seed: int) -> Scenario:
+    def scenario(self, speed_m_per_s: float, field: str, options: Mapping[str, Any], seed: int) -> Scenario:
         """The deployment as a scenario."""
         return parse(
             {
@@ -74,7 +79,7 @@ class MovingScene:
                 "channel": {"preset": self.channel},
                 "edge": {
                     "field": field,
-                    "field_options": options,
+                    "field_options": dict(options),
                     "policy": {"name": self.policy, "value": self.policy_value},
                     "updates": "arrivals" if options.get("layers") else "cycle",
                 },
@@ -83,15 +88,86 @@ class MovingScene:
         )
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A field as it is updated: with its own options (MEDIUM), or in layers (LAYERS)."""
+
+    field: str
+    name: str
+    options: Mapping[str, Any]
+
+    @property
+    def label(self) -> str:
+        """As tables name it."""
+        return f"{self.field} {self.name}"
+
+
+def live_settings(fields: Sequence[str], options: Mapping[str, Any]) -> list[Setting]:
+    """Each field with ``options``, after the same in layers if it has any."""
+    return [
+        Setting(name, kind, {**more, **options})
+        for name in fields
+        for kind, more in ((LAYERS, {"layers": True}), (MEDIUM, {}))
+        if kind == MEDIUM or "layers" in option_help(name)
+    ]
+
+
+@dataclass(frozen=True)
+class Charged:
+    """What is measured to be charged: updates of a warm field at one speed."""
+
+    moving: MovingScene
+    speed: float
+    setting: Setting
+    warm_steps: int
+
+
+@dataclass(frozen=True)
+class MovingRun:
+    """Updates of about ``update_s`` for ``seconds`` of virtual time. compute: what they are charged."""
+
+    moving: MovingScene
+    speed: float
+    setting: Setting
+    seed: int
+    warm_steps: int
+    update_s: float
+    seconds: float
+    compute: Compute
+
+    def facts(self) -> dict[str, Any]:
+        """What a row says of its run."""
+        return {
+            "field": self.setting.field,
+            "effort": self.setting.name,
+            "options": dict(self.setting.options),
+            "speed_m_per_s": self.speed,
+            "planned_update_s": self.update_s,
+            "seed": self.seed,
+        }
+
+
+def run_updates(run: MovingRun, weights: Path | None = None) -> dict[str, Any]:
+    """Mean scores of a run. weights: folder of LPIPS weights."""
+    of = run.speed, run.setting.field, json.dumps(run.setting.options, sort_keys=True), run.seed, run.warm_steps
+    layers = run.setting.name == LAYERS
+    steps = static_steps(run.update_s) if layers else steps_for(run.update_s, run.compute)
+    start = _warm_start(run.moving, *of)
+    return start.run(steps, run.compute, run.seconds, lpips_of(weights), run.update_s if layers else 0.0)
+
+
+@lru_cache(maxsize=1)  # runs of one warm field follow each other
+def _warm_start(moving: MovingScene, speed: float, field: str, options: str, seed: int, warm_steps: int) -> WarmStart:
+    return WarmStart(moving, speed, field, json.loads(options), seed, warm_steps)
+
+
 class WarmStart:
     """Cameras of a scene at one speed, which keep their renderings, and a warm field: converged on the first
     instant, or in layers that follow arrivals for a while before each run."""
 
     def __init__(
-        self, moving: MovingScene, speed: float, field: str, options: dict[str, Any], seed: int, warm_steps: int
+        self, moving: MovingScene, speed: float, field: str, options: Mapping[str, Any], seed: int, warm_steps: int
     ) -> None:
-        from edge_server.fields.registry import make_field
-
         self.scenario = moving.scenario(speed, field, options, seed)
         self.cameras = training_cameras(self.scenario)
         self.field: Field = make_field(field, options, seed=seed)
@@ -171,22 +247,25 @@ class WarmStart:
         return deployment
 
 
-def measure_compute(moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int) -> Compute:
-    """Measure the time of updates of a warm field on this machine while the scene moves and every image is
-    new: ms_per_step for a step, ms_per_update for everything else (reading the images, following motion, a
-    snapshot), from medians of ``_UPDATES`` short and as many long updates. For layers ms_per_update and
-    ms_per_view, in processor time and without the static field.
+def measure_compute(asked: Charged) -> dict[str, float]:
+    """Measure the time of updates of a warm field on this machine while the scene moves and every image is new;
+    returns a ``Compute`` as a mapping.
+
+    ms_per_step is for a step, ms_per_update for everything else (reading the images, following motion, a snapshot),
+    from medians of ``_UPDATES`` short and as many long updates. For layers ms_per_update and ms_per_view, in processor
+    time and without the static field.
 
     Other processes lengthen the wall time, additional threads the processor time, so the shorter one is used.
     """
-    start = WarmStart(moving, speed, field, options, 0, warm_steps)
+    setting = asked.setting
+    start = WarmStart(asked.moving, asked.speed, setting.field, setting.options, 0, asked.warm_steps)
     start.field.warm_up()
     if start.layers:
         costs = UpdateCosts()
         costs.watch(start.field)
         lead = start.lead(RunSettings(steps=1), costs=costs)
         cost = costs.measured(lead.with_images(tuple(lead.updates.buffer.newest().values())))
-        return Compute(ms_per_update=round(cost["update_ms"], 3), ms_per_view=round(cost["view_ms"], 3))
+        return asdict(Compute(ms_per_update=round(cost["update_ms"], 3), ms_per_view=round(cost["view_ms"], 3)))
     taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
     for number in range(1, 2 * _UPDATES + 3):
         views = [_view(camera, number * _BETWEEN_NS) for camera in start.cameras]
@@ -199,7 +278,7 @@ def measure_compute(moving: MovingScene, speed: float, field: str, options: dict
             taken[steps].append(1e3 * min(spent))
     few, many = (statistics.median(taken[steps]) for steps in (_FEW, _MANY))
     ms_per_step = max((many - few) / (_MANY - _FEW), 0.01)
-    return Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3))
+    return asdict(Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3)))
 
 
 def static_steps(update_s: float) -> int:

@@ -10,18 +10,21 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.frontier import command, effort_sweep
+from edge_server.experiments.frontier import command, from_scratch
 from edge_server.experiments.frontier.output import conclusion, recommendation
 from edge_server.experiments.frontier.update_time import (
+    Charged,
     MovingScene,
+    Setting,
     WarmStart,
+    live_settings,
     mean_over_seeds,
     measure_compute,
+    static_steps,
     steps_for,
 )
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
-from edge_server.fields.tensorf import settings
 from edge_server.live.frontier import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
@@ -59,13 +62,13 @@ def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch)
         def snapshot(self):
             clock[0] += 0.030
 
-    monkeypatch.setattr("edge_server.fields.registry.make_field", lambda *args, **more: Slow())
+    monkeypatch.setattr("edge_server.experiments.frontier.update_time.make_field", lambda *args, **more: Slow())
     for name, factor in (("perf_counter", 1.0), ("process_time", 3.0)):  # of three threads
         monkeypatch.setattr(
             f"edge_server.experiments.frontier.update_time.time.{name}", lambda factor=factor: factor * clock[0]
         )
-    found = measure_compute(TINY, 1.0, "ngp", {}, warm_steps=5)
-    assert found.ms_per_step == pytest.approx(5.0) and found.ms_per_update == pytest.approx(90.0)
+    found = measure_compute(Charged(TINY, 1.0, Setting("ngp", "medium", {}), warm_steps=5))
+    assert found == {"ms_per_step": pytest.approx(5.0), "ms_per_update": pytest.approx(90.0), "ms_per_view": 0.0}
     stamps = [{v.generated_ns for v in views} for views in seen]
     assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
     assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
@@ -85,13 +88,20 @@ def test_the_front_is_what_nothing_beats_in_both():
         {"planned_s": 3.0, "psnr_db": 25.0},
         {"planned_s": 4.0, "psnr_db": 26.0},
     ]
-    effort_sweep.mark_front(rows)
+    from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
 
 
 def test_steps_that_fit_into_an_update():
     assert steps_for(1.0, COMPUTE) == 33
     assert steps_for(0.001, COMPUTE) == 1
+    assert static_steps(0.02) == 5 and static_steps(0.001) == 1
+
+
+def test_layers_are_a_setting_of_fields_that_have_them():
+    found = live_settings(("splat", "ngp"), {"threads": 1})
+    assert [s.label for s in found] == ["splat layers", "splat medium", "ngp medium"]
+    assert found[0].options == {"layers": True, "threads": 1} and found[1].options == {"threads": 1}
 
 
 def test_seeds_are_averaged_with_their_standard_error():
@@ -177,45 +187,24 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
     first = capsys.readouterr().out
-    assert "(known)" not in first and "Best time to spend on an update: at 1 m/s" in first
+    assert "Best time to spend on an update: at 1 m/s" in first
     assert first.splitlines()[-1].startswith("for this scene: update_ms: ")
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())
-    assert set(data["ms_per_step"]) == {e.label for e in effort_sweep.efforts("ngp", {})}
-    assert all(ms > 0 for ms in data["ms_per_step"].values())
+    assert set(data["ms_per_step"]) == {"ngp"} and data["ms_per_step"]["ngp"] > 0
     with (tmp_path / "updates.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
-    assert {p.effort for p in read_frontier(tmp_path / "frontier.json", "ngp")} == {"low", "medium"}
+        assert len(list(csv.DictReader(file))) == 2  # two update times
+    assert {p.effort for p in read_frontier(tmp_path / "frontier.json", "ngp")} == {"medium"}
 
     # As after Ctrl-C: what is finished is not measured again, the rest is, and nothing else has changed.
-    points = data["points"]
-    gone = next(key for key, point in points.items() if point["settings"]["figure"] == 2)
-    lost = points.pop(gone)
-    (tmp_path / "frontier.json").write_text(json.dumps(data))
+    lines = (tmp_path / "results.jsonl").read_text().splitlines()
+    assert len(lines) == 2 + 1 + 2  # from scratch, what is charged, updates
+    (tmp_path / "results.jsonl").write_text("\n".join(lines[:-1]) + "\n")
     assert edge_server(words) == 0
-    again = json.loads((tmp_path / "frontier.json").read_text())["points"]
-    assert capsys.readouterr().out.count("(known)") == len(points)
-    assert again[gone] == lost, "virtual time gives the same point again"
-
-
-def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
-    still, (effort, *_) = (synthetic_still("tile", cameras=3, size=16), effort_sweep.efforts("tensorf", {}))
-    sweep = replace(command.QUICK, planned_s=(0.5,))
-    measured = []
-
-    def fit(*args):
-        measured.append(args)
-        return {"steps": 1, "psnr_db": 20.0}
-
-    monkeypatch.setattr(effort_sweep, "fit_from_scratch", fit)
-    for _ in range(2):
-        file = command.FrontierFile(tmp_path / "frontier.json")
-        command.Frontier(tmp_path, file, sweep, still, "tile", ("tensorf",), [effort], None, "none", 0)._from_scratch()
-    assert len(measured) == 1
-    monkeypatch.setitem(settings.EFFORTS, effort.name, {"rays": 77})
-    command.Frontier(tmp_path, file, sweep, still, "tile", ("tensorf",), [effort], None, "none", 0)._from_scratch()
-    assert len(measured) == 2
+    again = (tmp_path / "results.jsonl").read_text().splitlines()
+    assert again == lines, "virtual time gives the same point again"
+    assert json.loads((tmp_path / "frontier.json").read_text())["updates"] == data["updates"]
 
 
 def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():

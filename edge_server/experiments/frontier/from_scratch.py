@@ -1,0 +1,105 @@
+"""Measures fidelity against seconds of fitting from scratch, with the Pareto front."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from edge_server.experiments.common.tables import median_or_none, over_seeds
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still, score_views
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import PerceptualMetric, Scorer
+from edge_server.fields import Budget
+from edge_server.fields.registry import make_field
+from freshfield.machine_load import LoadMeter
+
+_MEDIANS = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db", "ssim", "lpips")
+
+
+@dataclass(frozen=True)
+class Still:
+    """A still scene, as ``open_still`` takes it: name or data set, image size, and the views that are held out."""
+
+    scene: str
+    size: int = 128
+    holdout: str = "8"
+    scale: float = 1.0
+    frame: int = 0
+
+    @property
+    def files(self) -> list[Path]:
+        """The data set, if it is one."""
+        path = Path(self.scene)
+        return [path] if path.exists() else []
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fit of a new field for ``seconds``."""
+
+    still: Still
+    field: str
+    seconds: float
+    seed: int
+    options: Mapping[str, Any]
+
+
+@cache
+def views_of(still: Still) -> MultiviewStill:
+    """The views of a still scene. Raises SceneError or DatasetError."""
+    return open_still(still.scene, still.size, still.holdout, still.scale, still.frame)
+
+
+@cache
+def lpips_of(weights: Path | None) -> PerceptualMetric | None:
+    """LPIPS with weights from a folder; None without any."""
+    return None if weights is None else open_lpips(weights)[0]
+
+
+def fit_from_scratch(fit: Fit, weights: Path | None = None) -> dict[str, Any]:
+    """Measure one point: its score on the held-out views and its cost. weights: folder of LPIPS weights."""
+    still = views_of(fit.still)
+    model = make_field(fit.field, fit.options, seed=fit.seed)
+    model.warm_up()
+    load = LoadMeter()
+    report = model.fit(still.training, Budget(seconds=fit.seconds))
+    outside = load.outside_cores()
+    score, _ = score_views(model, still.held_out, Scorer(lpips_of(weights), background=still.background))
+    return {
+        "seconds": report.seconds,
+        "steps": report.steps,
+        "ms_per_step": 1e3 * report.seconds / max(report.steps, 1),
+        "rays_per_s": report.rays / max(report.seconds, 1e-9),
+        "samples_per_s": report.samples / max(report.seconds, 1e-9),
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
+        "lpips": score.lpips,
+        "outside_cores": outside,
+    }
+
+
+def curves(fits: Sequence[Fit], points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Medians over seeds of the points with the same field and planned seconds (``planned_s``), with ``on_front``:
+    whether no other row with as little planned time has as high a PSNR."""
+    rows = [{**point, "field": fit.field, "planned_s": fit.seconds} for fit, point in zip(fits, points)]
+    found = over_seeds(rows, ("field", "planned_s"), (*_MEDIANS, "outside_cores"), median_or_none)
+    mark_front(found)
+    return found
+
+
+def mark_front(rows: Sequence[dict[str, Any]]) -> None:
+    """Set ``on_front`` of each row."""
+    best = float("-inf")
+    for row in sorted(rows, key=lambda r: (r["planned_s"], -r["psnr_db"])):
+        row["on_front"] = row["psnr_db"] > best
+        best = max(best, row["psnr_db"])
+
+
+def costs(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Milliseconds of a step by field: medians over all its points."""
+    names = dict.fromkeys(row["field"] for row in rows)
+    return {name: statistics.median(r["ms_per_step"] for r in rows if r["field"] == name) for name in names}
