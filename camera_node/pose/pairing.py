@@ -1,16 +1,15 @@
 """Pairs live frames with the pose samples of an arm (thesis 4.3.3), which arrive at another rate.
 
 The thesis takes the sample nearest to the frame. The two samples around it can also be interpolated: linearly
-with slerp, or linearly in joint space; ``camera-node calibrate accuracy`` measures the gain. The frame
-carries the time to the nearest sample, and a frame without a sample within a bound gets no pose.
+with slerp, or linearly in joint space. The frame carries the time to the nearest sample, and a frame without a
+sample within a bound gets no pose.
 """
 
 from __future__ import annotations
 
 import bisect
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -28,22 +27,6 @@ def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
     return (1.0 - fraction) * a + fraction * b
 
 
-@dataclass
-class PairingCounts:
-    """Counts of the samples of a buffer or recording.
-
-    samples: all that came.
-    duplicates: those with a stamp that was known already (the first is kept).
-    reordered: those older than the newest, inserted in order.
-    restarts: how often the sender's clock was found to be set back.
-    """
-
-    samples: int = 0
-    duplicates: int = 0
-    reordered: int = 0
-    restarts: int = 0
-
-
 class SampleBuffer(Generic[T]):
     """The last ``keep_ns`` of a stream of samples, sorted by stamp. Thread-safe.
 
@@ -52,6 +35,7 @@ class SampleBuffer(Generic[T]):
     keep_ns: samples older than the newest by more than this are dropped.
     restart_after: number of consecutive samples, ascending but too old, after which they replace the buffer:
         the sender's clock was set back, or a wrong stamp had emptied the buffer.
+    received: number of samples that came.
     Raises ValueError for a value out of range.
     """
 
@@ -64,7 +48,7 @@ class SampleBuffer(Generic[T]):
     ) -> None:
         if max_gap_ns < 0 or keep_ns <= 0 or restart_after < 1:
             raise ValueError("max_gap_ns cannot be negative, keep_ns and restart_after must be positive")
-        self.counts = PairingCounts()
+        self.received = 0
         self._interpolate = interpolate
         self._max_gap_ns, self._keep_ns, self._restart_after = max_gap_ns, keep_ns, restart_after
         self._times: list[int] = []
@@ -75,14 +59,12 @@ class SampleBuffer(Generic[T]):
     def add(self, t_ns: int, sample: T) -> bool:
         """Add a sample taken at ``t_ns``. False if it was a duplicate or too old."""
         with self._lock:
-            self.counts.samples += 1
+            self.received += 1
             if self._times and t_ns < self._times[-1] - self._keep_ns:
                 return self._add_stale(t_ns, sample)
             at = bisect.bisect_left(self._times, t_ns)
             if at < len(self._times) and self._times[at] == t_ns:
-                self.counts.duplicates += 1
                 return False
-            self.counts.reordered += at < len(self._times)
             self._old.clear()
             self._times.insert(at, t_ns)
             self._samples.insert(at, sample)
@@ -105,7 +87,6 @@ class SampleBuffer(Generic[T]):
         self._old.append((t_ns, sample))
         if len(self._old) < self._restart_after:
             return False
-        self.counts.restarts += 1
         self._times, self._samples = [t for t, _ in self._old], [s for _, s in self._old]
         self._old.clear()
         self._prune()
@@ -116,20 +97,3 @@ class SampleBuffer(Generic[T]):
         if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
             first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
             del self._times[:first], self._samples[:first]
-
-
-def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], PairingCounts]:
-    """Sort a recording by stamp and keep the first sample of each stamp. Returns times, samples and
-    counts."""
-    counts = PairingCounts(samples=len(times_ns))
-    newest = None
-    kept: dict[int, T] = {}
-    for t_ns, sample in zip(times_ns, samples):
-        if t_ns in kept:
-            counts.duplicates += 1
-            continue
-        counts.reordered += newest is not None and t_ns < newest
-        newest = t_ns if newest is None else max(newest, t_ns)
-        kept[t_ns] = sample
-    order = sorted(kept)
-    return order, [kept[t] for t in order], counts

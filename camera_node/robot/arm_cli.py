@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from camera_node.config import ROBOTS
-
 
 def add_commands(commands: Any) -> None:
     """Add their parsers to the sub-commands ``commands``."""
@@ -33,8 +31,6 @@ def add_commands(commands: Any) -> None:
         help="address to serve at; the ports are fixed, so a second arm needs a second address, such as "
         "127.0.0.3 [127.0.0.2]",
     )
-    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm [%(default)s]")
-    add("--calibration", type=Path, metavar="FILE", help="calibration.conf of a real robot [nominal kinematics]")
     add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees [a home pose]")
     add(
         "--drift-ppm",

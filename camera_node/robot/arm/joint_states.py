@@ -182,7 +182,7 @@ class ArmStream:
     @property
     def received(self) -> int:
         """Number of samples received since ``start``."""
-        return self._samples.counts.samples
+        return self._samples.received
 
     def _run(self) -> None:
         failures = 0

@@ -34,8 +34,7 @@ input, one of:
   --pairs FILE   JSON list of [flange in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
   --live SCENARIO --camera ID   guided session: move the arm, hold still; it says which poses are missing and
-                 when there are enough. Flange poses come from the camera's source (without hand_eye), or from
-                 --hand CSV, by seconds since the first frame
+                 when there are enough. Flange poses come from the camera's source (without hand_eye)
 """
 
 INTRINSICS = """Estimates a camera's intrinsics and their uncertainty from 10 to 20 pictures of a target, tilted and in
@@ -152,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _hand_eye(args: argparse.Namespace) -> int:
     given = {name for name in ("folder", "pairs", "hand", "target", "live") if getattr(args, name) is not None}
-    if given not in ({"folder"}, {"pairs"}, {"hand", "target"}, {"live"}, {"live", "hand"}):
+    if given not in ({"folder"}, {"pairs"}, {"hand", "target"}, {"live"}):
         raise CalibrationError("expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO")
     _check_options(args, given)
     args.max_gap_ms = MAX_GAP_S * 1e3 if args.max_gap_ms is None else args.max_gap_ms
@@ -196,7 +195,7 @@ def _calibrate(args: argparse.Namespace) -> Calibration:
         return calibrate(inputs.read_pairs(args.pairs, setup), args.method)
     if not 0 < args.max_gap_ms <= MAX_GAP_MS:
         raise CalibrationError(f"--max-gap-ms: expected a positive number up to {MAX_GAP_MS:.0f}")
-    if args.live is None and args.hand is not None:
+    if args.hand is not None:
         flange, target = inputs.read_track(args.hand), inputs.read_track(args.target)
         return calibrate_tracks(flange, target, setup, args.method, args.max_gap_ms / 1e3)
     if args.board is None:

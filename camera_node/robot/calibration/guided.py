@@ -100,7 +100,7 @@ def read_shots(source: Source, codec: str, pace: Callable[[int], bool]) -> Itera
         try:
             shot = source.read(source.content(first + tick))
         except ValueError as error:
-            report_skipped(error)
+            print(f"\n{error}", file=sys.stderr)
             continue
         image = shot.image
         if isinstance(image, bytes):
@@ -150,10 +150,6 @@ class Pace:
             return False
         time.sleep(max(0.0, self._start + at_s - time.monotonic()))
         return True
-
-
-def report_skipped(error: Exception) -> None:
-    print(f"\n{error}", file=sys.stderr)
 
 
 def draw_step(image: Image, corners: Corners | None, step: Step) -> Image:

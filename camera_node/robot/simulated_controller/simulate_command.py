@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.config import errors_of
 from camera_node.robot.arm.camera_poses import arm_model, require_arm
-from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
+from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
 from camera_node.robot.simulated_controller.server import ControllerServer
 from freshfield.clock import WallClock
@@ -21,7 +21,11 @@ from freshfield.scenario import ScenarioError, load
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C or SIGTERM. Returns 1 if a port is taken. Raises ScenarioError."""
-    host, arm = _host_and_model(args)
+    host, arm = args.host or "127.0.0.2", UR3E
+    if args.scenario is not None:
+        scenario = load(args.scenario)
+        config = require_arm(scenario)
+        host, arm = args.host or config.host, arm_model(scenario, config)
     joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
     with errors_of("--noise-rad"):
@@ -55,14 +59,3 @@ def read_joints(text: str) -> np.ndarray:
     if len(angles) != 6 or not all(abs(a) <= 2 * math.pi for a in angles):
         raise ScenarioError(f"--joints: expected six angles within 360 degrees, with commas, got {text!r}")
     return np.array(angles)
-
-
-def _host_and_model(args: argparse.Namespace) -> tuple[str, ArmModel]:
-    if args.scenario is not None:
-        scenario = load(args.scenario)
-        config = require_arm(scenario)
-        return args.host or config.host, arm_model(scenario, config)
-    model = MODELS[args.robot]
-    with errors_of("--calibration"):
-        model = model if args.calibration is None else apply_calibration(model, args.calibration)
-    return args.host or "127.0.0.2", model

@@ -2,59 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
-from camera_node.bounds import Bounded, bounded
+from freshfield.settings import Settings, about, within
 
 Vector3 = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class TeleopConfig(Bounded):
+class TeleopConfig(Settings, frozen=True):
     """How a stylus moves the arm. Positions are those of the flange, in the axes of the arm's base.
 
-    scale: S of (4.1): meters of the arm per meter of the stylus, along each axis of the base.
-    yaw_deg: rotation of the stylus's axes about the vertical.
-    orientation: whether the arm turns with the stylus.
-    rate_hz: joint targets per second, 20 to 500.
-    gain_per_s: the commanded speed per distance from the target.
-    filter_hz, filter_hz_s_m: cutoff of the one-euro filter at rest, and its increase per m/s (or rad/s).
-    watchdog_ms: the arm stops if no message comes for so long.
-    jump_m, jump_rad: a larger motion between two messages counts as a stylus put elsewhere.
-
-    The following limits hold at every tick, whatever the stylus does.
-
-    workspace_low_m, workspace_high_m: corners of the box that the flange stays in.
-    joint_margin_rad: distance from the joints' limits.
-    speed_rad_s, acceleration_rad_s2: of every joint; speed_m_s: of the flange.
-    margin_m: distance between parts of the arm that are not neighbors.
-    floor_m: lowest height of the arm's parts beyond the shoulder.
-    tool_m, tool_radius_m: the camera and its mount, as a capsule along the flange's axis.
+    The limits, from ``workspace_low_m`` on, hold at every tick, whatever the stylus does.
     """
 
-    scale: Vector3 = (1.0, 1.0, 1.0)
-    yaw_deg: float = 0.0
-    orientation: bool = True
-    rate_hz: float = bounded(125.0, 20.0, 500.0)
-    gain_per_s: float = bounded(5.0, 0.1, 20.0)
-    filter_hz: float = bounded(2.0, 0.01, 1000.0)
-    filter_hz_s_m: float = bounded(20.0, 0.0, 1e4)
-    watchdog_ms: float = bounded(200.0, 10.0, 5000.0)
-    jump_m: float = bounded(0.05, 1e-3, 1.0)
-    jump_rad: float = bounded(0.5, 1e-2, 3.14)
-    workspace_low_m: Vector3 = (-0.45, -0.45, 0.05)
-    workspace_high_m: Vector3 = (0.45, 0.45, 0.60)
-    joint_margin_rad: float = bounded(0.05, 0.0, 3.0)
-    speed_rad_s: float = bounded(0.8, 1e-3, 6.28)
-    acceleration_rad_s2: float = bounded(2.0, 0.05, 40.0)
-    speed_m_s: float = bounded(0.25, 1e-3, 1.5)
-    margin_m: float = bounded(0.02, 0.0, 0.2)
-    floor_m: float = bounded(0.0, -2.0, 1.0)
-    tool_m: float = bounded(0.08, 0.0, 0.5)
-    tool_radius_m: float = bounded(0.04, 1e-3, 0.2)
+    scale: Annotated[Vector3, about("S of (4.1): meters of the arm per meter of the stylus, along each axis")] = (
+        1.0,
+        1.0,
+        1.0,
+    )
+    yaw_deg: Annotated[float, about("rotation of the stylus's axes about the vertical")] = 0.0
+    orientation: Annotated[bool, about("whether the arm turns with the stylus")] = True
+    rate_hz: Annotated[float, within(20.0, 500.0, "joint targets per second")] = 125.0
+    gain_per_s: Annotated[float, within(0.1, 20.0, "commanded speed per distance from the target")] = 5.0
+    filter_hz: Annotated[float, within(0.01, 1000.0, "cutoff of the one-euro filter at rest")] = 2.0
+    filter_hz_s_m: Annotated[float, within(0.0, 1e4, "increase of the cutoff per m/s or rad/s")] = 20.0
+    watchdog_ms: Annotated[float, within(10.0, 5000.0, "the arm stops if no message comes for so long")] = 200.0
+    jump_m: Annotated[float, within(1e-3, 1.0, "a larger motion between two messages is a stylus put elsewhere")] = 0.05
+    jump_rad: Annotated[float, within(1e-2, 3.14, "the same for rotations")] = 0.5
+    workspace_low_m: Annotated[Vector3, about("corner of the box that the flange stays in")] = (-0.45, -0.45, 0.05)
+    workspace_high_m: Annotated[Vector3, about("its opposite corner")] = (0.45, 0.45, 0.60)
+    joint_margin_rad: Annotated[float, within(0.0, 3.0, "distance from the joints' limits")] = 0.05
+    speed_rad_s: Annotated[float, within(1e-3, 6.28, "of every joint")] = 0.8
+    acceleration_rad_s2: Annotated[float, within(0.05, 40.0, "of every joint")] = 2.0
+    speed_m_s: Annotated[float, within(1e-3, 1.5, "of the flange")] = 0.25
+    margin_m: Annotated[float, within(0.0, 0.2, "distance between parts of the arm that are not neighbors")] = 0.02
+    floor_m: Annotated[float, within(-2.0, 1.0, "lowest height of the arm's parts beyond the shoulder")] = 0.0
+    tool_m: Annotated[float, within(0.0, 0.5, "length of the camera and its mount, along the flange's axis")] = 0.08
+    tool_radius_m: Annotated[float, within(1e-3, 0.2, "radius of the camera and its mount")] = 0.04
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not all(0.0 < abs(s) <= 100.0 for s in self.scale):
             raise ValueError("scale: expected three numbers within 100 that are not 0")
         if not all(low < high for low, high in zip(self.workspace_low_m, self.workspace_high_m)):

@@ -25,7 +25,8 @@ from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
 from freshfield.clock import WallClock
-from freshfield.scenario import Scenario, load, read_section
+from freshfield.scenario import Scenario, load
+from freshfield.settings import read_settings
 
 log = logging.getLogger("camera-node.teleop")
 
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
     """The section ``source.arm.teleop``. Raises ScenarioError."""
-    return read_section(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
+    return read_settings(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
 
 
 def open_stylus(text: str) -> Stylus:

@@ -1,33 +1,29 @@
-"""Pairing while samples still arrive: what is between two, what is refused, what is counted."""
+"""Pairing while samples still arrive: in order or not, from clocks that are set, interpolated or nearest."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from camera_node.pose.pairing import SampleBuffer, interpolate_joints, sort_samples
-from camera_node.pose.providers import PoseGapError
-from freshfield.geometry import Pose, so3_exp
+from camera_node.pose.pairing import SampleBuffer, interpolate_joints
+from camera_node.pose.providers import PoseGapError, Trajectory
+from freshfield.geometry import Pose, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, se3, so3_exp
 
 MS = 1_000_000
 
 
-def pose(turn, shift=(0.0, 0.0, 0.0)) -> Pose:
-    m = np.eye(4)
-    m[:3, :3], m[:3, 3] = so3_exp(turn), shift
-    return Pose.from_matrix(m)
-
-
-def test_the_ends_of_an_interpolation_are_its_samples_and_tiny_turns_are_no_danger():
-    for size in (0.0, 1e-300, 1e-9, 1e-4, 3.0):
-        a, b = pose((0.3, 0, 0), (1, 2, 3)), pose((0.3 + size, 0, 0), (1.1, 2, 3))
-        np.testing.assert_allclose(a.interpolate(b, 0.0).matrix(), a.matrix(), atol=1e-12)
-        np.testing.assert_allclose(a.interpolate(b, 1.0).matrix(), b.matrix(), atol=1e-12)
+def at(t_ms: float) -> Pose:
+    turn = so3_exp([0.3 * np.sin(t_ms / 90), 0.5 * np.cos(t_ms / 70), t_ms / 200])
+    return Pose.from_matrix(se3(turn, [np.sin(t_ms / 100), t_ms / 500, 0.2]))
 
 
 def test_nearest_or_between_with_the_gap_and_a_bound_that_counts():
     joints = SampleBuffer(interpolate_joints, max_gap_ns=10 * MS)
     nearest = SampleBuffer(None, max_gap_ns=10 * MS)
+    with pytest.raises(PoseGapError, match="no pose yet"):
+        joints.at(0)
     for t_ms in (0, 8, 16, 60, 68):
         for buffer in (joints, nearest):
             buffer.add(t_ms * MS, np.full(6, float(t_ms)))
@@ -38,20 +34,101 @@ def test_nearest_or_between_with_the_gap_and_a_bound_that_counts():
         joints.at(38 * MS)
     assert joints.at(78 * MS)[0][0] == 68  # after the last: the last, not beyond it
     assert not joints.ready(69 * MS) and joints.ready(68 * MS)
-
-
-def test_an_empty_buffer_says_so():
-    with pytest.raises(PoseGapError, match="no pose yet"):
-        SampleBuffer(Pose.interpolate).at(0)
-
-
-def test_bounds_that_make_no_sense_are_refused():
     for wrong in ({"max_gap_ns": -1}, {"keep_ns": 0}, {"restart_after": 0}):
         with pytest.raises(ValueError, match="must be positive"):
             SampleBuffer(None, **wrong)
 
 
-def test_tidy_sorts_and_keeps_the_first_of_a_stamp():
-    times, values, counts = sort_samples([5, 1, 3, 3, 9], [np.array([float(k)]) for k in range(5)])
-    assert times == [1, 3, 5, 9] and [v[0] for v in values] == [1, 2, 0, 4]
-    assert (counts.duplicates, counts.reordered) == (1, 2)
+def test_exactly_so_many_old_samples_restart_the_buffer():
+    buffer = SampleBuffer[int](None, max_gap_ns=MS, keep_ns=100 * MS, restart_after=4)
+    buffer.add(10**12, 0)
+    assert [buffer.add(k * MS, k) for k in range(3)] == [False] * 3
+    assert buffer.at(10**12)[0] == 0, "one fewer does not"
+    assert buffer.add(3 * MS, 3) and buffer.at(0)[0] == 0 and buffer.at(3 * MS)[0] == 3
+    with pytest.raises(PoseGapError):
+        buffer.at(10**12)
+
+
+@pytest.mark.stability
+@given(st.randoms(use_true_random=False), st.lists(st.integers(0, 400), min_size=1, max_size=40))
+def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
+    """Duplicated and shuffled, a stream pairs as its sorted self does."""
+    sent = stamps_ms + random.sample(stamps_ms, len(stamps_ms) // 2)
+    random.shuffle(sent)
+    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=30 * MS)
+    added = [buffer.add(t_ms * MS, at(t_ms)) for t_ms in sent]
+    distinct = sorted(set(stamps_ms))
+    assert sum(added) == len(distinct) and buffer.received == len(sent)
+    track = Trajectory([t * MS for t in distinct], [at(t) for t in distinct], max_gap_ns=30 * MS)
+    for t_ms in range(0, 400, 13):
+        try:
+            expected = track.at(t_ms * MS)
+        except PoseGapError:
+            with pytest.raises(PoseGapError):
+                buffer.at(t_ms * MS)
+        else:
+            assert buffer.at(t_ms * MS) == expected
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("jump_ms", [-3_600_000, 3_600_000, -(10**12), 10**12])
+def test_a_clock_that_is_set_is_followed(jump_ms):
+    """A controller that restarts counts from its start again; one that is synchronised leaps."""
+    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS)
+    for t_ms in range(0, 1000, 8):
+        buffer.add(t_ms * MS, at(t_ms))
+    for k, t_ms in enumerate(range(1000, 2000, 8)):
+        buffer.add((t_ms + jump_ms) * MS, at(t_ms))
+        assert k < 8 or buffer.at((t_ms + jump_ms) * MS)[0] == at(t_ms)
+
+
+@pytest.mark.stability
+def test_one_wild_stamp_costs_a_few_samples_and_no_more():
+    buffer, lost = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS), 0
+    for t_ms in range(0, 4000, 8):
+        buffer.add((10**15 if t_ms == 2000 else t_ms) * MS, at(t_ms))
+        try:
+            buffer.at(t_ms * MS)
+        except PoseGapError:
+            lost += 1
+    assert lost == 8
+
+
+@pytest.mark.stability
+def test_late_samples_in_disorder_restart_nothing_and_memory_is_bounded():
+    buffer = SampleBuffer[float](None, keep_ns=100 * MS, restart_after=4)
+    for t_ms in range(0, 10_000, 2):
+        buffer.add(t_ms * MS, float(t_ms))
+    assert len(buffer._times) <= 60
+    for t_ms in (50, 40, 30, 20, 10, 0, 0, 0):
+        assert not buffer.add(t_ms * MS, float(t_ms))
+    assert buffer.at(9998 * MS)[0] == 9998
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-7, 1.0, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi - 1e-9])
+def test_between_two_poses_however_far_apart(angle):
+    """Up to and past half a turn, where the shorter way changes sides: always a rigid motion between them."""
+    turned = se3(so3_exp(np.array([0.6, 0.0, 0.8]) * angle), [0.1, 0.2, -0.1])
+    a, b = at(10), Pose.from_matrix(at(10).matrix() @ turned)
+    for fraction in (0.0, 1e-15, 0.3, 0.5, 1.0):
+        middle = a.interpolate(b, fraction).matrix()
+        np.testing.assert_allclose(middle[:3, :3] @ middle[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(a.interpolate(b, 0.0).matrix(), a.matrix(), atol=1e-12)
+    np.testing.assert_allclose(a.interpolate(b, 1.0).matrix(), b.matrix(), atol=1e-7)
+
+
+@pytest.mark.stability
+def test_unit_quaternions_after_a_hundred_thousand_compositions():
+    steps = 100_000
+    # All turns are about one axis: after a whole number of rounds the product is the identity.
+    step = matrix_to_quaternion(so3_exp(np.array([2, -3, 6]) / 7 * 2 * np.pi * 17 / steps))
+    q, furthest = np.array([1.0, 0.0, 0.0, 0.0]), 0.0
+    for k in range(1, steps + 1):
+        q = quaternion_multiply(q, step)
+        if k % 10 == 0:
+            furthest = max(furthest, abs(float(np.linalg.norm(q)) - 1.0))
+            q = quaternion_normalize(q)
+    assert furthest < 1e-14
+    # Rounding of the step's angle adds up in proportion to the number of steps, and in nothing else.
+    np.testing.assert_allclose(np.abs(q), [1.0, 0.0, 0.0, 0.0], atol=1e-10)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig, SourceConfig, source_config
-from camera_node.pose.providers import PoseProvider, Trajectory, read_samples
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.calibration import WANT_MM, CalibrationError, guided
@@ -60,14 +59,8 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         raise CalibrationError("--want-mm: expected a positive number")
     loaded = guided.load_scenario(args)
     config = source_config(loaded)
-    arm: ArmConfig | None = None if args.hand is not None else getattr(config, "arm", None)
+    arm: ArmConfig | None = getattr(config, "arm", None)
     to_base = np.eye(4) if arm is None else _base_from_world(loaded, arm, args.camera)
-    flanges = None
-    if args.hand is not None:
-        times_ns, poses = read_samples(args.hand)
-        first = np.unique(times_ns, return_index=True)[1]
-        columns = [times_ns[k] for k in first], [poses[k] for k in first]
-        flanges = Trajectory(*columns, max_gap_ns=round(args.max_gap_ms * 1e6))
     before = read_pairs(args.samples, setup) if args.samples is not None and args.samples.exists() else None
 
     def keep(samples: Samples) -> None:
@@ -82,7 +75,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         if streams is not None and arm is not None:
             stack.callback(streams.follow_arm(loaded, arm).stop)
         pace = guided.Pace(float(source.fps), args.seconds)
-        guided.guide(session_steps(session, source, config, pace, lens, flanges, to_base, streams), args.preview)
+        guided.guide(session_steps(session, source, config, pace, lens, to_base, streams), args.preview)
     if streams is None:
         return calibrate(session.samples, args.method)
     return calibrate_tracks(streams.flange(), streams.target(), setup, args.method, args.max_gap_ms / 1e3)
@@ -94,27 +87,19 @@ def session_steps(
     config: SourceConfig,
     pace: Callable[[int], bool],
     lens: Pinhole | None = None,
-    flanges: PoseProvider | None = None,
     to_base: Array | None = None,
     streams: StreamRecorder | None = None,
 ) -> Iterator[tuple[Image, Corners | None, Step]]:
-    """Offer a source's shots to a session. Yields each image, the corners found, and the step.
+    """Offer a source's shots, whose poses are the flange's, to a session. Yields each image, the corners found in it,
+    and the step.
 
     pace: see ``guided.read_shots``.
     lens: replaces the source's own.
-    flanges: flange poses by time since the first shot; None: the shots' poses are the flange's.
     to_base: base-from-world (4, 4), if the shots' poses are in the world.
     streams: records the target poses and decides when there is enough.
     """
-    begin_ns: int | None = None
     for t_ns, shot, image in guided.read_shots(source, config.codec, pace):
-        begin_ns = t_ns if begin_ns is None else begin_ns
-        try:
-            pose = shot.pose if flanges is None else flanges.at(t_ns - begin_ns)[0]
-        except ValueError as error:
-            guided.report_skipped(error)
-            continue
-        flange = pose.matrix() if to_base is None else to_base @ pose.matrix()
+        flange = shot.pose.matrix() if to_base is None else to_base @ shot.pose.matrix()
         step = session.offer(image, lens or shot.intrinsics, flange)
         if streams is not None:
             if session.target_pose is not None:

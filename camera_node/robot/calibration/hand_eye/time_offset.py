@@ -101,8 +101,7 @@ def coarse_offset(flange: Track, target: Track) -> tuple[float, float]:
                 f"the {name} hardly turns ({np.degrees(seen.max()):.2f} degrees a second at most): the time "
                 "offset cannot be found from its motion"
             )
-    score, count = _masked_correlation(a, b)
-    score[count * _STEP_S < max(_MIN_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))] = -1.0
+    score = _correlation(a, b)
     best = int(np.argmax(score))
     if score[best] < _MIN_CORRELATION:
         raise CalibrationError(
@@ -179,21 +178,14 @@ def _angular_speed(track: Track) -> Array:
     return np.where(known, turns / _WINDOW_S, np.nan)
 
 
-def _masked_correlation(a: Array, b: Array) -> tuple[Array, Array]:
-    """Pearson's correlation of a[k + lag] with b[k] over the samples that are known in both, and their
-    number, for lags -(len(b) - 1) to len(a) - 1."""
-    known_a, known_b = (~np.isnan(v) for v in (a, b))
-    a, b = (np.where(known, v - v[known].mean(), 0.0) for known, v in ((known_a, a), (known_b, b)))
-    ones_a, ones_b = known_a.astype(np.float64), known_b.astype(np.float64)
-
-    def cross(u: Array, v: Array) -> Array:
-        return np.asarray(correlate(u, v, mode="full", method="fft"))
-
-    count = np.maximum(np.round(cross(ones_a, ones_b)), 0.0)
-    n = np.maximum(count, 1.0)
-    sum_a, sum_b = cross(a, ones_b), cross(ones_a, b)
-    top = cross(a, b) - sum_a * sum_b / n
-    below = (cross(a * a, ones_b) - sum_a**2 / n) * (cross(ones_a, b * b) - sum_b**2 / n)
-    # If nothing varies, rounding of the transforms leaves values just above zero.
-    level = 1e-9 * max(float((a * a).sum() * (b * b).sum()), 1e-300)
-    return np.where(below > level, top / np.sqrt(np.maximum(below, level)), -1.0), count
+def _correlation(a: Array, b: Array) -> Array:
+    """Correlation of a[k + lag] with b[k] for lags -(len(b) - 1) to len(a) - 1; 1 if one is the other, delayed. An
+    unknown sample (NaN) counts as the mean, and so does what one stream has beyond the other's ends."""
+    centered = [np.nan_to_num(v - np.nanmean(v)) for v in (a, b)]
+    cross = correlate(*centered, mode="full", method="fft")
+    inside = [correlate(v**2, np.ones(len(other)), mode="full", method="fft") for v, other in zip(centered, (b, a))]
+    # Of b the squares within a's ends are those of its mirror image.
+    power = np.sqrt(np.maximum(inside[0], 0.0) * np.maximum(inside[1][::-1], 0.0))
+    whole = np.sqrt((centered[0] ** 2).sum() * (centered[1] ** 2).sum())
+    # Where less than half of the motion overlaps, chance decides.
+    return np.where(power > 0.5 * whole, cross / np.maximum(power, 1e-12), -1.0)

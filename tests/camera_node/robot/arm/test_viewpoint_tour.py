@@ -1,6 +1,4 @@
-import dataclasses
-from functools import cache
-
+import msgspec
 import numpy as np
 import pytest
 
@@ -8,7 +6,15 @@ from camera_node.config import PathConfig, source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, PathError, is_free, plan_tour, reachable, viewpoints
+from camera_node.robot.arm.viewpoint_tour import (
+    FARTHEST_RAD,
+    PathError,
+    _extend_tour,
+    is_free,
+    plan_tour,
+    reachable,
+    viewpoints,
+)
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
@@ -17,11 +23,6 @@ CELL = load("cell")
 ARM = source_config(CELL).arm
 BASE = base_matrix(ARM)
 MOUNT = load_hand_eyes(CELL, ARM, ["hand"])["hand"].transform
-
-
-@cache
-def cells_tour():
-    return plan_tour(UR3E, BASE, MOUNT, ARM.path)
 
 
 def test_viewpoints_look_at_their_target_from_their_radius():
@@ -39,7 +40,7 @@ def test_viewpoints_look_at_their_target_from_their_radius():
 
 @pytest.mark.slow  # 7 s
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
-    found = cells_tour()
+    found = plan_tour(UR3E, BASE, MOUNT, ARM.path)
     assert ARM.path.radius_m == 0.34 and found.reached == 43
     reached = found.reached_by_ring(ARM.path)
     assert sum(reached) == found.reached and min(reached) >= 10
@@ -60,13 +61,6 @@ def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
     assert seen == set(found.places) and len(found.stops) < 1.5 * found.reached
     azimuths = np.rad2deg(np.arctan2([e[0] for e in eyes], [-e[1] for e in eyes]))
     assert np.ptp(np.unwrap(np.sort(azimuths), period=360)) > 200
-
-
-@pytest.mark.slow  # plans the whole tour twice
-def test_the_tour_begins_where_it_can_be_begun():
-    free = cells_tour().stops[0]
-    again = plan_tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]
-    assert np.allclose(again, free, atol=1e-9)
 
 
 def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
@@ -97,9 +91,30 @@ def test_an_arm_is_not_driven_through_itself():
     assert not is_free(UR3E, BASE, home, other, -1.0)
 
 
+def test_from_where_no_path_leads_on_the_tour_goes_back():
+    """Two viewpoints that only the first one leads to: back between them, and no way back at the end."""
+    home = np.array(HOME_RAD)
+    joints = home + np.array([[0.0] * 6, [1.2, 0, 0, 0, 0, 0], [-1.3, 0, 0, 0, 0, 0]])
+    tour, used = _extend_tour(UR3E, BASE, -1.0, joints, np.array([0, 1, 2]), 0)
+    np.testing.assert_allclose(tour.stops, [joints[0], joints[1], joints[0], joints[2]])
+    assert tour.places == [0, 1, 2] and used.all()
+
+
 def test_a_tour_out_of_reach_says_what_to_change():
+    far = msgspec.structs.replace(ARM.path, radius_m=2.0)
     with pytest.raises(PathError, match=r"reaches 0 of .* viewpoints: change radius_m"):
-        plan_tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, radius_m=2.0))
+        plan_tour(UR3E, BASE, MOUNT, far)
+    assert not reachable(UR3E, BASE, MOUNT, far, viewpoints(far)).any()
+
+
+def test_reachable_viewpoints_are_those_above_the_floor_with_a_free_posture():
+    path = msgspec.structs.replace(ARM.path, step_deg=80.0)
+    poses = viewpoints(path)
+    assert reachable(UR3E, BASE, MOUNT, path, poses).sum() >= 10
+    low = [pose.copy() for pose in poses[:3]]
+    for pose, z_m in zip(low, (2.0, -0.2, 0.02)):
+        pose[2, 3] = z_m
+    assert not reachable(UR3E, BASE, MOUNT, path, low).any()
 
 
 def cell(**changed):
@@ -122,12 +137,12 @@ def test_where_the_base_stands():
 @pytest.mark.parametrize(
     "changed, says",
     [
-        ({"robot": "ur99"}, "arm: robot is 'ur99', expected one of ur3e"),
-        ({"frequency_hz": 1000}, "frequency_hz is 1000, expected 10 to 500"),
+        ({"robot": "ur99"}, "arm.robot: .*ur99"),
+        ({"frequency_hz": 1000}, "frequency_hz: .*500"),
         ({"host": "192.168.56.101", "simulated": True}, "simulated: host is 192.168.56.101"),
-        ({"pairing": "guessed"}, "pairing is 'guessed'"),
-        ({"path": {"radius_m": -1}}, "arm.path: radius_m is -1, expected 0.001"),
-        ({"hosts": "x"}, "arm.hosts: unknown key"),
+        ({"pairing": "guessed"}, "pairing: .*guessed"),
+        ({"path": {"radius_m": -1}}, "arm.path.radius_m: "),
+        ({"path": {"rolls_deg": [400.0]}}, "rolls_deg"),
     ],
 )
 def test_a_wrong_arm_is_refused_by_key(changed, says):
@@ -140,7 +155,6 @@ def test_a_wrong_arm_is_refused_by_key(changed, says):
     [
         ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
         ({"cameras": {"hand": "no-such.yaml"}}, r"arm.cameras.hand: .*no-such.yaml: cannot be read"),
-        ({"cameras": {}}, "cameras: expected at least one camera"),
         ({"calibration": "no-such.conf"}, r"source.arm.calibration: .*no-such.conf: cannot be read"),
     ],
 )
@@ -149,33 +163,3 @@ def test_a_wrong_file_is_refused_by_name(changed, says):
     with pytest.raises(ScenarioError, match=says):
         load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
         arm_model(scenario, source_config(scenario).arm)
-
-
-@pytest.mark.slow  # 5 to 7 s
-def test_a_camera_that_may_roll_comes_to_more_viewpoints():
-    """A camera beside the flange's axis has its arm on one side at one roll, on the other at another."""
-    reached = [
-        plan_tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, rolls_deg=rolls), HOME_RAD).reached
-        for rolls in ((0.0,), ARM.path.rolls_deg)
-    ]
-    assert reached[1] > reached[0] + 5
-
-
-@pytest.mark.parametrize("rolls", [(), (400.0,), (float("nan"),)])
-def test_rolls_that_are_none_are_refused(rolls):
-    with pytest.raises(ValueError, match="rolls_deg"):
-        PathConfig(rolls_deg=rolls)
-
-
-@pytest.mark.slow  # 5 to 7 s
-def test_reachable_viewpoints_are_those_with_a_free_posture():
-    """Every stop of a tour is reachable; what lies beyond the arm, or in the floor, is not."""
-    poses = viewpoints(ARM.path)
-    found = reachable(UR3E, BASE, MOUNT, ARM.path, poses)
-    assert found[cells_tour().places].all()
-    far = [pose.copy() for pose in poses[:3]]
-    for pose, z_m in zip(far, (2.0, -0.2, 0.02)):
-        pose[2, 3] = z_m
-    assert not reachable(UR3E, BASE, MOUNT, ARM.path, far).any()
-    high = dataclasses.replace(ARM.path, floor_m=5.0)
-    assert not reachable(UR3E, BASE, MOUNT, high, poses).any()
