@@ -215,3 +215,19 @@ def test_a_camera_that_comes_back_goes_first():
         buffer.put(frame(camera, sequence=90, generated_ns=at_ns - 50 * k * MS), at_ns)
     taken = buffer.take(list(buffer.newest().values()), most=1)[0]
     assert "cam02" in {item.frame.camera for item in taken if item.frame.sequence == 90}
+
+
+def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():
+    """It waits for sixteen takes, and no longer."""
+    buffer = FrameBuffer(["cam00", "cam01"])
+    buffer.keep_every_frame(True)
+    buffer.put(frame("cam00", generated_ns=0), 0)
+    assert _sequences(buffer.take(list(buffer.newest().values()), most=1)[0]) == [("cam00", 0)]
+    served = []
+    for take in range(2, 20):
+        at_ns = 100 * take * MS
+        buffer.put(frame("cam01", sequence=take, generated_ns=at_ns), at_ns)
+        buffer.put(frame("cam00", sequence=take, generated_ns=at_ns - 50 * MS), at_ns)  # always older
+        used, _ = buffer.take(list(buffer.newest().values()), most=1)
+        served += [(take, item.frame.camera) for item in used if item.frame.sequence == take]
+    assert served == [(take, "cam00" if take == 18 else "cam01") for take in range(2, 20)]
