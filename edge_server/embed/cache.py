@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +21,13 @@ _Key = tuple[str, str, int]
 _Row = NDArray[np.float32] | None
 
 
-class HasFrame(Protocol):
-    """An object with a frame."""
-
-    @property
-    def frame(self) -> Frame: ...
-
-
-Item = TypeVar("Item", bound=HasFrame)
-
-
-class EmbeddingCache(Generic[Item]):
+class EmbeddingCache:
     """Embeds each frame once. Not thread-safe.
 
     computed, failed: number of frames. A failure is remembered, so that a frame is tried and counted once.
     """
 
-    def __init__(self, embedder: Embedder, decode: Callable[[Item], Any], capacity: int = CAPACITY) -> None:
+    def __init__(self, embedder: Embedder, decode: Callable[[Frame], Any], capacity: int = CAPACITY) -> None:
         """decode: gives a frame's view with its ``image``, None if it is damaged. Share it with the field, so
         that a frame that both use is decoded once. capacity: number of embeddings to keep."""
         self._embedder, self._decode, self._capacity = embedder, decode, capacity
@@ -46,13 +36,13 @@ class EmbeddingCache(Generic[Item]):
         self.computed = 0
         self.failed = 0
 
-    def of(self, items: Sequence[Item]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def of(self, frames: Sequence[Frame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Embed frames. Returns embeddings, float32 (n, dim), and their validity, bool (n,).
 
         A frame that cannot be decoded, or whose embedding is not finite, has a row of zeros and is not valid.
         """
-        keys = [(i.frame.camera, i.frame.session, i.frame.sequence) for i in items]
-        missing = {key: item for key, item in zip(keys, items) if key not in self._rows}
+        keys = [(frame.camera, frame.session, frame.sequence) for frame in frames]
+        missing = {key: frame for key, frame in zip(keys, frames) if key not in self._rows}
         # Collected before anything is evicted: a decision may be larger than the cache.
         found = {key: self._rows[key] for key in keys if key in self._rows} | self._embed(missing)
         for key in keys:
@@ -68,9 +58,9 @@ class EmbeddingCache(Generic[Item]):
                 out[k], ok[k] = row, True
         return out, ok
 
-    def _embed(self, missing: dict[_Key, Item]) -> dict[_Key, _Row]:
+    def _embed(self, missing: dict[_Key, Frame]) -> dict[_Key, _Row]:
         found: dict[_Key, _Row] = dict.fromkeys(missing)
-        views = {key: view for key, item in missing.items() if (view := self._decode(item)) is not None}
+        views = {key: view for key, frame in missing.items() if (view := self._decode(frame)) is not None}
         if views:
             rows = self._embedder.embed([view.image for view in views.values()])
             # An embedder gives zeros where its model gave NaN.

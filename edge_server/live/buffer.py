@@ -9,8 +9,9 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
-from freshfield.frame import BufferedFrame, Frame
+from freshfield.frame import Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 
 MOST_UNSELECTED = 8  # most frames of a camera that are kept for a field that wants every frame
@@ -30,13 +31,13 @@ class FrameBuffer:
 
     def __init__(self, cameras: Sequence[str]) -> None:
         self.cameras = tuple(cameras)
-        self._newest: dict[str, BufferedFrame] = {}
+        self._newest: dict[str, Frame] = {}
         self._arrived = threading.Condition()
         self.arrivals = 0
         self.stale_on_arrival = 0
         self.shed = 0
         self.held_back = 0
-        self._unselected: dict[str, deque[BufferedFrame]] | None = None
+        self._unselected: dict[str, deque[Frame]] | None = None
         self._takes = 0
         self._last_take = dict.fromkeys(self.cameras, 0.0)  # the last one that took a frame of each camera
 
@@ -46,11 +47,11 @@ class FrameBuffer:
         A newer one dated after ``received_ns`` comes from a clock that has been corrected since, and is
         replaced: otherwise its camera would stand still until that time.
         """
-        item = BufferedFrame(frame, frame.generated_edge_ns, received_ns)
+        item = replace(frame, received_ns=received_ns)
         with self._arrived:
             known = self._newest.get(frame.camera)
-            impossible = known is not None and known.generated_ns > received_ns + MAX_CAPTURE_AHEAD_NS
-            if known is not None and not impossible and known.generated_ns >= item.generated_ns:
+            impossible = known is not None and known.generated_edge_ns > received_ns + MAX_CAPTURE_AHEAD_NS
+            if known is not None and not impossible and known.generated_edge_ns >= item.generated_edge_ns:
                 self.stale_on_arrival += 1
             else:
                 self._newest[frame.camera] = item
@@ -69,9 +70,7 @@ class FrameBuffer:
                     {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras} if wanted else None
                 )
 
-    def take(
-        self, selected: Sequence[BufferedFrame], most: int | None = None
-    ) -> tuple[tuple[BufferedFrame, ...], tuple[BufferedFrame, ...]]:
+    def take(self, selected: Sequence[Frame], most: int | None = None) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Take frames for an update.
 
         selected: newest frames that the policy selected.
@@ -86,44 +85,44 @@ class FrameBuffer:
         frame, which waits on. Frames of cameras that were not selected are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
-        own = {item.frame.camera: item for item in selected}
-        youngest_ns = max((item.generated_ns for item in selected), default=0)
-        ranked: list[tuple[tuple[float, ...], BufferedFrame]] = []
+        own = {item.camera: item for item in selected}
+        youngest_ns = max((item.generated_edge_ns for item in selected), default=0)
+        ranked: list[tuple[tuple[float, ...], Frame]] = []
         with self._arrived:
             if self._unselected is None:
                 self.held_back = 0
                 return tuple(selected), ()
             self._takes += 1
             for camera, waiting in self._unselected.items():
-                arrived: list[BufferedFrame] = []
+                arrived: list[Frame] = []
                 while waiting and waiting[0].received_ns <= until_ns:
                     arrived.append(waiting.popleft())
                 if camera in own:
-                    arrived.sort(key=lambda item: (-item.generated_ns, item is not own[item.frame.camera]))
+                    arrived.sort(key=lambda item: (-item.generated_edge_ns, item is not own[item.camera]))
                     last = self._last_take[camera]
                     waits_on = self._takes - last <= LONGEST_WAIT
                     for k, item in enumerate(arrived):
-                        older = (youngest_ns - item.generated_ns) // _AS_YOUNG_NS if waits_on else 0
-                        ranked.append(((k, waits_on, older, last, -item.generated_ns), item))
+                        older = (youngest_ns - item.generated_edge_ns) // _AS_YOUNG_NS if waits_on else 0
+                        ranked.append(((k, waits_on, older, last, -item.generated_edge_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
             for k, item in enumerate(taken):  # within one take, the first camera has waited longest
-                self._last_take[item.frame.camera] = self._takes + k / len(taken)
+                self._last_take[item.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
             self.held_back = 0
             for item in left:
-                waiting = self._unselected[item.frame.camera]
-                if item is own[item.frame.camera] and len(waiting) < MOST_UNSELECTED:
+                waiting = self._unselected[item.camera]
+                if item is own[item.camera] and len(waiting) < MOST_UNSELECTED:
                     waiting.appendleft(item)
                     self.held_back += 1
                 else:
                     self.shed += 1
-        others = [item for item in taken if item is not own[item.frame.camera]]
+        others = [item for item in taken if item is not own[item.camera]]
         left_out = {id(item) for item in left}
         used = tuple(item for item in selected if id(item) not in left_out)
         return used, tuple(sorted(others, key=lambda item: item.received_ns))
 
-    def newest(self) -> dict[str, BufferedFrame]:
+    def newest(self) -> dict[str, Frame]:
         """Omega(t): the newest frame of every camera that has reported, in the order of ``cameras``."""
         with self._arrived:
             return {c: self._newest[c] for c in self.cameras if c in self._newest}

@@ -19,7 +19,7 @@ from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
-from freshfield.frame import BufferedFrame
+from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it
@@ -48,8 +48,8 @@ class Selection:
 
     plan: SelectionWindow
     now_ns: int
-    items: tuple[BufferedFrame, ...]
-    others: tuple[BufferedFrame, ...] = ()
+    items: tuple[Frame, ...]
+    others: tuple[Frame, ...] = ()
     arrivals: int = 0
 
 
@@ -79,7 +79,7 @@ class FieldUpdater:
         self.buffer = buffer
         self.on_arrivals = on_arrivals
         self._selected_of = 0  # arrivals at the last selection
-        self._selected: dict[str, BufferedFrame] = {}  # the newest selected frame of each camera
+        self._selected: dict[str, Frame] = {}  # the newest selected frame of each camera
         self.decoder = ViewDecoder(foreground)
         self.embedder = embedder
         self.embeddings: EmbeddingCache | None = None
@@ -88,7 +88,7 @@ class FieldUpdater:
 
             # A frame that is both embedded and trained on is decoded once.
             self.embeddings = EmbeddingCache(embedder, self.decoder.view)
-        self.materialize: Callable[[Sequence[BufferedFrame]], Sequence[BufferedFrame]] | None = None
+        self.materialize: Callable[[Sequence[Frame]], Sequence[Frame]] | None = None
         self.policy = policy
         self.field = field
         self.keyframes = keyframes
@@ -132,16 +132,16 @@ class FieldUpdater:
         """What the policy may look at, at ``now_ns``."""
         return self._epoch(self.buffer.newest(), now_ns)
 
-    def _epoch(self, newest: Mapping[str, BufferedFrame], now_ns: int) -> Epoch:
+    def _epoch(self, newest: Mapping[str, Frame], now_ns: int) -> Epoch:
         def state(parts: Sequence[str] = STATE_PARTS) -> State:
             from edge_server.scheduler.learned.observation import observe
 
             seen = newest
             if self.materialize is not None:
-                seen = {item.frame.camera: item for item in self.materialize(tuple(newest.values()))}
+                seen = {item.camera: item for item in self.materialize(tuple(newest.values()))}
             return observe(self.buffer.cameras, seen, now_ns, self.embeddings, parts, keep_frames=True)
 
-        generated = {c: item.generated_ns for c, item in newest.items()}
+        generated = {c: item.generated_edge_ns for c, item in newest.items()}
         received = {c: item.received_ns for c, item in newest.items()}
         return Epoch(now_ns, self.number, generated, state, received)
 
@@ -171,7 +171,7 @@ class FieldUpdater:
         self._selected_of += arrivals
         items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, most_new))
         if self.field.frame_s is not None:
-            own = {item.frame.camera: item for item in items}
+            own = {item.camera: item for item in items}
             arrivals = len(others) + sum(self._selected.get(c) is not item for c, item in own.items())
             self._selected |= own
         return Selection(plan, now_ns, items, others, arrivals)
@@ -235,7 +235,7 @@ class FieldUpdater:
         """The record of an update that became visible at ``published_ns``; ages are taken then (6.35)."""
         ages = tuple((published_ns - view.generated_ns) / 1e6 for view in views)
         used = {view.camera for view in views}
-        network = [i.received_ns - i.generated_ns for i in selection.items if i.frame.camera in used]
+        network = [i.received_ns - i.generated_edge_ns for i in selection.items if i.camera in used]
         publication = Publication(
             number=self.number,
             t_s=(published_ns - self.start_ns) / 1e9,

@@ -335,7 +335,7 @@ class EdgeServer:
 
     def _cameras(self) -> list[CameraView]:
         now_ns, ingest = self.clock.now_ns(), self.ingest
-        frames = ingest.newest_held_out | {c: item.frame for c, item in self.buffer.newest().items()}
+        frames = ingest.newest_held_out | self.buffer.newest()
         views = []
         for camera in self.scenario.cameras:
             frame = frames.get(camera)

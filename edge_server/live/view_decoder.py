@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from edge_server.fields import View
 from freshfield import payload
-from freshfield.frame import BufferedFrame, Frame
+from freshfield.frame import Frame
 from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:
@@ -40,27 +40,26 @@ class ViewDecoder:
             self.most_pixels = pixels
             self._views.clear()
 
-    def views(self, selected: Iterable[BufferedFrame]) -> list[View]:
+    def views(self, selected: Iterable[Frame]) -> list[View]:
         """Views of the selected frames in their order, without those that cannot be decoded."""
         return [view for item in selected if (view := self.view(item)) is not None]
 
-    def view(self, item: BufferedFrame) -> View | None:
+    def view(self, frame: Frame) -> View | None:
         """View of one frame, kept as its camera's last; None where it cannot be decoded."""
-        frame = item.frame
         cached = self._views.get(frame.camera)
         if cached is not None and cached[0] is frame:
             return cached[1]
-        view = self._decode(item)
+        view = self._decode(frame)
         self._views[frame.camera] = (frame, view)
         return view
 
-    def others(self, items: Iterable[BufferedFrame]) -> list[View]:
+    def others(self, items: Iterable[Frame]) -> list[View]:
         """Views of frames that are not their cameras' newest and are used once, without those that cannot be
         decoded."""
         return [view for item in items if (view := self._decode(item)) is not None]
 
-    def _decode(self, item: BufferedFrame) -> View | None:
-        halvings = self._halvings(item.frame.intrinsics)
+    def _decode(self, item: Frame) -> View | None:
+        halvings = self._halvings(item.intrinsics)
         view = self._decode_at(item, halvings)
         if view is None:
             self.undecodable += 1
@@ -68,15 +67,15 @@ class ViewDecoder:
             view = replace(view, whole=lambda: self._decode_at(item, 0))
         return view
 
-    def _decode_at(self, item: BufferedFrame, halvings: int) -> View | None:
-        frame, k = item.frame, item.frame.intrinsics
+    def _decode_at(self, frame: Frame, halvings: int) -> View | None:
+        k = frame.intrinsics
         try:
             image = payload.decode(frame.payload, frame.codec, k.width, k.height, halvings)
         except payload.PayloadError:
             return None
         if self.foreground is not None:
             image = self.foreground.apply(frame.camera, image)
-        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), item.generated_ns)
+        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), frame.generated_edge_ns)
 
     def _halvings(self, k: Pinhole) -> int:
         if self.most_pixels is None:

@@ -9,7 +9,7 @@ import math
 import re
 import struct
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import google_crc32c
 from google.protobuf.message import DecodeError
@@ -45,6 +45,7 @@ class Frame:
     clock_offset_ns: edge clock minus node clock, as the node estimates it.
     clock_uncertainty_ns: bound of the estimate's error.
     pose_gap_ns: time between the capture and the pose sample that it was paired with.
+    received_ns: arrival on the edge's clock, once it has arrived; not on the wire.
     """
 
     camera: str
@@ -59,24 +60,16 @@ class Frame:
     clock_offset_ns: int = 0
     clock_uncertainty_ns: int = 0
     pose_gap_ns: int = 0
+    received_ns: int = field(default=0, compare=False)
 
     @property
     def generated_edge_ns(self) -> int:
         """Capture time on the edge's clock."""
         return self.generated_ns + self.clock_offset_ns
 
-
-@dataclass(frozen=True)
-class BufferedFrame:
-    """A frame in the edge's buffer. generated_ns, received_ns: capture and arrival on the edge's clock."""
-
-    frame: Frame
-    generated_ns: int
-    received_ns: int
-
     def age_ms(self, now_ns: int) -> float:
         """Time since the capture. now_ns: on the edge's clock."""
-        return (now_ns - self.generated_ns) / 1e6
+        return (now_ns - self.generated_edge_ns) / 1e6
 
 
 def valid_id(text: str) -> bool:

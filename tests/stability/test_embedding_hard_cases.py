@@ -13,7 +13,6 @@ from edge_server.embed.cache import EmbeddingCache
 from edge_server.embed.letterbox import GRAY, letterbox
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
-from freshfield.frame import BufferedFrame
 from freshfield.geometry import Pinhole
 from tests.edge_server.embed.graphs import CHANNELS, detector
 from tests.edge_server.frames import frame
@@ -95,9 +94,7 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     assert rows[0].any() and not rows[1].any() and (rows[0] == rows[2]).all()
     cache, square = EmbeddingCache(made, ViewDecoder().view), Pinhole.from_fov(32, 32, 60.0)
     items = [
-        BufferedFrame(
-            frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8))), 0, 0
-        )
+        frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8)))
         for k, v in enumerate((0, 255, 0))
     ]
     rows, ok = cache.of(items)
@@ -111,11 +108,7 @@ def test_two_hundred_cameras_of_all_sizes(shipped):
         height, width = int(RNG.integers(8, 120)), int(RNG.integers(8, 120))
         image = RNG.integers(0, 256, (height, width, 3), dtype=np.uint8)
         camera = Pinhole.from_fov(width, height, 60.0)
-        items.append(
-            BufferedFrame(
-                frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")), k, k
-            )
-        )
+        items.append(frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")))
     rows, ok = cache.of(items)
     assert rows.shape == (200, shipped.dim) and ok.all() and np.isfinite(rows).all()
     some = [items[k] for k in (3, 77, 199)]

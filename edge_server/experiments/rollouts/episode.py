@@ -35,7 +35,7 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
-from freshfield.frame import BufferedFrame, Frame
+from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
@@ -130,11 +130,11 @@ class _Recorder(FrameBuffer):
 
     def __init__(self, cameras: Sequence[str]) -> None:
         super().__init__(cameras)
-        self.record: list[BufferedFrame] = []
+        self.record: list[Frame] = []
 
     def put(self, frame: Frame, received_ns: int) -> None:
         super().put(frame, received_ns)
-        self.record.append(BufferedFrame(frame, frame.generated_edge_ns, received_ns))
+        self.record.append(replace(frame, received_ns=received_ns))
 
 
 def _remembered(image: Image, period_ns: int | None) -> Image:
@@ -267,7 +267,7 @@ class Episode:
         at = np.sort(rng.integers(round(lead), round(lead + span), setting.decisions))
         self.instants_ns = [int(tick) * GRID_MS * 10**6 for tick in at]
         self._until_ns = self.instants_ns[-1] + round(setting.horizon_ms * 1e6)
-        self._frames: dict[tuple[str, int], BufferedFrame] = {}
+        self._frames: dict[tuple[str, int], Frame] = {}
         self._deployment, self._record = self._recorded()
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
@@ -298,8 +298,8 @@ class Episode:
         deployment.run((self._until_ns - deployment.clock.now_ns()) / 1e9)
         record = recorder.record
         # Kept for the images only: the instant of reception depends on the record.
-        self._frames |= {(b.frame.camera, b.frame.sequence): b for b in record}
-        return deployment, [Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in record]
+        self._frames |= {(b.camera, b.sequence): b for b in record}
+        return deployment, [Arrival(b.camera, b.sequence, b.generated_edge_ns, b.received_ns) for b in record]
 
     def evaluate(self, number: int, choice: Choice, cameras: tuple[str, ...] | None = None) -> dict[str, Outcome]:
         """Fit the choice at a decision and score it at publication: an outcome from each of ``cameras`` (None:
@@ -351,10 +351,10 @@ class Episode:
         """The state of the buffer (6.33) that holds the frames of ``newest``, by camera, at an instant."""
         setting = self._factory.setting
         items = self._exposed(sorted(newest.values(), key=lambda a: a.received_ns))
-        by_camera = {item.frame.camera: item for item in items}
+        by_camera = {item.camera: item for item in items}
         return observe(setting.scenario.training, by_camera, at_ns, self._embeddings, setting.parts)
 
-    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[BufferedFrame, ...]:
+    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[Frame, ...]:
         return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
 
     def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
@@ -362,7 +362,7 @@ class Episode:
         missing = [a for a in arrivals if (a.camera, a.sequence) not in self._views]
         for item in self._exposed(missing):
             views = ViewDecoder().views([item])
-            self._views[item.frame.camera, item.frame.sequence] = views[0] if views else None
+            self._views[item.camera, item.sequence] = views[0] if views else None
         found = [self._views.get((a.camera, a.sequence)) for a in arrivals]
         return [view for view in found if view is not None]
 

@@ -28,7 +28,7 @@ from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
 from freshfield.files import out_file, write_json
-from freshfield.frame import BufferedFrame
+from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
@@ -129,7 +129,7 @@ class UpdateCosts:
         self._most_pixels = updates.decoder.most_pixels
         self._seen, self._spent_s = updates.buffer.arrivals, spent_s
 
-    def measured(self, items: Sequence[BufferedFrame]) -> dict[str, float]:
+    def measured(self, items: Sequence[Frame]) -> dict[str, float]:
         """Milliseconds of an update (update_ms) and of each frame that arrived (view_ms): least squares over
         the updates, plus the time to decode a frame of ``items``."""
         frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T

@@ -31,7 +31,7 @@ from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler.policy import Policy
 from freshfield.clock import VirtualClock
-from freshfield.frame import BufferedFrame, Frame, FrameRejected, from_request, to_request
+from freshfield.frame import Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
 from freshfield.scenario import seed_sequence
 
@@ -242,23 +242,23 @@ class VirtualDeployment:
         """Capture period of the fastest camera."""
         return round(1e9 / max(float(camera.fps) for camera in self._cameras.values()))
 
-    def with_images(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
+    def with_images(self, items: Sequence[Frame]) -> tuple[Frame, ...]:
         """Frames of the buffer with their images and poses, which are made now; frames that a source cannot
         make are left out. A frame that is used again stays the same object and is decoded once. Public for
         code that decides instead of this deployment's edge."""
         made = []
         for item in items:
-            camera, sequence = item.frame.camera, item.frame.sequence
+            camera, sequence = item.camera, item.sequence
             known = self._used.get(camera, ())
             used = next((frame for frame in known if frame.sequence == sequence), None)
             if used is None:
                 try:
-                    used = self._with_image(item.frame)
+                    used = self._with_image(item)
                 except ValueError:
                     self.failed[camera] += 1
                     continue
                 self._used[camera] = (used, *known)[:2]
-            made.append(BufferedFrame(used, item.generated_ns, item.received_ns))
+            made.append(used)
         return tuple(made)
 
     def frames(self) -> dict[str, Any]:

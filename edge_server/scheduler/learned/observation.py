@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.scheduler.learned.state import POSE_WIDTH, State
 from edge_server.scheduler.policy import STATE_PARTS
-from freshfield.frame import BufferedFrame
+from freshfield.frame import Frame
 from freshfield.geometry import quaternion_normalize
 
 # A rig of one camera, or of several at one point, has no size to scale by.
@@ -20,14 +20,14 @@ _MIN_RIG_RADIUS_M = 1e-6
 class FrameEmbeddings(Protocol):
     """Computes z = F_e(frame) (6.31) and caches it per frame (edge_server.embed)."""
 
-    def of(self, items: Sequence[BufferedFrame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def of(self, items: Sequence[Frame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Embeddings (n, d), and a mask (n,) of the frames that have one."""
         ...
 
 
 def observe(
     cameras: Sequence[str],
-    newest: Mapping[str, BufferedFrame],
+    newest: Mapping[str, Frame],
     now_ns: int,
     embeddings: FrameEmbeddings | None = None,
     parts: Sequence[str] = STATE_PARTS,
@@ -54,17 +54,17 @@ def observe(
         z = np.full((n, found.shape[1]), np.nan, np.float32)
         z[np.array(rows, int)[ok]] = found[ok]
         if keep_frames:
-            frames = {item.frame.camera: item.frame for item in items}
+            frames = {item.camera: item for item in items}
     return State(ages, poses, z, reported, tuple(cameras), frames)
 
 
-def relative_poses(items: Sequence[BufferedFrame]) -> NDArray[np.float64]:
+def relative_poses(items: Sequence[Frame]) -> NDArray[np.float64]:
     """(n, 6): translation from the cameras' center in units of their mean distance from it, so that the rig's
     position and size do not matter; rotation vector in radians, world axes."""
-    positions = np.array([item.frame.pose.translation_m for item in items], np.float64)
+    positions = np.array([item.pose.translation_m for item in items], np.float64)
     centered = positions - positions.mean(axis=0)
     radius = float(np.linalg.norm(centered, axis=1).mean())
-    q = quaternion_normalize([item.frame.pose.quaternion for item in items])
+    q = quaternion_normalize([item.pose.quaternion for item in items])
     sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
     # The angle over the sine of half of it; 2 in the limit of no rotation.
     per_sine = np.where(sine > 1e-12, 2.0 * np.arctan2(sine, q[:, :1]) / np.maximum(sine, 1e-12), 2.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.live.view_decoder import ViewDecoder
-from freshfield.frame import BufferedFrame
+from freshfield.frame import Frame
 from tests.edge_server.frames import damaged_frame, frame
 
 DIM = 4
@@ -37,8 +37,8 @@ def cached(**more) -> tuple[Means, EmbeddingCache]:
     return means, EmbeddingCache(means, ViewDecoder().view, **more)
 
 
-def buffered(camera: str = "cam01", sequence: int = 0, **other) -> BufferedFrame:
-    return BufferedFrame(frame(camera, sequence, **other), sequence, sequence)
+def buffered(camera: str = "cam01", sequence: int = 0, **other) -> Frame:
+    return frame(camera, sequence, **{"generated_ns": sequence, "received_ns": sequence, **other})
 
 
 def test_a_frame_is_embedded_once_whoever_asks_again():
@@ -86,7 +86,7 @@ def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
     means, decoder = Means(), ViewDecoder()
     cache = EmbeddingCache(means, decoder.view)
     for _ in range(3):
-        rows, ok = cache.of([BufferedFrame(damaged_frame("cam01"), 0, 0), buffered("cam02")])
+        rows, ok = cache.of([damaged_frame("cam01"), buffered("cam02")])
         assert ok.tolist() == [False, True] and (rows[0] == 0).all()
     assert cache.failed == 1 and decoder.undecodable == 1 and means.asked == [1]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge_server.live.buffer import LONGEST_WAIT, MOST_UNSELECTED, FrameBuffer
-from freshfield.frame import BufferedFrame
+from freshfield.frame import Frame
 from tests.edge_server.frames import frame
 
 MS = 1_000_000
@@ -23,7 +23,7 @@ def test_a_late_older_frame_never_becomes_newest():
     buffer = FrameBuffer(["cam01"])
     buffer.put(frame(sequence=2, generated_ns=60 * MS), 70 * MS)
     buffer.put(frame(sequence=1, generated_ns=30 * MS), 90 * MS)
-    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert buffer.newest()["cam01"].sequence == 2
     assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
 
 
@@ -32,7 +32,7 @@ def test_a_frame_from_the_future_gives_way_to_any():
     buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
     assert buffer.ages_ms(100 * MS) == {"cam01": -1200.0}
     buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert buffer.newest()["cam01"].sequence == 2
     assert buffer.ages_ms(150 * MS) == {"cam01": 30.0} and buffer.stale_on_arrival == 0
 
 
@@ -40,7 +40,7 @@ def test_a_frame_ahead_within_the_tolerance_is_still_the_newest():
     buffer = FrameBuffer(["cam01"])
     buffer.put(frame(sequence=2, generated_ns=400 * MS), 150 * MS)
     buffer.put(frame(sequence=1, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].frame.sequence == 2 and buffer.stale_on_arrival == 1
+    assert buffer.newest()["cam01"].sequence == 2 and buffer.stale_on_arrival == 1
 
 
 def test_memory_is_one_frame_a_camera():
@@ -48,7 +48,7 @@ def test_memory_is_one_frame_a_camera():
     for i in range(1000):
         buffer.put(frame(sequence=i, generated_ns=i * MS), i * MS)
     assert len(buffer.newest()) == 1
-    assert buffer.newest()["cam01"].frame.sequence == 999
+    assert buffer.newest()["cam01"].sequence == 999
 
 
 def test_order_is_the_cameras_not_the_arrivals():
@@ -67,8 +67,8 @@ def test_wait_returns_on_arrival_and_on_timeout():
     assert time.monotonic() - begun_s < 30.0, "it slept on"
 
 
-def _sequences(items: Sequence[BufferedFrame]) -> list[tuple[str, int]]:
-    return [(item.frame.camera, item.frame.sequence) for item in items]
+def _sequences(items: Sequence[Frame]) -> list[tuple[str, int]]:
+    return [(item.camera, item.sequence) for item in items]
 
 
 def test_every_frame_is_taken_once_and_the_oldest_make_room():
@@ -155,7 +155,7 @@ def test_of_equally_young_frames_those_of_who_has_waited_longest_are_taken():
             at_ns = 100 * sequence * MS + 7 * MS // 10 + k * MS // 10
             buffer.put(frame(camera, sequence=sequence, generated_ns=at_ns), at_ns)
         for item in buffer.take(list(buffer.newest().values()), most=2)[0]:
-            seen[item.frame.camera] += 1
+            seen[item.camera] += 1
     assert seen == dict.fromkeys(buffer.cameras, 4)
 
 
@@ -169,7 +169,7 @@ def test_where_there_is_no_time_for_all_the_youngest_are_taken():
             at_ns = (1000 * sequence + 500) * MS
             buffer.put(frame(camera, sequence=sequence, generated_ns=at_ns - int(lag) * 20 * MS), at_ns)
         used, _ = buffer.take(list(buffer.newest().values()), most=2)
-        assert {lags[item.frame.camera] for item in used} == {0, 1}
+        assert {lags[item.camera] for item in used} == {0, 1}
 
 
 def test_a_camera_whose_frames_are_always_older_than_others_has_its_turn():
@@ -184,7 +184,7 @@ def test_a_camera_whose_frames_are_always_older_than_others_has_its_turn():
         used, others = buffer.take(list(buffer.newest().values()), most=2)
         assert len(used) == 2 and others == ()
         for item in used:
-            seen[item.frame.camera] += 1
+            seen[item.camera] += 1
     young = [seen[camera] for camera in buffer.cameras[:5]]
     assert seen["cam05"] == 4 and max(young) - min(young) <= 1
     assert buffer.shed == buffer.arrivals - sum(seen.values()) - 4  # four newest ones wait on
@@ -199,7 +199,7 @@ def test_more_late_cameras_than_are_taken_have_their_turns_too():
             arrived = (1000 * sequence + 500) * MS
             buffer.put(frame(camera, sequence=sequence, generated_ns=arrived - 2 * k * MS), arrived)
         for item in buffer.take(list(buffer.newest().values()), most=4)[0]:
-            seen[item.frame.camera] += 1
+            seen[item.camera] += 1
     assert min(seen.values()) >= 3
 
 
@@ -214,7 +214,7 @@ def test_a_camera_that_comes_back_goes_first():
     for k, camera in enumerate(buffer.cameras):
         buffer.put(frame(camera, sequence=90, generated_ns=at_ns - 50 * k * MS), at_ns)
     taken = buffer.take(list(buffer.newest().values()), most=1)[0]
-    assert "cam02" in {item.frame.camera for item in taken if item.frame.sequence == 90}
+    assert "cam02" in {item.camera for item in taken if item.sequence == 90}
 
 
 def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():
@@ -229,5 +229,5 @@ def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():
         buffer.put(frame("cam01", sequence=take, generated_ns=at_ns), at_ns)
         buffer.put(frame("cam00", sequence=take, generated_ns=at_ns - 50 * MS), at_ns)  # always older
         used, _ = buffer.take(list(buffer.newest().values()), most=1)
-        served += [(take, item.frame.camera) for item in used if item.frame.sequence == take]
+        served += [(take, item.camera) for item in used if item.sequence == take]
     assert served == [(take, "cam00" if take == 18 else "cam01") for take in range(2, 20)]

@@ -46,7 +46,7 @@ def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qua
     assert u.select(plan, 159 * MS) is None
     assert u.select(plan, 160 * MS) is None  # the horizon is over, but nothing was generated in it
     u.buffer.put(frame("cam01", sequence=1, generated_ns=170 * MS), 180 * MS)
-    assert [i.frame.sequence for i in u.select(plan, 180 * MS).items] == [1]
+    assert [i.sequence for i in u.select(plan, 180 * MS).items] == [1]
 
 
 def test_an_empty_buffer_selects_nothing():

@@ -3,24 +3,23 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.live.view_decoder import ViewDecoder
-from freshfield.frame import BufferedFrame
 from tests.edge_server.frames import damaged_frame, frame
 
 
 def test_a_frame_is_decoded_once_and_carries_the_edges_time():
     decoder = ViewDecoder()
-    item = BufferedFrame(frame(generated_ns=5, clock_offset_ns=7), 12, 20)
+    item = frame(generated_ns=5, clock_offset_ns=7, received_ns=20)
     (first,) = decoder.views([item])
     (second,) = decoder.views([item])
     assert first is second
     assert first.generated_ns == 12
     assert first.image.shape == (24, 32, 3)
-    assert np.allclose(first.camera_to_world, item.frame.pose.matrix())
+    assert np.allclose(first.camera_to_world, item.pose.matrix())
 
 
 def test_a_damaged_payload_is_counted_once_and_loses_nothing_else():
     decoder = ViewDecoder()
-    items = [BufferedFrame(damaged_frame("cam01"), 0, 0), BufferedFrame(frame("cam02"), 0, 0)]
+    items = [damaged_frame("cam01"), frame("cam02")]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert decoder.undecodable == 1
@@ -29,19 +28,19 @@ def test_a_damaged_payload_is_counted_once_and_loses_nothing_else():
 def test_memory_is_one_view_a_camera():
     decoder = ViewDecoder()
     for i in range(200):
-        decoder.views([BufferedFrame(frame(sequence=i), i, i)])
+        decoder.views([frame(sequence=i, generated_ns=i, received_ns=i)])
     assert len(decoder._views) == 1
 
 
 def test_another_size_is_decoded_anew():
-    decoder, item = ViewDecoder(), BufferedFrame(frame(), 0, 0)
+    decoder, item = ViewDecoder(), frame()
     assert decoder.view(item).image.shape == (24, 32, 3)
     decoder.take_at_most(767)
     assert decoder.view(item).image.shape == (12, 16, 3)
 
 
 def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
-    item = BufferedFrame(frame(), 0, 0)  # 32 x 24
+    item = frame()  # 32 x 24
     for most, size in ((768, (24, 32)), (767, (12, 16)), (1, (3, 4))):
         view = ViewDecoder(most_pixels=most).view(item)
         assert view.image.shape[:2] == size == (view.intrinsics.height, view.intrinsics.width)

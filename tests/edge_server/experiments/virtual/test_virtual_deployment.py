@@ -289,7 +289,7 @@ def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants()
 def test_spread_cameras_capture_at_their_own_seeded_instants() -> None:
     spread = scenario(cameras={"count": 5, "held_out": ["cam00"], "phase": "spread"})
     deployment = run(spread, seconds=0.6)
-    instants = {item.frame.camera: item.generated_ns for item in deployment.updates.buffer.newest().values()}
+    instants = {item.camera: item.generated_edge_ns for item in deployment.updates.buffer.newest().values()}
     period_ns = 1e9 / 15
     phases = {camera: at % period_ns for camera, at in instants.items()}
     for camera, phase in phases.items():

@@ -9,7 +9,6 @@ import pytest
 
 from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import StateLayout
-from freshfield.frame import BufferedFrame
 from freshfield.geometry import Pose, look_at, so3_exp
 from tests.edge_server.frames import frame
 from tests.edge_server.scheduler.learned.problems import state
@@ -109,7 +108,7 @@ class Colors:
 
     def of(self, items):
         self.asked += len(items)
-        rows = np.array([[i.frame.sequence, 1.0] for i in items], np.float32).reshape(-1, 2)
+        rows = np.array([[i.sequence, 1.0] for i in items], np.float32).reshape(-1, 2)
         return rows, np.arange(len(items)) != 2
 
 
@@ -120,7 +119,7 @@ def rig(scale=1.0, shift=(0.0, 0.0, 0.0)):
         matrix = look_at(eye, [0.0, 0.0, 0.0])
         matrix[:3, 3] += shift
         made = frame(f"c{i}", sequence=i, generated_ns=10 * i * MS, pose=Pose.from_matrix(matrix))
-        out[f"c{i}"] = BufferedFrame(made, made.generated_ns, 50 * MS)
+        out[f"c{i}"] = replace(made, received_ns=50 * MS)
     return out
 
 
@@ -132,7 +131,7 @@ def test_observing_gives_ages_poses_and_embeddings_in_the_cameras_order():
     np.testing.assert_array_equal(s.reported, [True, True, False, True])
     assert s.cameras == ("c3", "c2", "c1", "c0")
     np.testing.assert_array_equal(s.embeddings, [[3, 1], [2, 1], [np.nan] * 2, [np.nan] * 2])
-    turn = newest["c3"].frame.pose.matrix()[:3, :3]
+    turn = newest["c3"].pose.matrix()[:3, :3]
     np.testing.assert_allclose(so3_exp(s.poses[0, 3:]), turn, atol=1e-12)
 
 
