@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -114,10 +115,15 @@ def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
     sink, still = sinks.ServoSink(stream, 0.01), Command(HOME, np.zeros(6), "holding")
     sink.send(0.0, still)
     assert control.servoJ.call_count == 1
+    for lag_rad, says in ((0.34, ""), (0.36, "21 degrees behind its target")):
+        stream.now.return_value = HOME - np.eye(6)[2] * lag_rad
+        with pytest.raises(ArmError, match=says) if says else contextlib.nullcontext():
+            sink.send(0.0, still)
+    assert control.servoJ.call_count == 2
     stream.trouble = "arm at 10.0.0.1: safety: protective stop"
     with pytest.raises(ArmError, match="protective stop: stopped"):
         sink.send(0.01, still)
-    assert control.servoJ.call_count == 1
+    assert control.servoJ.call_count == 2
 
 
 def test_an_arm_that_is_not_there_and_wrong_settings_are_one_line(tmp_path, capsys, host):
