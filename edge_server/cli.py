@@ -91,7 +91,10 @@ _COMMANDS = {
     "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
     "bench": ("experiments.bench.command", "measure speed and quality on this machine: field, track, growth and more"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
-    "export": ("export.command", "write a run's mesh, splats, points, cameras and poses as files for other programs"),
+    "export": (
+        "export.export_command",
+        "write a run's mesh, splats, points, cameras and poses as files for other programs",
+    ),
     "train-detector": (
         "experiments.training.detector.command",
         "train the small detector whose backbone makes the default embeddings",

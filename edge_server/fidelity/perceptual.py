@@ -104,10 +104,3 @@ def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | Non
         return None, f"perceptual: {error.name} is not installed: pip install 'freshfield[embed]'"
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         return None, f"perceptual: the files in {folder} cannot be used ({error})"
-
-
-def save_coefficients(path: Path, taps: tuple[str, ...], weights: list[NDArray[np.float64]], power: float) -> None:
-    """Write the coefficients that ``open_perceptual`` reads."""
-    arrays: dict[str, NDArray] = {f"w{k}": w.astype(np.float32) for k, w in enumerate(weights)}
-    arrays |= {"taps": np.array(taps), "power": np.array(power)}
-    np.savez(path, **arrays)  # type: ignore[arg-type]  # arrays by name, not its one option

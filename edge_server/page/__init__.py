@@ -17,8 +17,8 @@ import rich
 import viser
 
 from edge_server.live.state import EdgeState
+from edge_server.page.access_guard import AccessGuard
 from edge_server.page.controls import notify
-from edge_server.page.door import Door
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
@@ -65,10 +65,10 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
     if words := transport.guard(host, "page", http=True):
         log.warning("--insecure: %s", words)
     tls = transport.tls(host)
-    door = Door(HttpDoor(transport.access, host), tls)
-    with door.before_viser():
+    guard = AccessGuard(HttpDoor(transport.access, host), tls)
+    with guard.before_viser():
         server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
-    if not door.used:
+    if not guard.used:
         _quietly(server.stop)
         raise PageError("page: this version of viser listens in another way: nothing would protect the page")
     if port and server.get_port() != port:  # taken since the check: viser silently takes the next one
@@ -102,7 +102,7 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
             if each is connection:
                 notify(server.get_clients().get(number), "Not done", "You logged in to look only.", bad=True)
 
-    door.controls, door.on_refused = server.gui._gui_input_handle_from_uuid, on_refused
+    guard.controls, guard.on_refused = server.gui._gui_input_handle_from_uuid, on_refused
     renders.start()
     refresher.start()
     port = server.get_port()

@@ -66,7 +66,8 @@ class MeshLayer:
 
         from edge_server.fields.common.threads.thread_pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
-        from edge_server.surface.reconstruct import MeshSettings, grid_for, make_depth_maps, mesh_from_depth_maps
+        from edge_server.surface.reconstruct import grid_for, make_depth_maps, mesh_from_depth_maps
+        from edge_server.surface.settings import MeshSettings
 
         renderer = self._state.renderer
         views = getattr(renderer, "cameras", ())

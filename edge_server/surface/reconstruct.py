@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,42 +12,12 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
 from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
 from edge_server.surface.refine_depth import refine_depth
+from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
 
-METHODS = ("tsdf", "sdf")
 GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
 FINEST = 512  # maximum voxels along the longest side without a given voxel size
-Corner = tuple[float, float, float]
 Say = Callable[[str, float], None]
-
-
-@dataclass(frozen=True)
-class MeshSettings:
-    """How a mesh is made.
-
-    method: tsdf (3.8-3.10) or sdf (3.12-3.15).
-    sharpen: refine depth by photo-consistency (``refine_depth``).
-    voxel_m: None: the size of a pixel at the surface.
-    bounds: lower and upper corner, meters; None: from the depth maps.
-    watertight: close the surface in unobserved space.
-    min_weight: known voxels have more weight than this (a camera at normal incidence counts 1).
-    memory_mb: largest size of the volume.
-    Raises SurfaceError for an unknown method or a weight out of range.
-    """
-
-    method: str = "tsdf"
-    sharpen: bool = True
-    voxel_m: float | None = None
-    bounds: tuple[Corner, Corner] | None = None
-    watertight: bool = False
-    min_weight: float = 0.2
-    memory_mb: float = 2048.0
-
-    def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise SurfaceError(f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
-        if not 0.0 <= self.min_weight <= 1e6:
-            raise SurfaceError(f"min_weight must be in 0..1e+06, not {self.min_weight:g}")
 
 
 def silent(what: str, share: float) -> None:

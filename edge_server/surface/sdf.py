@@ -20,28 +20,10 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
+from edge_server.surface.settings import SdfSettings
 from edge_server.surface.volume import Grid, Volume, fuse_maps
 
 MAX_NODES = 1 << 24
-
-
-@dataclass(frozen=True)
-class SdfSettings:
-    """How a distance function is fitted.
-
-    levels: number of grids, each twice as fine as the last. steps: Adam steps per level.
-    points: samples of each kind per step.
-    eikonal: lambda of (3.15). sides: weight of the third term.
-    rate: Adam's learning rate, in voxels of the level.
-    """
-
-    levels: int = 3
-    steps: int = 60
-    points: int = 20_000
-    eikonal: float = 0.1
-    sides: float = 1.0
-    rate: float = 0.1
-    seed: int = 0
 
 
 def fit_sdf(

@@ -31,6 +31,7 @@ Embed = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 KIND = "viewpoint policy"
 _STEP_MS = 1000.0  # an age of one step, in the unit of the schedulers' state
 _CLOSED = -1e9
+_ANY_KL = 1e9  # passes never end early
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,17 @@ def train_policy(
     rng = np.random.default_rng(seed)
     steps = StepFeatures(candidates)
     layout = layout_of(steps, embeddings, config.views, rng)
-    spec = Spec("select", layout, hidden=config.hidden, learning_rate=config.learning_rate)
+    spec = Spec(
+        "select",
+        layout,
+        hidden=config.hidden,
+        learning_rate=config.learning_rate,
+        clip=config.clip,
+        passes=config.passes,
+        minibatch=config.minibatch,
+        entropy=config.entropy,
+        target_kl=_ANY_KL,
+    )
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
     # Rounding makes steps of equal reward differ by 1e-16: as a unit, it would blow the rewards up.
@@ -181,14 +192,13 @@ def train_policy(
     scale = spread if spread > 1e-9 * float(np.abs(usual).max()) else 1.0
     actor = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_actor(spec, rng).items()}
     critic = {k: torch.tensor(w, requires_grad=True) for k, w in networks.init_value(spec, rng).items()}
-    parameters = [*actor.values(), *critic.values()]
-    adam = torch.optim.Adam(parameters, lr=config.learning_rate)
+    adam = torch.optim.Adam([*actor.values(), *critic.values()], lr=config.learning_rate)
     returns: list[float] = []
     with one_torch_thread():
         for _ in range(config.updates):
             batch = _episodes(rows, reward, scale, config, _numpy(actor), _numpy(critic), spec, rng)
             returns.append(batch["mean"])
-            _improve(batch, actor, critic, parameters, adam, spec, config, rng)
+            _improve(batch, actor, critic, adam, spec, rng)
     return CandidatePolicy(spec, _numpy(actor), embed), returns
 
 
@@ -241,34 +251,32 @@ def _improve(
     batch: dict[str, Any],
     actor: dict[str, Any],
     critic: dict[str, Any],
-    parameters: list[Any],
     adam: Any,
     spec: Spec,
-    config: PolicyConfig,
     rng: np.random.Generator,
 ) -> None:
-    """Passes of PPO's clipped objective over a batch."""
+    """The clipped update of PPO over a batch: a categorical over the open candidates."""
     import torch
 
+    from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
+
     raw = batch["returns"] - batch["values"]
-    advantage = torch.tensor((raw - raw.mean()) / max(raw.std(), 1e-9))
-    features, returns = torch.tensor(batch["features"]), torch.tensor(batch["returns"])
+    acted = Acted(
+        torch.tensor(batch["logps"]),
+        torch.tensor((raw - raw.mean()) / max(raw.std(), 1e-9)),
+        torch.tensor(batch["returns"]),
+    )
+    features = torch.tensor(batch["features"])
     closed, chosen = torch.tensor(batch["closed"]), torch.tensor(batch["chosen"])
-    before = torch.tensor(batch["logps"])
-    for _ in range(config.passes):
-        for some in torch.tensor(rng.permutation(len(returns))).split(config.minibatch):
-            logits = networks.logits(torch, spec, actor, features[some])
-            logps = torch.log_softmax(logits.masked_fill(closed[some], _CLOSED), dim=-1)
-            ratio = torch.exp(logps.gather(1, chosen[some, None])[:, 0] - before[some])
-            gain = advantage[some]
-            clipped = torch.clamp(ratio, 1.0 - config.clip, 1.0 + config.clip)
-            policy = -torch.minimum(ratio * gain, clipped * gain).mean()
-            entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1).mean()
-            value = ((networks.value(torch, spec, critic, features[some]) - returns[some]) ** 2).mean()
-            adam.zero_grad()
-            (policy + spec.value * value - config.entropy * entropy).backward()
-            torch.nn.utils.clip_grad_norm_(parameters, spec.max_gradient)
-            adam.step()
+
+    def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        logits = networks.logits(torch, spec, actor, features[some])
+        logps = torch.log_softmax(logits.masked_fill(closed[some], _CLOSED), dim=-1)
+        now = logps.gather(1, chosen[some, None])[:, 0]
+        entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1)
+        return now, entropy, networks.value(torch, spec, critic, features[some])
+
+    clipped_update(spec, evaluate, acted, [*actor.values(), *critic.values()], adam, rng)
 
 
 def _numpy(weights: dict[str, Any]) -> dict[str, NDArray[np.float64]]:

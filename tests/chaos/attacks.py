@@ -306,7 +306,7 @@ ATTACKS: tuple[tuple[str, str, Run, str], ...] = (
         "checkpoint that unpacks to 1 GB",
         "file",
         read(zip_bomb),
-        "tests/edge_server/export/test_command.py::test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked",
+        "tests/edge_server/export/test_export_command.py::test_a_checkpoint_that_would_unpack_to_gigabytes_is_not_unpacked",
     ),
     (
         "MCAP chunk that unpacks to 256 MB",

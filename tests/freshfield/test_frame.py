@@ -153,23 +153,43 @@ def test_each_refusal_has_its_reason(change, reason):
     assert error.value.reason == reason and str(error.value)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        set_header(sequence=6),
-        set_header(generated_ns=0),
-        set_header(camera_id="cam08"),
-        set_header(session_id="12-ac"),
-        set_header(clock_offset_ns=0),
-        set_header(pose__tz_m=3.0000001),
-        set_header(intrinsics__p2=1e-9),
-        set_header(role=pb.ROLE_TRAIN),
-        lambda r: setattr(r, "payload", r.payload[:-1] + b"\0"),
-    ],
-)
-def test_the_checksum_covers_every_field(change):
+def fields(message) -> list[str]:
+    """Paths of every field of the header, those of pose and intrinsics among them."""
+    paths = []
+    for field in message.DESCRIPTOR.fields:
+        inner = field.type == field.TYPE_MESSAGE
+        paths += [f"{field.name}__{path}" for path in fields(getattr(message, field.name))] if inner else [field.name]
+    return paths
+
+
+def test_there_are_this_many_fields():
+    assert len(fields(pb.FrameHeader())) == 26
+
+
+@pytest.mark.parametrize("path", fields(pb.FrameHeader()))
+def test_the_checksum_covers_every_field(path):
+    """Each value altered by the least that its type can be: had it no part in the checksum, the frame would pass."""
+
+    def alter(request):
+        *parents, name = path.split("__")
+        target = request.header
+        for parent in parents:
+            target = getattr(target, parent)
+        value = getattr(target, name)
+        setattr(
+            target,
+            name,
+            value + "x" if isinstance(value, str) else value + 1 if isinstance(value, int) else value + 1e-9,
+        )
+
     with pytest.raises(FrameRejected) as error:
-        from_request(changed(change, checksummed=False))
+        from_request(changed(alter, checksummed=False))
+    assert error.value.reason == "crc_mismatch"
+
+
+def test_the_checksum_covers_the_payload():
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(lambda r: setattr(r, "payload", r.payload[:-1] + b"\0"), checksummed=False))
     assert error.value.reason == "crc_mismatch"
 
 
@@ -182,15 +202,6 @@ def sent_through(camera: Pinhole) -> Pinhole:
 def nine_points(camera: Pinhole) -> np.ndarray:
     u, v = np.meshgrid([0, camera.width / 2, camera.width], [0, camera.height / 2, camera.height])
     return np.stack([u.ravel(), v.ravel()], -1)
-
-
-def test_a_lens_that_cannot_be_undone_is_refused():
-    wild = Pinhole(64, 64, 12.2, 12.2, 32.0, 32.0, (0.0, 0.0, 78.0, 69.6))
-    with np.errstate(all="ignore"):
-        assert not np.isfinite(wild.rays()).all()
-    with pytest.raises(FrameRejected, match="distortion") as error:
-        sent_through(wild)
-    assert error.value.reason == "bad_intrinsics"
 
 
 def test_a_lens_whose_rays_are_finite_but_wrong_is_refused():
@@ -229,34 +240,12 @@ def test_the_fox_lens_is_admitted():
     assert camera.distorted and sent_through(camera) == camera
 
 
-def test_the_lenses_of_a_recording_are_admitted():
-    file = data_dir("pose2sim_single_person") / "calibration_opencv.json"
-    for lens in json.loads(file.read_text()).values():
-        (fx, _, cx), (_, fy, cy), _ = lens["K"]
-        size = lens["width"], lens["height"]
-        camera = Pinhole(*size, fx, fy, cx + 0.5, cy + 0.5, tuple(lens["dist_k1k2p1p2"]))
-        assert camera.distorted and sent_through(camera) == camera
-
-
-def test_an_empty_request_is_refused_and_not_an_error():
-    with pytest.raises(FrameRejected):
-        from_request(pb.PushRequest())
-
-
 @given(st.text(max_size=70))
 def test_valid_ids_are_safe_in_file_names_and_ledgers(text):
     assert valid_id(text) == (1 <= len(text) <= 64 and all(c.isascii() and (c.isalnum() or c in "._-") for c in text))
 
 
 RAW = to_request(frame()).SerializeToString()
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_a_message_or_unparsable(data):
-    try:
-        parse(data)
-    except FrameRejected as error:
-        assert error.reason == "unparsable"
 
 
 @pytest.mark.parametrize("raw", [RAW + b"\0\0", RAW[:-1], b"\xff" * 9, b"\x0b"], ids=bytes.hex)

@@ -134,9 +134,16 @@ def test_the_last_line_is_found_among_lines_as_long_as_the_end_that_is_read(tmp_
     assert LedgerReader(write(tmp_path, long, closed=False)).last() == long[-1]
 
 
-def test_one_lost_line_is_said(tmp_path):
+def test_lines_lost_at_several_times_add_up(tmp_path):
     ledger = Ledger(tmp_path, "node", "cam00", 7)
-    ledger._lines.lost = 1
-    ledger.write(5, "cam00", "s", 0, "captured")
-    assert [(e.event, e.detail) for e in LedgerReader(ledger.path)] == [("captured", ""), ("lost_lines", "1")]
-    ledger.close(6)
+    lost = []
+    for k in range(3):
+        size = ledger.path.stat().st_size
+        with no_file_longer_than(size + 10 * k):
+            for _ in range(k + 1):
+                ledger.write(k, "cam00", "s", k, "captured")
+        ledger.write(k, "cam00", "s", k, "captured")
+        lost.append(ledger.lines_lost)
+    ledger.close(9)
+    said = [int(e.detail) for e in LedgerReader(ledger.path) if e.event == "lost_lines"]
+    assert lost == [1, 3, 6] and said == [1, 2, 3]

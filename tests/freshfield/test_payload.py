@@ -14,6 +14,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from freshfield.geometry import Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
 from freshfield.payload import CODECS, PayloadError, check, decode, encode
 from tests.work import MOST_MS, work_ms
@@ -291,6 +292,8 @@ def test_halving_keeps_the_picture(codec, size):
         small = decode(data, codec, width, height, halvings)
         n = 2**halvings
         assert small.shape == (-(-height // n), -(-width // n), 3)
+        camera = Pinhole.from_fov(width, height, 60.0).halved(halvings)
+        assert (camera.height, camera.width) == small.shape[:2]
         if width % n == height % n == 0:
             mean = image.reshape(height // n, n, width // n, n, 3).mean(axis=(1, 3))
             assert np.abs(small - mean).max() < 6

@@ -32,7 +32,8 @@ from edge_server.foreground.foreground import make_foreground
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.metrics import Truth, compare
-from edge_server.surface.reconstruct import Corner, MeshSettings, make_depth_maps, mesh_from_depth_maps
+from edge_server.surface.reconstruct import make_depth_maps, mesh_from_depth_maps
+from edge_server.surface.settings import Corner, MeshSettings
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import load
 

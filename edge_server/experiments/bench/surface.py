@@ -39,7 +39,8 @@ from edge_server.surface.metrics import (
     compare,
     depth_error_mm,
 )
-from edge_server.surface.reconstruct import MeshSettings, make_depth_maps, mesh_from_depth_maps
+from edge_server.surface.reconstruct import make_depth_maps, mesh_from_depth_maps
+from edge_server.surface.settings import MeshSettings
 from freshfield.machine_load import LoadMeter
 
 # Cases by name: representation and options.

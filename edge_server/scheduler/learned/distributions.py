@@ -13,7 +13,6 @@ not reported (mask 0) cannot be drawn; where none has, the set is empty with pro
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -47,20 +46,6 @@ def omega_entropy(xp: Any, logits: Any) -> Any:
     """(B,) entropy of the categorical."""
     logps = omega_log_probabilities(xp, logits)
     return -(xp.exp(logps) * logps).sum(axis=-1)
-
-
-def mix_uniform(xp: Any, action: str, logits: Any, share: float) -> Any:
-    """Logits of the mixture (1 - share) policy + share uniform: probability 1/2 for every camera where
-    ``action`` is select, else 1/K for every omega."""
-    if share == 0.0:
-        return logits
-    own, uniform = math.log1p(-share), math.log(share)
-    if action == "select":
-        even = xp.full_like(logits, uniform - math.log(2.0))
-        used, unused = own - _softplus(xp, -logits), own - _softplus(xp, logits)
-        return xp.logaddexp(used, even) - xp.logaddexp(unused, even)
-    each = xp.full_like(logits, uniform - math.log(logits.shape[-1]))
-    return xp.logaddexp(own + omega_log_probabilities(xp, logits), each)
 
 
 def sample_sets(logits: Array, mask: Array, rng: np.random.Generator) -> NDArray[np.bool_]:

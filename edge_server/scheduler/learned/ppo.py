@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +30,11 @@ from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
+from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
 from edge_server.torch_threads import one_torch_thread
 
-# Bounds exp: larger ratios are far outside the clip anyway.
-_MAX_LOG_RATIO = 20.0
 # Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
 # Normalization does not scale them up to 1.
 _MIN_ADVANTAGE_STD = 0.05
@@ -57,42 +56,29 @@ class Batch:
     """Decisions and their rewards.
 
     features: (B, N, width). actions: (B, N) bool, or (B,) index of an omega. logps: (B,) log-probabilities
-    under the policy that acted. rewards: (B,), NaN where there is none. explore: uniform share of the policy
-    that acted; the learned policy is compared with it under the same share.
+    under the policy that acted. rewards: (B,), NaN where there is none.
     """
 
     features: NDArray[np.float64]
     actions: NDArray[Any]
     logps: NDArray[np.float64]
     rewards: NDArray[np.float64]
-    explore: float = 0.0
 
     def __len__(self) -> int:
         return len(self.rewards)
 
 
 @dataclass(frozen=True)
-class Diagnostics:
-    """Figures of an update, in its last pass over the batch.
+class Diagnostics(UpdateFigures):
+    """Figures of an update; all 0 for a batch without a usable decision.
 
     reward: mean of the finite ones. dropped: decisions whose reward or log-probability was not finite.
-    moved: approximate KL divergence from the policy that acted, in nats. clipped: share of ratios outside the
-    clip. gradient: norm before clipping. explained: share of the rewards' variance that V explained before
-    the update (None where they do not vary). steps: gradient steps taken. skipped: steps left out because the
-    gradient was not finite.
+    explained: share of the rewards' variance that V explained before the update (None where they do not vary).
     """
 
     reward: float | None
     dropped: int
-    policy_loss: float
-    value_loss: float
-    entropy: float
-    moved: float
-    clipped: float
-    gradient: float
     explained: float | None
-    steps: int
-    skipped: int
 
 
 class Learner:
@@ -125,24 +111,6 @@ class Learner:
         weights = {name: w.detach().numpy().copy() for name, w in self._actor.items()}
         return Actor(self.spec, weights, mean_features=self._mean_features.copy())
 
-    def set_actor(self, actor: Actor) -> None:
-        """Continue from ``actor``'s weights. ValueError where they are not of this specification."""
-        if actor.weights.keys() != self._actor.keys():
-            raise ValueError("the weights belong to another network")
-        with torch.no_grad():
-            for name, w in self._actor.items():
-                w.copy_(_checked_tensor(actor.weights[name], w))
-
-    def reset_rewards(self) -> None:
-        """Start over with rewards of another kind: reset their statistics and V. The actor does not
-        change."""
-        self._rewards = _RunningMeanStd()
-        initial = networks.init_value(self.spec, self._rng["weights"])
-        with torch.no_grad():
-            for name, w in self._value.items():
-                w.copy_(torch.tensor(initial[name]))
-                self._adam.state.pop(w, None)
-
     def act(self, states: Sequence[State], explore: bool = True) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). Without
         ``explore`` the most probable ones."""
@@ -160,11 +128,10 @@ class Learner:
         actions: NDArray[Any],
         logps: NDArray[np.float64],
         rewards: Sequence[float | None] | NDArray[np.float64],
-        explore: float = 0.0,
     ) -> Batch:
         """The batch for ``update``; arguments as in ``Batch``, a missing reward may be None."""
         found = np.array([np.nan if r is None else r for r in rewards], np.float64)
-        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found, explore)
+        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found)
 
     # --- learning -----------------------------------------------------------------------------------
 
@@ -175,7 +142,7 @@ class Learner:
         usable = (np.abs(batch.rewards) < _MAX_REWARD) & np.isfinite(batch.logps)
         dropped = int((~usable).sum())
         if not usable.any():
-            return Diagnostics(None, dropped, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None, 0, 0)
+            return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped, None)
         rewards = batch.rewards[usable]
         mean = float(rewards.mean())
         rewards = self._rewards.clipped(rewards)
@@ -187,19 +154,18 @@ class Learner:
             self._cameras_seen += len(cameras)
             self._mean_features += (cameras - self._mean_features).sum(axis=0) / self._cameras_seen
         with one_torch_thread():
-            done = self._passes(
+            figures, explained = self._improve(
                 torch.tensor(batch.features[usable]),
                 torch.tensor(batch.actions[usable]),
                 torch.tensor(batch.logps[usable]),
                 torch.tensor(self._rewards.standardized(rewards)),
-                batch.explore,
             )
-        return Diagnostics(mean, dropped, **done)
+        return Diagnostics(**asdict(figures), reward=mean, dropped=dropped, explained=explained)
 
-    def _passes(
-        self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor, explore: float
-    ) -> dict[str, Any]:
-        """Pass over the batch in minibatches until the policy has moved by ``target_kl``."""
+    def _improve(
+        self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor
+    ) -> tuple[UpdateFigures, float | None]:
+        """``clipped_update``, and the share of the rewards' variance that V explained before it."""
         spec = self.spec
         with torch.no_grad():
             baseline = networks.value(torch, spec, self._value, features)
@@ -210,38 +176,14 @@ class Learner:
         explained = 1.0 - (left / spread) ** 2 if spread > _CONSTANT else None
         # Where no action made a difference, only errors of V remain.
         advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
-        steps, skipped = 0, 0
-        seen: list[tuple[float, ...]] = []
-        for _ in range(spec.passes):
-            seen = []
-            order = torch.tensor(self._rng["order"].permutation(len(rewards)))
-            for some in order.split(spec.minibatch):
-                loss, figures = self._loss(
-                    features[some], actions[some], logps[some], advantages[some], rewards[some], explore
-                )
-                self._adam.zero_grad()
-                loss.backward()
-                gradient = torch.nn.utils.clip_grad_norm_(self._parameters, spec.max_gradient)
-                if torch.isfinite(gradient):
-                    self._adam.step()
-                    steps += 1
-                else:
-                    skipped += 1
-                seen.append((*figures, gradient.item()))
-            if np.mean([figures[3] for figures in seen]) > spec.target_kl:
-                break
-        policy, value, entropy, moved, clipped, gradient_norm = np.mean(seen, axis=0).tolist()
-        return {
-            "policy_loss": policy,
-            "value_loss": value,
-            "entropy": entropy,
-            "moved": moved,
-            "clipped": clipped,
-            "gradient": gradient_norm,
-            "explained": explained,
-            "steps": steps,
-            "skipped": skipped,
-        }
+
+        def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            logits = networks.logits(torch, spec, self._actor, features[some])
+            now, entropy = log_probability(spec, logits, features[some], actions[some])
+            return now, entropy, networks.value(torch, spec, self._value, features[some])
+
+        acted = Acted(logps, advantages, rewards)
+        return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"]), explained
 
     @staticmethod
     def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:
@@ -252,33 +194,6 @@ class Learner:
             return raw
         centered = raw - raw.mean()
         return centered / torch.clamp(centered.std(correction=0), min=_MIN_ADVANTAGE_STD)
-
-    def _loss(
-        self,
-        features: torch.Tensor,
-        actions: torch.Tensor,
-        logps: torch.Tensor,
-        advantages: torch.Tensor,
-        rewards: torch.Tensor,
-        explore: float,
-    ) -> tuple[torch.Tensor, tuple[float, ...]]:
-        """The loss, (5.23) or (6.42) negated with V's error and the entropy bonus, and figures to report."""
-        spec = self.spec
-        logits = networks.logits(torch, spec, self._actor, features)
-        logits = d.mix_uniform(torch, spec.action, logits, explore)
-        now, entropy = log_probability(spec, logits, features, actions)
-        log_ratio = torch.clamp(now - logps, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
-        ratio = torch.exp(log_ratio)
-        clipped = torch.clamp(ratio, 1.0 - spec.clip, 1.0 + spec.clip)
-        policy_loss = -torch.minimum(ratio * advantages, clipped * advantages).mean()
-        error = networks.value(torch, spec, self._value, features) - rewards
-        value_loss = (error * error).mean()
-        loss = policy_loss + spec.value * value_loss - spec.entropy * entropy.mean()
-        # This KL estimate is never negative and varies less than -log ratio.
-        moved = (torch.expm1(log_ratio) - log_ratio).mean()
-        outside = ((ratio - 1.0).abs() > spec.clip).double().mean()
-        figures = (policy_loss, value_loss, entropy.mean(), moved, outside)
-        return loss, tuple(figure.item() for figure in figures)
 
     # --- keeping ------------------------------------------------------------------------------------
 

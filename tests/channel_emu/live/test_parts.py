@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import platform
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.live import timer
+from channel_emu.live import priority, timer
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.frame_stream import damage_payload
 from channel_emu.live.histogram import Histogram
@@ -102,11 +103,19 @@ def test_damage_changes_the_payload_and_nothing_else() -> None:
     assert refused.value.reason == "crc_mismatch"
 
 
-def test_priority_says_what_it_reached_and_never_fails() -> None:
-    """In a process of its own, so that the tests keep theirs."""
-    code = "from channel_emu.live.priority import raise_priority; print(raise_priority())"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() in ("realtime", "short-slice", "nice", "normal")
+@pytest.mark.parametrize("short_slice", [True, False])
+def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatch, short_slice: bool) -> None:
+    def forbidden(*_: object) -> None:
+        raise PermissionError
+
+    asked: list[int] = []
+    monkeypatch.setattr(os, "sched_setscheduler", forbidden, raising=False)
+    monkeypatch.setattr(os, "nice", asked.append)
+    monkeypatch.setattr(priority, "_shorten_slice", lambda: short_slice)
+    assert priority.raise_priority() == ("short-slice" if short_slice else "nice")
+    assert len(asked) == 1 and asked[0] < 0
+    monkeypatch.setattr(os, "nice", forbidden)
+    assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
 
 
 _MEMORY_AFTER_A_FLOOD = """

@@ -21,7 +21,7 @@ from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
 from freshfield.geometry import Pose, quaternion_to_matrix, se3_inverse
-from tests.edge_server.surface.shapes import DISTORTED_LENS, LENS, ball_maps
+from tests.edge_server.surface.ball import DISTORTED_LENS, LENS, ball_maps
 
 RNG = np.random.default_rng(5)
 

@@ -11,7 +11,7 @@ import viser
 from edge_server.fields import View
 from edge_server.page.mesh_layer import NODE, MeshLayer
 from tests.edge_server.page.test_page import bare_state, publication
-from tests.edge_server.surface.shapes import LENS, BallRenderer, poses_around
+from tests.edge_server.surface.ball import LENS, BallRenderer, poses_around
 from tests.waiting import wait_until
 
 

@@ -11,7 +11,7 @@ from edge_server.surface import SurfaceError
 from edge_server.surface import mesh as mesh_module
 from edge_server.surface.mesh import Mesh, extract_mesh, remove_degenerate, remove_small_components
 from edge_server.surface.volume import Grid, fuse_maps
-from tests.edge_server.surface.shapes import RADIUS_M, ball_maps
+from tests.edge_server.surface.ball import RADIUS_M, ball_maps
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 

@@ -9,9 +9,10 @@ import torch
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_small_components
-from edge_server.surface.sdf import SdfSettings, fit_sdf, gradient_norm, sample_grid
+from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
+from edge_server.surface.settings import SdfSettings
 from edge_server.surface.volume import Grid
-from tests.edge_server.surface.shapes import RADIUS_M, ball_maps, voxel_points
+from tests.edge_server.surface.ball import RADIUS_M, ball_maps, voxel_points
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 SHORT = SdfSettings(levels=2, steps=60, points=4000)

@@ -95,9 +95,18 @@ def slab(o, d, half, enter, leave):
 
 
 @part
-def interval(space, ox, oy, oz, dx, dy, dz):
-    """Where a ray enters and leaves the scene; leave <= enter if it misses it or is not finite: undistortion
-    may diverge for an impossible lens, and NaN must not become the number of a cell."""
+def origin_of(views, v):
+    """The origin of view v as three float32."""
+    o = views.origin[v]
+    return np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
+
+
+@part
+def interval(space, o, d):
+    """Where the ray from o along d (three float32 each) enters and leaves the scene; leave <= enter if it misses
+    it or is not finite: undistortion may diverge for an impossible lens, and NaN must not become the number of
+    a cell."""
+    (ox, oy, oz), (dx, dy, dz) = o, d
     # Not is_finite(): numba loses the name of an inlined function's own inlined callee.
     if not abs(dx + dy + dz + ox + oy + oz) <= np.float32(3.4e38):
         return np.float32(0.0), np.float32(-1.0)
@@ -120,14 +129,15 @@ def _exit(u, d, blocks):
 
 
 @part
-def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit, most):
-    """Append the ray's samples in occupied cells from distance t on.
+def march(space, o, d, t, leave, x, ts, dts, n, limit, most):
+    """Append the samples of the ray from o along d (three float32 each) in occupied cells from distance t on.
 
     x: float32 (3, N), unit-cube coordinates; ts, dts: float32 (N,), distance and length of each sample in
     scene units. Samples n to at most limit are written; the ray ends where the density known so far makes
     an optical depth of ``most`` (NEVER: it does not). Returns (n, t, depth): t < leave if the ray ended
     early, for lack of room unless depth > most.
     """
+    (ox, oy, oz), (dx, dy, dz) = o, d
     depth = np.float32(0.0)
     one, half = np.float32(1.0), np.float32(0.5)
     cells, blocks = space.cells, space.cells // COARSE

@@ -50,7 +50,7 @@ def render_tiles(
     travel = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)
     active = np.empty(TILE, np.int64)
-    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    o = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     while True:
         base = fetch_add(counter, 1) * TILE
         if base >= pixels.shape[0]:
@@ -58,9 +58,9 @@ def render_tiles(
         rays = min(TILE, pixels.shape[0] - base)
         count = 0
         for r in range(rays):
-            dx, dy, dz = pixel_direction(lens, rotation, pixels[base + r, 0], pixels[base + r, 1])
-            enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
-            travel[r, 0], travel[r, 1], travel[r, 2] = dx, dy, dz
+            d = pixel_direction(lens, rotation, pixels[base + r, 0], pixels[base + r, 1])
+            enter, leave = interval(space, o, d)
+            travel[r, 0], travel[r, 1], travel[r, 2] = d
             travel[r, 3], travel[r, 4], travel[r, 5] = enter + np.float32(0.5) * space.step, leave, _F0
             color[base + r] = _F0
             depth[base + r] = opacity[base + r] = _F0
@@ -72,23 +72,8 @@ def render_tiles(
             first[0] = 0
             for k in range(count):
                 r = active[k]
-                n, t, _ = march(
-                    space,
-                    ox,
-                    oy,
-                    oz,
-                    travel[r, 0],
-                    travel[r, 1],
-                    travel[r, 2],
-                    travel[r, 3],
-                    travel[r, 4],
-                    x[worker],
-                    ts,
-                    dts,
-                    n,
-                    n + ROUND,
-                    NEVER,
-                )
+                d, t, leave = (travel[r, 0], travel[r, 1], travel[r, 2]), travel[r, 3], travel[r, 4]
+                n, t, _ = march(space, o, d, t, leave, x[worker], ts, dts, n, n + ROUND, NEVER)
                 travel[r, 3] = t
                 first[k + 1] = n
             query_density(encoding, levels, net, x[worker], start, n, acts[worker])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.radiance_model import query_backward, query_color, query_density
-from edge_server.fields.common.kernels.rays import interval, march, pixel_direction
+from edge_server.fields.common.kernels.rays import interval, march, origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
 from edge_server.fields.common.kernels.volume_rendering import (
     OPAQUE_DEPTH,
@@ -172,10 +172,7 @@ def begin_rays(views, recipe, space, chunk, first, end, ray, travel):
     for r in range(first, end):
         index = chunk * CHUNK_RAYS + r
         view = draw_ray(views, recipe, index, ray[r])
-        o = views.origin[view]
-        enter, leave = interval(
-            space, np.float32(o[0]), np.float32(o[1]), np.float32(o[2]), ray[r, 0], ray[r, 1], ray[r, 2]
-        )
+        enter, leave = interval(space, origin_of(views, view), (ray[r, 0], ray[r, 1], ray[r, 2]))
         enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
         travel[r, _AT], travel[r, _LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
@@ -209,24 +206,9 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, t
                 fresh += 1
                 under_way += 1
             r = active[marched]
-            o = views.origin[np.int64(ray[r, 9])]
-            end, travel[r, _AT], _ = march(
-                space,
-                np.float32(o[0]),
-                np.float32(o[1]),
-                np.float32(o[2]),
-                ray[r, 0],
-                ray[r, 1],
-                ray[r, 2],
-                travel[r, _AT],
-                travel[r, _LEAVE],
-                x,
-                ts,
-                dts,
-                end,
-                room,
-                np.float32(ASKED),
-            )
+            o, d = origin_of(views, np.int64(ray[r, 9])), (ray[r, 0], ray[r, 1], ray[r, 2])
+            at, leave = travel[r, _AT], travel[r, _LEAVE]
+            end, travel[r, _AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED))
             stops[marched] = end
             marched += 1
         query_density(encoding, recipe.levels, net, x, n, end, acts)

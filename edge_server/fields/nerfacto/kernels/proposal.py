@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
-from edge_server.fields.common.kernels.rays import slab
+from edge_server.fields.common.kernels.rays import interval, slab
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 
@@ -92,7 +92,7 @@ def _cell(cells, ux, uy, uz):
 
 
 @part
-def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
+def warp(contracted, o, d, enter, leave):
     """Spacing of bins: linear in distance up to the end of the box of interest, then linear in disparity.
 
     Returns (knee, slope, end). Warped distance u is t up to the knee, then knee + (1 - 1 / (1 + (t - knee)
@@ -100,6 +100,7 @@ def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
     """
     if not contracted:
         return leave, _F1, leave
+    (ox, oy, oz), (dx, dy, dz) = o, d
     near, far = slab(ox, dx, _F1, enter, leave)
     near, far = slab(oy, dy, _F1, near, far)
     near, far = slab(oz, dz, _F1, near, far)
@@ -116,14 +117,15 @@ def unwarp(u, knee, slope):
 
 
 @part
-def make_bins(space, encoding, bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell, depth, edges, at):
+def make_bins(space, encoding, bins, o, d, enter, leave, shift, first, cell, depth, edges, at):
     """Divide a ray into bins and keep those in occupied cells, up to optical depth CUTOFF_DEPTH.
 
     shift: in [0, 1), moves the raster of bins. Written from ``first`` on: cell, int32 (N,), proposal cell of
     each kept bin; depth, float32 (N,), its optical depth. edges: float32 (2, bins + 1), receives start and
     end of the k-th kept bin. at: int32 (2, bins), scratch. Returns (bins kept, whether densities are finite).
     """
-    knee, slope, end = warp(space.contracted, ox, oy, oz, dx, dy, dz, enter, leave)
+    (ox, oy, oz), (dx, dy, dz) = o, d
+    knee, slope, end = warp(space.contracted, o, d, enter, leave)
     step = (end - enter) / np.float32(bins - 1)
     raw_of = proposal_cells_of(encoding)
     # Separate loops, so that LLVM vectorizes all but the one that reads the grids.
@@ -217,13 +219,14 @@ def _dilated(weight, k, first, end):
 
 
 @part
-def place_samples(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line):
+def place_samples(contracted, o, d, edges, group, first, count, share, shift, n, x, line):
     """Append a ray's samples, of equal length within a group, from column n on.
 
     shift: in [0, 1), position of a sample within its part. x: float32 (3, N), points in the unit cube. line:
-    float32 (>= 3, N), distance, length and group. Returns the new number of samples, at most ``limit``.
+    float32 (>= 3, N), distance, length and group. Returns the new number of samples, at most N.
     """
-    k = np.int64(0)
+    (ox, oy, oz), (dx, dy, dz) = o, d
+    k, limit = np.int64(0), x.shape[1]
     while k < count:
         g, a, length = group[first + k], k, _F0
         while k < count and group[first + k] == g:
@@ -246,6 +249,27 @@ def place_samples(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count
             line[0, n], line[1, n], line[2, n] = t, length, np.float32(g)
             n += 1
     return n
+
+
+@part
+def sample_ray(space, encoding, sampling, o, d, shift, within, bins, first, scratch, n, x, line):
+    """Bins of the ray from o along d (three float32 each), from ``first`` on, and its samples from column n on.
+
+    shift: of the raster of bins; within: of samples within their part; both in [0, 1).
+    bins: (cell, depth, weight, group), see ``make_bins``, ``bin_weights`` and ``allocate_samples``.
+    scratch: (edges, at, share), likewise. x, line: see ``place_samples``.
+    Returns (bins kept, whether the proposal is finite, the new number of samples).
+    """
+    cell, depth, weight, group = bins
+    edges, at, share = scratch
+    enter, leave = interval(space, o, d)
+    if not leave > enter:
+        return np.int64(0), True, n
+    count, finite = make_bins(space, encoding, sampling.bins, o, d, enter, leave, shift, first, cell, depth, edges, at)
+    bin_weights(depth, first, count, weight)
+    allocate_samples(weight, first, count, sampling.samples, sampling.uniform_share, within, group, share)
+    n = place_samples(space.contracted, o, d, edges, group, first, count, share, within, n, x, line)
+    return count, finite, n
 
 
 @part

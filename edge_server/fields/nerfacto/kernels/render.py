@@ -6,10 +6,10 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.radiance_model import query_color, query_density
-from edge_server.fields.common.kernels.rays import interval, pixel_direction
+from edge_server.fields.common.kernels.rays import pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
-from edge_server.fields.nerfacto.kernels.proposal import allocate_samples, bin_weights, make_bins, place_samples
+from edge_server.fields.nerfacto.kernels.proposal import sample_ray
 
 TILE = 256  # rays a task
 SAMPLE_BATCH = 2048  # samples that the network evaluates at a time
@@ -47,13 +47,12 @@ def render_with_proposal(
     out = acts[worker, acts.shape[1] - net.widths[-1] :]
     ts, dts = line[worker, 0], line[worker, 1]
     edges, share = np.empty((2, sampling.bins + 1), np.float32), np.empty(sampling.bins, np.int64)
-    at = np.empty((2, sampling.bins), np.int32)
-    cell, tau = np.empty(sampling.bins, np.int32), np.empty(sampling.bins, np.float32)
-    group = np.empty(sampling.bins, np.int32)
-    weight, way = np.empty(sampling.bins, np.float32), np.empty((TILE, 3), np.float32)
-    first = np.empty(TILE + 1, np.int64)
-    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
-    zero, room = np.int64(0), np.int64(SAMPLE_BATCH)
+    scratch = edges, np.empty((2, sampling.bins), np.int32), share
+    cell, group = np.empty(sampling.bins, np.int32), np.empty(sampling.bins, np.int32)
+    bins = cell, np.empty(sampling.bins, np.float32), np.empty(sampling.bins, np.float32), group
+    way, first = np.empty((TILE, 3), np.float32), np.empty(TILE + 1, np.int64)
+    o = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    zero = np.int64(0)
     while True:
         base = fetch_add(counter, 1) * TILE
         if base >= pixels.shape[0]:
@@ -64,50 +63,11 @@ def render_with_proposal(
             first[0] = 0
             while done + here < rays and (n + 2 * sampling.samples + 1 <= SAMPLE_BATCH or here == 0):
                 pixel = base + done + here
-                dx, dy, dz = pixel_direction(lens, rotation, pixels[pixel, 0], pixels[pixel, 1])
-                way[here, 0], way[here, 1], way[here, 2] = dx, dy, dz
-                enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
-                if leave > enter:
-                    count, _ = make_bins(
-                        space,
-                        encoding,
-                        sampling.bins,
-                        ox,
-                        oy,
-                        oz,
-                        dx,
-                        dy,
-                        dz,
-                        enter,
-                        leave,
-                        _HALF,
-                        zero,
-                        cell,
-                        tau,
-                        edges,
-                        at,
-                    )
-                    bin_weights(tau, zero, count, weight)
-                    allocate_samples(weight, zero, count, sampling.samples, sampling.uniform_share, _HALF, group, share)
-                    n = place_samples(
-                        space.contracted,
-                        ox,
-                        oy,
-                        oz,
-                        dx,
-                        dy,
-                        dz,
-                        edges,
-                        group,
-                        zero,
-                        count,
-                        share,
-                        _HALF,
-                        n,
-                        room,
-                        x[worker],
-                        line[worker],
-                    )
+                d = pixel_direction(lens, rotation, pixels[pixel, 0], pixels[pixel, 1])
+                way[here, 0], way[here, 1], way[here, 2] = d
+                _, _, n = sample_ray(
+                    space, encoding, sampling, o, d, _HALF, _HALF, bins, zero, scratch, n, x[worker], line[worker]
+                )
                 here += 1
                 first[here] = n
             query_density(encoding, levels, net, x[worker], zero, n, acts[worker])

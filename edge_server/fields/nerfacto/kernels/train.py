@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.radiance_model import query_backward, query_color, query_density
-from edge_server.fields.common.kernels.rays import interval
+from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, add_exposure_sums, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import (
@@ -20,15 +20,9 @@ from edge_server.fields.common.kernels.volume_rendering import (
     ray_loss,
     samples_until_opaque,
 )
-from edge_server.fields.nerfacto.kernels.proposal import (
-    allocate_samples,
-    bin_weights,
-    interlevel_loss,
-    make_bins,
-    place_samples,
-)
+from edge_server.fields.nerfacto.kernels.proposal import interlevel_loss, sample_ray
 
-_F0, _HALF = np.float32(0.0), np.float32(0.5)
+_F0 = np.float32(0.0)
 
 
 class ProposalGradients(NamedTuple):
@@ -95,26 +89,8 @@ def compact_columns(rows, a, b, to):
 
 
 @part
-def sample_chunk(
-    views,
-    recipe,
-    sampling,
-    space,
-    encoding,
-    net,
-    chunk,
-    x,
-    acts,
-    ray_first,
-    ray,
-    line,
-    cell,
-    depth,
-    weight,
-    group,
-    bin_first,
-):
-    """Fill a chunk with rays, their bins, their samples and the result of ``query_density``.
+def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, bins, bin_first):
+    """Fill a chunk with rays, their bins (see ``sample_ray``), their samples and the result of ``query_density``.
 
     Hidden samples are removed, and further rays fill their place. Returns (rays, samples, rays whose
     proposal is not finite).
@@ -122,65 +98,23 @@ def sample_chunk(
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
     edges, share = np.empty((2, sampling.bins + 1), np.float32), np.empty(sampling.bins, np.int64)
-    at = np.empty((2, sampling.bins), np.int32)
-    n, rays, room, none = np.int64(0), np.int64(0), np.int64(CHUNK), np.int64(0)
+    scratch = edges, np.empty((2, sampling.bins), np.int32), share
+    n, rays = np.int64(0), np.int64(0)
     broken = 0
     ray_first[0] = bin_first[0] = 0
     while rays < limit and CHUNK - n > CHUNK // 8:
         end, drawn = n, rays
         while drawn < limit and end + 2 * sampling.samples + 1 <= CHUNK:
             index = chunk * CHUNK_RAYS + drawn
-            view = draw_ray(views, recipe, index, ray[drawn])
-            ray[drawn, 9] = np.float32(view)
-            o = views.origin[view]
-            ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
-            dx, dy, dz = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
-            enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
-            count, first = none, bin_first[drawn]
-            if leave > enter:
-                shift = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
-                within = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
-                count, finite = make_bins(
-                    space,
-                    encoding,
-                    sampling.bins,
-                    ox,
-                    oy,
-                    oz,
-                    dx,
-                    dy,
-                    dz,
-                    enter,
-                    leave,
-                    shift,
-                    first,
-                    cell,
-                    depth,
-                    edges,
-                    at,
-                )
-                broken += 0 if finite else 1
-                bin_weights(depth, first, count, weight)
-                allocate_samples(weight, first, count, sampling.samples, sampling.uniform_share, within, group, share)
-                end = place_samples(
-                    space.contracted,
-                    ox,
-                    oy,
-                    oz,
-                    dx,
-                    dy,
-                    dz,
-                    edges,
-                    group,
-                    first,
-                    count,
-                    share,
-                    within,
-                    end,
-                    room,
-                    x,
-                    line,
-                )
+            o = origin_of(views, draw_ray(views, recipe, index, ray[drawn]))
+            d = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
+            shift = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
+            within = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
+            first = bin_first[drawn]
+            count, finite, end = sample_ray(
+                space, encoding, sampling, o, d, shift, within, bins, first, scratch, end, x, line
+            )
+            broken += 0 if finite else 1
             drawn += 1
             ray_first[drawn], bin_first[drawn] = end, first + count
         if drawn == rays:
@@ -204,28 +138,15 @@ def sample_chunk(
 
 @kernel
 def train_with_proposal(
-    counter,
-    worker,
-    views,
-    recipe,
-    sampling,
-    space,
-    encoding,
-    net,
-    embeddings,
-    weights,
-    batch,
-    bins,
-    scratch,
-    proposal_scratch,
+    counter, worker, views, recipe, sampling, space, encoding, net, embeddings, weights, batch, bins, scratch, extra
 ):
     """Forward and backward of a step; a task is a chunk. Scatter kernels then add up the gradients of the
-    encoding and of the proposal. embeddings: float32 (V, A), one a view; A = 0: none."""
+    encoding and of the proposal. embeddings: float32 (V, A), one a view; A = 0: none. extra: proposal's scratch."""
     acts, d_acts = scratch.acts[worker], scratch.d_acts[worker]
-    line, depth = proposal_scratch.line[worker], proposal_scratch.depth[worker]
-    weight, group = proposal_scratch.weight[worker], proposal_scratch.group[worker]
+    line, depth = extra.line[worker], extra.depth[worker]
+    weight, group = extra.weight[worker], extra.group[worker]
     ts, dts, group_of, w = line[0], line[1], line[2], line[3]
-    bin_first = proposal_scratch.first[worker]
+    bin_first = extra.first[worker]
     ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
     outputs, row = net.widths[-1], 1 + 3 * recipe.harmonics
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
@@ -236,24 +157,9 @@ def train_with_proposal(
             return
         x, cell, grad = batch.x[chunk], bins.cell[chunk], bins.grad[chunk]
         bins.d_embeddings[chunk] = _F0
+        bins_of = cell, depth, weight, group
         rays, n, broken = sample_chunk(
-            views,
-            recipe,
-            sampling,
-            space,
-            encoding,
-            net,
-            chunk,
-            x,
-            acts,
-            ray_first,
-            ray,
-            line,
-            cell,
-            depth,
-            weight,
-            group,
-            bin_first,
+            views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, bins_of, bin_first
         )
         query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
         for r in range(rays):

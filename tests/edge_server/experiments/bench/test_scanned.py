@@ -15,7 +15,7 @@ from edge_server.experiments.bench import scanned
 from edge_server.experiments.scenes.tile_scan import Scan, exact_depth, surface_truth
 from edge_server.fields import View
 from edge_server.surface.depth import depth_map
-from edge_server.surface.reconstruct import MeshSettings
+from edge_server.surface.settings import MeshSettings
 from freshfield.scenario import load
 
 

@@ -5,14 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget
 from edge_server.fields.nerfacto.field import NerfactoField
-from tests.edge_server.fields.common.test_camera_refinement import _displaced
 from tests.edge_server.fields.nerfacto.small import SMALL
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN, score
+
+
+def test_samples_are_uniform_at_first_and_then_follow_the_proposal() -> None:
+    field = NerfactoField(replace(SMALL, even=0.4, anneal=40))
+    for step, share in ((0, 1.0), (10, 0.85), (40, 0.4), (400, 0.4)):
+        field.step = step
+        assert field._sampling().uniform_share == pytest.approx(share)
+    assert NerfactoField(replace(SMALL, interlevel=0.0))._sampling().uniform_share == 1.0
 
 
 def test_the_proposal_learns_where_surfaces_are() -> None:
@@ -59,13 +67,3 @@ def test_appearance_costs_nothing_where_it_is_not_asked_for() -> None:
         and field._proposal_gradients.d_embeddings.size == 0
         and field._net.widths[-1] == 4
     )
-
-
-def test_wrong_poses_are_refined() -> None:
-    """The shared trainer's refinement, through this field's own rendering."""
-    views, scores = _displaced(SEEN, 0.02, 1.5), {}
-    for on in (False, True):
-        field = NerfactoField(replace(SMALL, refine_m=0.1 * on, refine_deg=4.0 * on))
-        field.fit(views, Budget(steps=600))
-        scores[on] = score(field)
-    assert scores[True] > scores[False] + 0.5

@@ -56,7 +56,7 @@ def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: fl
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
     count, finite = make_bins(
-        space, encoding, bins, *START_AT, *TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
+        space, encoding, bins, START_AT, TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
     )
     return cell[5 : 5 + count], depth[5 : 5 + count], edges[:, :count].copy(), finite
 
@@ -93,7 +93,7 @@ def test_spacing_is_linear_in_the_box_and_even_in_contracted_space_beyond() -> N
     np.testing.assert_allclose(length[:knee], length[0], rtol=1e-3)
     along = (_unit(points, True) * 4)[:, 0]
     np.testing.assert_allclose(np.diff(along)[knee + 1 :], np.diff(along)[knee + 1], rtol=0.02)
-    knee_t, slope, end = warp(True, *START_AT, *TOWARDS, F(0.1), F(19.0))
+    knee_t, slope, end = warp(True, START_AT, TOWARDS, F(0.1), F(19.0))
     assert unwarp(end, knee_t, slope) == pytest.approx(19.0, rel=1e-3)
 
 
@@ -172,9 +172,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     np.testing.assert_allclose(weight, np.exp(-total[:-1]) - np.exp(-total[1:]), atol=1e-6)
     group, share = _allocated(weight, 16, 0.2, shift)
     x, line = np.empty((3, 99), F), np.empty((3, 99), F)
-    n = place_samples(
-        True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), np.int64(99), x, line
-    )
+    n = place_samples(True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), x, line)
     t, length, of = line[:, 2:n]
     assert n - 2 == share.sum() and (np.diff(t) > 0).all()
     assert length.sum() == pytest.approx((edges[1] - edges[0]).sum(), rel=1e-5)
@@ -185,7 +183,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     points = t[:, None] * np.array(TOWARDS) + np.array(START_AT)
     np.testing.assert_allclose(x[:, 2:n].T, _unit(points, True), atol=1e-5)
     limited = place_samples(
-        True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), ZERO, np.int64(3), x, line
+        True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), ZERO, x[:, :3].copy(), line
     )
     assert limited == 3
 
@@ -333,7 +331,7 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
     recipe = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
     weights = Weights(F(0.0))
-    space = OccupancyGrid.for_box(settings.cells, 0, field.view_store.box).space(0.1)
+    space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:

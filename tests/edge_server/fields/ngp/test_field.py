@@ -5,11 +5,34 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.ngp.field import NgpField
 from tests.edge_server.fields.ngp.small import SMALL
-from tests.edge_server.fields.small import SEEN, same_state, score
+from tests.edge_server.fields.small import SEEN, same_state, score, small
+
+
+@pytest.mark.parametrize("name", ["ngp", "nerfacto"])
+def test_the_smoothing_applied_is_the_same_whatever_the_number_of_rays(name: str) -> None:
+    """Adam multiplies gradients by a factor that falls with the rays of a step; smoothing must not fall."""
+    field, applied = small(name, base_resolution=8, smooth=0.5), []
+    field._encoding.table[:] = np.random.default_rng(0).normal(size=field._encoding.table.shape)
+    for scale in (0.5, 4.0):
+        field._table_g[:], field._dirty[:] = 0.0, True  # and no sample has a gradient
+        field._gather(1, scale)
+        applied.append(scale * field._table_g[: field._encoding.first[1]])
+    np.testing.assert_allclose(applied[0], applied[1], rtol=1e-5, atol=1e-5)
+    side = int(field._encoding.resolution[0]) + 1
+    cube = field._encoding.table[: side**3].reshape(side, side, side, 2).astype(np.float64)
+    at = cube[3, 3, 3]
+    around = [
+        cube[3 + a, 3 + b, 3 + c] for a, b, c in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+    ]
+    # Every fourth step, four times the weight.
+    np.testing.assert_allclose(
+        applied[0][3 * (side * side + side + 1)], 4 * 0.5 * (6 * at - around.sum(axis=0)), rtol=1e-4
+    )
 
 
 def test_a_smoothed_field_repeats_itself_and_is_smoother() -> None:
@@ -20,8 +43,8 @@ def test_a_smoothed_field_repeats_itself_and_is_smoother() -> None:
     same_state(fields[0], fields[1])
 
     def rough(field: NgpField) -> float:
-        side = int(field._grid.resolution[0]) + 1
-        cube = field._grid.table[: side**3].reshape(side, side, side, 2)
+        side = int(field._encoding.resolution[0]) + 1
+        cube = field._encoding.table[: side**3].reshape(side, side, side, 2)
         return float(np.mean([np.square(np.diff(cube, axis=axis)).mean() for axis in range(3)]))
 
     assert rough(fields[0]) < 0.7 * rough(fields[2])

@@ -14,8 +14,9 @@ from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
+from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
 from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.ppo import Learner, _RunningMeanStd
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, collect, regret, state, teach
 
 
@@ -311,6 +312,37 @@ def test_a_pass_ends_when_the_policy_has_moved_far_enough():
     batch = collect(free, problem, range(64))
     assert free.update(batch).steps == 10
     assert held.update(batch).steps < 10
+
+
+def test_running_statistics_of_rewards_are_those_of_all_of_them():
+    """Batches of different means: a shift between them is part of the variance."""
+    batches = [np.array([1.0, 2.0, 3.0]), np.array([11.0, 15.0]), np.array([-40.0, -38.0, -36.0, -30.0])]
+    running = _RunningMeanStd()
+    for n, values in enumerate(batches):
+        running.add(values)
+        whole = np.concatenate(batches[: n + 1])
+        assert (running.count, running.mean) == (len(whole), pytest.approx(whole.mean(), rel=1e-12))
+        assert running.variance == pytest.approx(whole.var(), rel=1e-12)
+    standardized = running.standardized(np.concatenate(batches))
+    assert standardized.std() == pytest.approx(1.0) and standardized.mean() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
+    """Two actions, twice as probable as when they were taken: the gain is clipped at 1 + clip, the loss is not."""
+    now = torch.log(torch.tensor([0.8, 0.8], dtype=torch.float64)).requires_grad_()
+    zeros = torch.zeros(2, dtype=torch.float64)
+    acted = Acted(
+        torch.log(torch.tensor([0.4, 0.4], dtype=torch.float64)),
+        torch.tensor([1.0, -1.0], dtype=torch.float64),
+        torch.tensor([3.0, -1.0], dtype=torch.float64),
+    )
+    spec = select(passes=1, clip=0.2, value=0.5, entropy=0.0)
+    adam = torch.optim.Adam([now], lr=1e-9)
+    rng = np.random.default_rng(0)
+    found = clipped_update(spec, lambda some: (now[some], zeros[some], zeros[some]), acted, [now], adam, rng)
+    assert found.policy_loss == pytest.approx(-(1.2 - 2.0) / 2) and found.value_loss == pytest.approx((9 + 1) / 2)
+    assert found.moved == pytest.approx(2.0 - 1.0 - np.log(2.0)) and found.clipped == 1.0
+    assert (found.steps, found.skipped) == (1, 0)
 
 
 def test_deciding_with_exploring_uses_the_learners_own_stream():

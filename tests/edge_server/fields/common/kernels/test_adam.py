@@ -18,7 +18,7 @@ def _state(rng):
 
 
 def _rule(step: int, rate: float = 0.01) -> Rule:
-    values = (rate, 0.9, 0.99, 1e-3, 2.0, 0.0, 1 / (1 - 0.9**step), 1 / (1 - 0.99**step))
+    values = (rate, 0.9, 0.99, 1e-3, 2.0, 1 / (1 - 0.9**step), 1 / (1 - 0.99**step))
     return Rule(*(np.float32(v) for v in values))
 
 

@@ -67,27 +67,6 @@ def test_table_gradient_equals_the_oracle() -> None:
     assert (dirty >= touched).all() and not dirty.all()
 
 
-def test_table_gradient_equals_finite_differences() -> None:
-    """In float64, by the oracle: that its own gradient is the derivative of its own output."""
-    grid, x, rng = _case(20)
-    oracle = torch_model.to_torch(grid, dtype=torch.float64)
-    points = torch.as_tensor(x[0].T, dtype=torch.float64)
-    wanted = torch.as_tensor(rng.normal(size=(20, 10)))
-    table = oracle.table.clone().requires_grad_(True)
-
-    def loss(t: torch.Tensor) -> torch.Tensor:
-        moved = torch_model.TorchGrid(oracle.resolution, oracle.first, oracle.dense, t)
-        return (torch_model.encode(moved, 5, points) * wanted).sum()
-
-    loss(table).backward()
-    assert table.grad is not None
-    for row in torch.nonzero(table.grad[:, 0])[::37, 0].tolist():
-        step = torch.zeros_like(table)
-        step[row, 0] = 1e-4
-        slope = (loss(table + step) - loss(table - step)).item() / 2e-4
-        assert slope == pytest.approx(table.grad[row, 0].item(), rel=1e-5, abs=1e-8)
-
-
 def _variation(grid: Grid, levels: int, table: Tensor) -> Tensor:
     """Half the squared differences between neighboring vertices of the levels that are stored densely."""
     total = table.sum() * 0.0

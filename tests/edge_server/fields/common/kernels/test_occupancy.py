@@ -107,7 +107,7 @@ def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phas
         phase,
         phases,
         np.float32(fade),
-        field._grid,
+        field._encoding,
         SETTINGS.levels,
         field._net,
         CELLS,
@@ -127,7 +127,7 @@ def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phas
     np.testing.assert_array_equal(cell @ [1, CELLS, CELLS**2], looked)
     apart = places * CELLS - cell
     assert apart.min() < 0.1 and apart.max() > 0.9 and abs(apart.mean() - 0.5) < 0.1
-    grid = to_torch(field._grid, dtype=torch.float64)
+    grid = to_torch(field._encoding, dtype=torch.float64)
     params = torch.as_tensor(field._net.params, dtype=torch.float64)
     raw = mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, torch.as_tensor(places)))
     sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp().numpy() * _centres(CELLS, contracted)[1][looked]
@@ -145,7 +145,7 @@ def test_a_density_that_is_not_finite_is_looked_at_again(field: NgpField) -> Non
         0,
         1,
         np.float32(0.5),
-        field._grid,
+        field._encoding,
         SETTINGS.levels,
         poisoned,
         CELLS,

@@ -12,7 +12,7 @@ from edge_server.fields.common.supervision import lens_row
 from freshfield.geometry import Pinhole, look_at
 
 _direction = njit(lambda lens, rotation, u, v: pixel_direction(lens, rotation, u, v))
-_interval = njit(lambda space, o, d: interval(space, o[0], o[1], o[2], d[0], d[1], d[2]))
+_interval = njit(lambda space, o, d: interval(space, (o[0], o[1], o[2]), (d[0], d[1], d[2])))
 
 CELLS = 16
 
@@ -25,11 +25,15 @@ def _space(contracted: bool, filled: float, near: float = 0.1) -> Space:
     return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(near))
 
 
+def _single(values) -> tuple[np.float32, ...]:
+    return tuple(map(np.float32, values))
+
+
 def _march(space: Space, o, d, jitter: float = 0.0):
     x, ts, dts = np.zeros((3, 500), np.float32), np.zeros(500, np.float32), np.zeros(500, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
     enter, leave = np.float32(enter + np.float32(jitter) * space.step), np.float32(leave)
-    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
     n, t, _ = march(space, *way, x, ts, dts, 0, 500, NEVER)
     return x[:, :n], ts[:n], dts[:n], (t, leave)
 
@@ -103,7 +107,7 @@ def test_empty_space_is_skipped_and_room_is_respected() -> None:
     whole = _march(space, o, d)[1]
     x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
     n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
     assert n == 9 and t < leave and (x[:, :4] == 0).all()
     np.testing.assert_array_equal(ts[4:], whole[:5])
@@ -120,7 +124,7 @@ def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:
     whole = _march(space, o, d)[1]
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
     x, ts, dts = np.zeros((3, 99), np.float32), np.zeros(99, np.float32), np.zeros(99, np.float32)
-    way = [np.float32(v) for v in (*o, *d, enter, leave)]
+    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
     n, t, depth = march(space, *way, x, ts, dts, 0, 99, np.float32(1.0))
     assert n == int(np.ceil(1.0 / (1.5 * space.step))) and depth > 1.0 and t < leave
     np.testing.assert_array_equal(ts[:n], whole[:n])

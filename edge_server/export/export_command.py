@@ -171,7 +171,7 @@ class Export:
             import_marching_cubes()
 
     def _settings(self):
-        from edge_server.surface.reconstruct import MeshSettings
+        from edge_server.surface.settings import MeshSettings
 
         a = self.args
         if a.voxel is not None and not a.voxel > 0:

@@ -1,8 +1,8 @@
 """The page's protection against the network: TLS and login, checks of Host and Origin, of what visitors send,
 of their number, and of how long one may go without reading.
 
-viser listens with the websockets package and has no parameter for any of this: while it starts, its call of
-``websockets.asyncio.server.serve`` is given the hooks of a ``Door``.
+viser listens with the websockets package and has no parameter for any of this. While it starts, viser's module
+(and no other) finds a ``websockets`` whose ``serve`` has the hooks of an ``AccessGuard``.
 """
 
 from __future__ import annotations
@@ -15,12 +15,15 @@ import logging
 import math
 import secrets
 import ssl
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import websockets.asyncio.server
+from viser.infra import WebsockServer
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
@@ -42,8 +45,8 @@ Vector = tuple[float, float, float]
 Process = Callable[[ServerConnection, Request], Response | None]
 
 
-class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """viser's message about a visitor's camera."""
+class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage"):
+    """viser's message about a visitor's camera. Fields that a later viser adds are for viser to judge."""
 
     wxyz: tuple[float, float, float, float]
     position: Vector
@@ -67,7 +70,7 @@ class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields
         )
 
 
-class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=True):
+class Click(msgspec.Struct, tag="SceneNodeClickMessage"):
     """viser's message about a click on a scene node."""
 
     name: str
@@ -79,7 +82,7 @@ class Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=T
     owner: str = ""
 
 
-class Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
+class Update(msgspec.Struct, tag="GuiUpdateMessage"):
     """viser's message about new values of a control."""
 
     uuid: str
@@ -101,7 +104,7 @@ class Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True)
 _DECODER = msgspec.msgpack.Decoder(Viewpoint | Click | Update)
 
 
-class Door:
+class AccessGuard:
     """Guards the page's connections.
 
     access: checks the login and the origin of requests.
@@ -125,10 +128,10 @@ class Door:
 
     @contextlib.contextmanager
     def before_viser(self) -> Iterator[None]:
-        """Within the context, whatever viser serves goes through this door."""
-        serve = websockets.asyncio.server.serve
+        """Within the context, what viser begins to serve is guarded; other servers of the process are not."""
+        viser_module = sys.modules[WebsockServer.__module__]
 
-        def through_the_door(handler: Any, host: Any, port: Any, **options: Any) -> Any:
+        def guarded(handler: Any, host: Any, port: Any, **options: Any) -> Any:
             self.used = True
             process = options.pop("process_request")
             # A logger of its own, which passes on only what ``_worth_a_line`` lets through.
@@ -146,13 +149,17 @@ class Door:
             }
             if self._tls is not None:
                 options["ssl_handshake_timeout"] = TLS_HANDSHAKE_TIMEOUT_S
-            return serve(handler, host, port, **options)
+            return websockets.asyncio.server.serve(handler, host, port, **options)
 
-        websockets.asyncio.server.serve = through_the_door  # type: ignore[assignment, misc]
+        server = SimpleNamespace(**vars(websockets.asyncio.server) | {"serve": guarded})
+        asyncio_package = SimpleNamespace(**vars(websockets.asyncio) | {"server": server})
+        package = SimpleNamespace(**vars(websockets) | {"asyncio": asyncio_package})
+        original = vars(viser_module).get("websockets")
+        setattr(viser_module, "websockets", package)  # noqa: B010 -- no attribute that a type checker knows
         try:
             yield
         finally:
-            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+            setattr(viser_module, "websockets", original)  # noqa: B010
 
     def _accepted(self, *words: Any, **more: Any) -> VisitorConnection:
         """Called in the task that accepts a connection, which over TLS lasts until the end of the handshake.
@@ -258,21 +265,21 @@ class Door:
 
 
 class VisitorConnection(ServerConnection):
-    """A connection through a door."""
+    """A connection that a guard watches."""
 
-    def __init__(self, door: Door, *words: Any, **more: Any) -> None:
+    def __init__(self, guard: AccessGuard, *words: Any, **more: Any) -> None:
         super().__init__(*words, **more)
         self.caller = ANYBODY
-        self._door = door
+        self._guard = guard
         self._clicks = 0.0  # how many may come at once
         self._clicked_s = -math.inf
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        self._door.opened(self)
+        self._guard.opened(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._door.closed(self)
+        self._guard.closed(self)
         super().connection_lost(exc)
 
     def in_time(self) -> bool:
@@ -286,7 +293,7 @@ class VisitorConnection(ServerConnection):
         return True
 
     async def recv(self, decode: bool | None = None) -> Any:
-        while not self._door.takes(self, data := await super().recv(decode)):
+        while not self._guard.takes(self, data := await super().recv(decode)):
             pass
         return data
 

@@ -10,14 +10,16 @@ import pytest
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map, render_depth_maps
 from edge_server.surface.mesh import extract_mesh, remove_small_components
-from edge_server.surface.reconstruct import MeshSettings, mesh_from_depth_maps
+from edge_server.surface.reconstruct import mesh_from_depth_maps
 from edge_server.surface.refine_depth import REACH, refine_depth
+from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
-from tests.edge_server.surface.shapes import LENS, RADIUS_M, BallRenderer, ball_depth, ball_maps, poses_around
+from tests.edge_server.surface.ball import LENS, RADIUS_M, BallRenderer, ball_depth, ball_maps, poses_around
 
 skimage = pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
+pytestmark = pytest.mark.stability
 RNG = np.random.default_rng(11)
 GRAY = np.full((64, 64, 3), 90, np.uint8)
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 import websocket
@@ -20,8 +21,9 @@ from edge_server.live.keys import make_keys
 from edge_server.live.output import guarded_http
 from edge_server.live.output.prometheus import serve_metrics
 from edge_server.live.state import EdgeState
-from edge_server.page import Page, door, start_page
-from edge_server.page.door import Door
+from edge_server.page import Page, access_guard, start_page
+from edge_server.page.access_guard import AccessGuard
+from freshfield.access import HttpDoor
 from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.test_page import bare_state
@@ -71,9 +73,9 @@ def press(visitor: Visitor, page: Page, button: str) -> None:
     visitor.send("GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": button})
 
 
-def door_of(page: Page) -> Door:
+def guard_of(page: Page) -> AccessGuard:
     """Of a page with a visitor."""
-    return next(iter(page._server._websock_server._live_connections.values()))._door
+    return next(iter(page._server._websock_server._live_connections.values()))._guard
 
 
 # --- who -------------------------------------------------------------------------------------------
@@ -203,7 +205,7 @@ def test_a_foreign_web_site_reaches_nothing() -> None:
 def test_requests_that_no_page_answers_are_counted_and_logged_once(caplog) -> None:
     with page_of(bare_state()) as page, Visitor(page.port):
         wait_until(lambda: page._server.get_clients(), "the visitor")
-        refused = door_of(page).refused
+        refused = guard_of(page).refused
         socket.create_connection(("127.0.0.1", page.port)).close()  # no request at all
         for request in (b"HEAD / HTTP/1.1", b"POST / HTTP/1.1", b"GET / HTTP/1.0", b"\x00\xff"):
             with socket.create_connection(("127.0.0.1", page.port), timeout=10) as raw:
@@ -227,10 +229,10 @@ def test_a_fault_of_our_own_is_logged_as_such(monkeypatch, caplog) -> None:
 
     with page_of(bare_state()) as page, Visitor(page.port):
         wait_until(lambda: page._server.get_clients(), "the visitor")
-        monkeypatch.setattr(Door, "_answer", broken)
+        monkeypatch.setattr(AccessGuard, "_answer", broken)
         assert get(page.port)[0] == 500
         wait_until(logged, "the fault")
-        assert not door_of(page).refused
+        assert not guard_of(page).refused
 
 
 @pytest.mark.parametrize("port", [99_999_999_999, 65536, -5])
@@ -281,7 +283,7 @@ def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
         visitor.wait_for(lambda: handles["view"].value == "points", "what a control offers")
         after = {label: (h.value, h.visible, h.disabled) for label, h in handles.items()}
         assert after == before | {"view": ("points", True, False)} and not state.controls.paused
-        assert sum(door_of(page).refused.values()) == 20
+        assert sum(guard_of(page).refused.values()) == 20
         other.wait_for(lambda: other.counts["GuiUpdateMessage"] > told, "the one change")
         assert not other.counts["GuiRemoveMessage"]
 
@@ -309,12 +311,38 @@ def test_viewpoints_that_nobody_can_have_are_not_rendered() -> None:
             {"wxyz": [0.0, 0, 0, 0]},
             {"position": [float("nan"), 0, 0]},
             {"position": [1.0]},
-            {"more": 1},
         ):
             visitor.send("ViewerCameraMessage", **(good | wrong))
         visitor.send("ViewerCameraMessage", **(good | {"position": [0.0, 0, 2]}))
         wait_until(lambda: client.camera.position[2] == 2, "the good one did not arrive")
-        assert sum(door_of(page).refused.values()) == 8
+        assert sum(guard_of(page).refused.values()) == 7
+
+
+def test_what_a_later_viser_adds_to_its_messages_is_taken_and_only_viser_is_guarded() -> None:
+    import websockets.asyncio.server
+    from viser.infra import _infra
+
+    guard, original = AccessGuard(HttpDoor(Transport().access, "127.0.0.1"), None), websockets.asyncio.server.serve
+    with guard.before_viser():
+        assert websockets.asyncio.server.serve is original
+        assert _infra.websockets.asyncio.server.serve is not original
+        assert _infra.websockets.exceptions is websockets.exceptions
+    assert _infra.websockets is websockets
+    camera = {
+        "type": "ViewerCameraMessage",
+        "wxyz": [1.0, 0, 0, 0],
+        "position": [0.0, 0, 1],
+        "fov": 0.9,
+        "near": 0.01,
+        "far": 1e3,
+        "image_height": 600,
+        "image_width": 800,
+        "look_at": [0.0, 0, 0],
+        "up_direction": [0.0, 0, 1],
+    }
+    assert guard.takes(None, msgspec.msgpack.encode(camera | {"zoom": 2}))
+    assert not guard.takes(None, msgspec.msgpack.encode(camera | {"fov": -1.0, "zoom": 2}))
+    assert not guard.takes(None, msgspec.msgpack.encode({"type": "RunJavascriptMessage", "source": "x"}))
 
 
 def test_nothing_is_uploaded() -> None:
@@ -331,7 +359,7 @@ def test_nothing_is_uploaded() -> None:
             size_bytes=3 * 10**8,
         )
         visitor.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part=0, content=bytes(1000))
-        at = door_of(page)
+        at = guard_of(page)
         wait_until(lambda: sum(at.refused.values()) == 2, "they were not refused")
         assert not page._server.gui._current_file_upload_states
         with contextlib.suppress(OSError):
@@ -343,13 +371,13 @@ def test_nothing_is_uploaded() -> None:
 
 
 def test_there_is_a_bound_on_visitors_and_their_places_are_given_again(monkeypatch) -> None:
-    monkeypatch.setattr(door, "MAX_VISITORS", 3)
+    monkeypatch.setattr(access_guard, "MAX_VISITORS", 3)
     with page_of(bare_state()) as page:
         visitors = [Visitor(page.port) for _ in range(3)]
         with pytest.raises(websocket.WebSocketBadStatusException, match="503"):
             Visitor(page.port)
         assert get(page.port)[0] == 200
-        at = door_of(page)
+        at = guard_of(page)
         visitors.pop().close()
         wait_until(lambda: len(at.visitors) == 2, "the place was kept")
         for visitor in [*visitors, Visitor(page.port)]:
@@ -357,7 +385,7 @@ def test_there_is_a_bound_on_visitors_and_their_places_are_given_again(monkeypat
 
 
 def test_half_requests_end_for_new_ones(monkeypatch) -> None:
-    monkeypatch.setattr(door, "MAX_PAGE_CONNECTIONS", 8)
+    monkeypatch.setattr(access_guard, "MAX_PAGE_CONNECTIONS", 8)
     with page_of(bare_state()) as page, Visitor(page.port) as visitor, contextlib.ExitStack() as open_:
         halves = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(30)]
         for half in halves:
@@ -385,7 +413,7 @@ def tls_of(folder: Path) -> Transport:
 
 
 def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(door, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(access_guard, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
     with (
         page_of(bare_state(), tls_of(tmp_path), "0.0.0.0") as page,
         socket.create_connection(("127.0.0.1", page.port), timeout=4.0) as silent,
@@ -395,9 +423,9 @@ def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> N
 
 @pytest.mark.parametrize("what", ["page", "metrics"])
 def test_unfinished_handshakes_are_few_and_shut_nobody_out(tmp_path, monkeypatch, what: str) -> None:
-    monkeypatch.setattr(door, "TLS_HANDSHAKE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(access_guard, "TLS_HANDSHAKE_TIMEOUT_S", 60.0)
     monkeypatch.setattr(guarded_http._Handler, "timeout", 60.0)
-    monkeypatch.setattr(door, "MAX_PAGE_CONNECTIONS", MAX_SCRAPES)
+    monkeypatch.setattr(access_guard, "MAX_PAGE_CONNECTIONS", MAX_SCRAPES)
     transport, port = tls_of(tmp_path), free_port()
     with page_of(bare_state(), transport, "0.0.0.0") as page, contextlib.ExitStack() as open_:
         serve_metrics(bare_state(), INGEST, "0.0.0.0", port, transport)
@@ -410,12 +438,12 @@ def test_unfinished_handshakes_are_few_and_shut_nobody_out(tmp_path, monkeypatch
 
 
 def test_who_does_not_read_is_sent_away_and_what_was_held_with_them(monkeypatch) -> None:
-    monkeypatch.setattr(door, "VISITOR_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(access_guard, "VISITOR_TIMEOUT_S", 1.0)
     with page_of(bare_state()) as page, Visitor(page.port) as reader:
         reader.wait_for(lambda: page._server.get_clients(), "the visitor")
         stuck = [Visitor(page.port, reads=False) for _ in range(8)]
         wait_until(lambda: len(page._server.get_clients()) == 9, "not all came")
-        at = door_of(page)
+        at = guard_of(page)
         held = []
         for k in range(40):
             page._server.scene.add_point_cloud(f"/{k % 4}", POINTS, POINTS)
@@ -435,7 +463,7 @@ def test_clicks_come_no_faster_than_a_persons() -> None:
         (client,) = page._server.get_clients().values()
         for _ in range(500):
             visitor.send("GuiUpdateMessage", uuid=control(page, "field")._impl.uuid, updates={"value": "snapshot"})
-        visitor.wait_for(lambda: sum(door_of(page).refused.values()) > 400, "refusals")
+        visitor.wait_for(lambda: sum(guard_of(page).refused.values()) > 400, "refusals")
         client.add_notification("last", "one")
         visitor.wait_for(lambda: visitor.counts["NotificationShowMessage"], "a notification")
         assert visitor.counts["NotificationShowMessage"] < 100
