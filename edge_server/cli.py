@@ -9,10 +9,11 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from freshfield import transport
 from freshfield.files import out_file, out_folder

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from edge_server.edge_defaults import CHOSEN, CYCLE, FIELD, cameras_move, with_defaults
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
-from freshfield.scenario import Scenario, ScenarioError, read_section
+from freshfield.scenario import Scenario
+from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 from freshfield.untrusted import read_json
 
 if TYPE_CHECKING:
@@ -22,139 +23,87 @@ if TYPE_CHECKING:
 
 LEAST_UPDATE_MS = 10.0
 """Shortest fitting time of an update: a shorter one is not worth the decoding of its views."""
+MOST_MS = 1e9
+"""Largest cost that virtual time charges."""
 
 
-@dataclass(frozen=True)
-class PolicyConfig:
-    """Which views an update uses.
+class PolicyConfig(Settings, frozen=True):
+    """Which views an update uses. value: omega_ms, k or period_ms; not given: the policy's own default."""
 
-    name: a policy of edge_server.scheduler, or bandit:FILE, relative to the scenario.
-    value: the policy's one parameter (omega_ms, k, period_ms); None takes its default.
-    """
-
-    name: str = "all"
-    value: float | None = None
+    name: Annotated[str, about("a policy of edge_server.scheduler, or bandit:FILE, relative to the scenario")] = "all"
+    value: Annotated[float | None, about("the policy's one parameter")] = None
 
 
-@dataclass(frozen=True)
-class ComputeConfig:
+class ComputeConfig(Settings, frozen=True):
     """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server costs``
-    measures what a machine takes.
+    measures what a machine takes."""
 
-    ms_per_step: for each optimizer step. ms_per_update: for each update.
-    ms_per_view: for each frame that has arrived since the last update.
-    """
-
-    ms_per_step: float = 0.0
-    ms_per_update: float = 0.0
-    ms_per_view: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not all(0.0 <= ms < 1e9 for ms in dataclasses.astuple(self)):
-            raise ValueError("compute: milliseconds must be finite and not negative")
+    ms_per_step: Annotated[float, within(0.0, MOST_MS, "for each optimizer step")] = 0.0
+    ms_per_update: Annotated[float, within(0.0, MOST_MS, "for each update")] = 0.0
+    ms_per_view: Annotated[float, within(0.0, MOST_MS, "for each frame that arrived since the last update")] = 0.0
 
     def charge_ns(self, steps: int, arrivals: int = 0) -> int:
         """Nanoseconds of an update of ``steps`` optimizer steps and ``arrivals`` new frames."""
         return round((self.ms_per_update + self.ms_per_step * steps + self.ms_per_view * arrivals) * 1e6)
 
 
-@dataclass(frozen=True)
-class KeyframesConfig:
-    """Earlier viewpoints of moving cameras (``live.keyframes``).
+class KeyframesConfig(Settings, frozen=True):
+    """Earlier viewpoints of moving cameras (``live.keyframes``). A view becomes a keyframe at a distance or at an
+    angle from all others."""
 
-    most: largest number of keyframes of each camera.
-    apart_m, apart_deg: a view becomes a keyframe at this distance or angle from all others.
-    """
-
-    most: int = 32
-    apart_m: float = 0.03
-    apart_deg: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.most <= 1000:
-            raise ValueError(f"most: expected 1 to 1000, got {self.most}")
-        if self.apart_m < 0 or self.apart_deg < 0:
-            raise ValueError("apart_m and apart_deg cannot be negative")
+    most: Annotated[int, within(1, 1000, "keyframes of each camera")] = 32
+    apart_m: Annotated[float, within(0.0, math.inf, "distance between keyframes")] = 0.03
+    apart_deg: Annotated[float, within(0.0, math.inf, "angle between keyframes")] = 5.0
 
 
-@dataclass(frozen=True)
-class ExportConfig:
-    """What ``edge-server export`` makes of the field at the end of a run of deploy/up.py.
+class ExportConfig(Settings, frozen=True):
+    """What ``edge-server export`` makes of the field at the end of a run of the launcher."""
 
-    mesh: file in the run's folder, .ply or .glb.
-    voxel_mm: side of a voxel; None: the size of a pixel at the surface.
-    """
-
-    mesh: str
-    voxel_mm: float | None = None
+    mesh: Annotated[str, about("file in the run's folder, .ply or .glb")]
+    voxel_mm: Annotated[float, within(0.01, 1000.0, "side of a voxel; not given: a pixel at the surface")] | None = None
 
     def __post_init__(self) -> None:
         if Path(self.mesh).name != self.mesh or Path(self.mesh).suffix.lower() not in (".ply", ".glb"):
             raise ValueError(f"mesh: expected a file name that ends in .ply or .glb, got {self.mesh!r}")
-        if self.voxel_mm is not None and not 0.01 <= self.voxel_mm <= 1000.0:
-            raise ValueError(f"voxel_mm: expected 0.01 to 1000, got {self.voxel_mm:g}")
 
 
-@dataclass(frozen=True)
-class EdgeConfig:
-    """The edge section of a scenario.
+class EdgeConfig(Settings, frozen=True):
+    """The edge section of a scenario. What a scenario does not name is neither imported nor computed.
 
-    field, field_options: the representation and its settings (edge_server.fields.registry).
-    What a scenario leaves open of field, layers, updates, update_ms, steps and keyframes is chosen by what
-    its cameras do (``edge_defaults``); the values here are those of the thesis's cycle.
-    policy: which views an update uses.
-    updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame
-    has arrived since.
-    update_ms: fitting time of an update.
-    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario, which page and report
-    draw. None: the shipped one.
-    steps: optimizer steps of an update in virtual time.
-    compute: what an update costs in virtual time: ``zero``, the milliseconds of ``ComputeConfig``, or a file
-    of ``edge-server costs``, relative to the scenario.
-    scores: what policies reach in virtual time, for the page: the values of a scores.json of ``edge-server
-    train-scheduler --hold``, which a scenario names relative to itself.
-    grace_ms: how long the first update waits for cameras that have not reported.
-    lpips: network to score with, where its weights are installed; none turns it off.
-    noisy_truth: held-out frames are noisy video, so that the bound of moving pixels follows their noise.
-    metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS.
-    embedding: an edge_server.embed.EmbeddingConfig, for policies that look at what cameras see.
-    keyframes: earlier viewpoints of moving cameras go on supervising; null: they do not.
-    foreground: an edge_server.foreground.ForegroundConfig, cuts the background out of every view.
-    export: what deploy/up.py makes of the field when the run ends.
-    What a scenario does not name is neither imported nor computed.
+    field, layers, updates, update_ms, steps, keyframes: what a scenario leaves open is chosen by what its cameras do
+        (``edge_defaults``); the values here are those of the thesis's cycle.
+    updates: cycle starts an update when the last one is done, as in the thesis; arrivals as soon as a frame has
+        arrived since.
+    frontier: page and report draw it; not given: the shipped one.
+    compute: ``zero``, the milliseconds of ``ComputeConfig``, or a file of ``edge-server costs``, relative to the
+        scenario.
+    scores: the values of a scores.json of ``edge-server train-scheduler --hold``, which a scenario names relative to
+        itself, for the page.
+    noisy_truth: the bound of moving pixels follows the noise of held-out frames.
+    keyframes: null: earlier viewpoints do not go on supervising.
+    embedding, foreground: an ``embed.EmbeddingConfig`` and a ``foreground.ForegroundConfig``, whose modules only a
+        scenario that has them imports.
     """
 
-    field: str = FIELD
-    field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
-    updates: str = CYCLE["updates"]
-    update_ms: float = CYCLE["update_ms"]
-    frontier: str | None = None
-    steps: int = CYCLE["steps"]
-    compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
-    grace_ms: float = 3000.0
-    lpips: str = "alex"
-    noisy_truth: bool = False
-    metrics: tuple[str, ...] = ()
-    embedding: Any = None  # its type would import its module whether a scenario asks for it or not
-    keyframes: KeyframesConfig | None = None
-    foreground: Any = None  # as embedding
-    export: ExportConfig | None = None
-    scores: Any = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("update_ms", LEAST_UPDATE_MS), ("grace_ms", 0.0)):
-            value = getattr(self, name)
-            if not least <= value <= LONGEST_MS:
-                raise ValueError(f"{name}: expected {least:g} to {LONGEST_MS:.0f}, got {value:g}")
-        if self.updates not in ("cycle", "arrivals"):
-            raise ValueError(f"updates: expected cycle or arrivals, got {self.updates!r}")
-        if not 1 <= self.steps <= 10_000_000:
-            raise ValueError(f"steps: expected 1 to 10000000, got {self.steps}")
-        if self.lpips not in ("alex", "squeeze", "none"):
-            raise ValueError(f"lpips: expected alex, squeeze or none, got {self.lpips!r}")
-        if unknown := set(self.metrics) - {"perceptual"}:
-            raise ValueError(f"metrics: expected perceptual, got {', '.join(sorted(unknown))}")
+    field: Annotated[str, about("the representation (edge_server.fields.registry)")] = FIELD
+    field_options: Annotated[dict[str, Any], about("its settings")] = msgspec.field(default_factory=dict)
+    policy: Annotated[PolicyConfig, about("which views an update uses")] = msgspec.field(default_factory=PolicyConfig)
+    updates: Literal["cycle", "arrivals"] = CYCLE["updates"]
+    update_ms: Annotated[float, within(LEAST_UPDATE_MS, LONGEST_MS, "fitting time of an update")] = CYCLE["update_ms"]
+    frontier: Annotated[str | None, about("frontier.json of edge-server frontier, relative to the scenario")] = None
+    steps: Annotated[int, within(1, 10_000_000, "optimizer steps of an update in virtual time")] = CYCLE["steps"]
+    compute: Annotated[ComputeConfig, about("cost of an update in virtual time")] = msgspec.field(
+        default_factory=ComputeConfig
+    )
+    grace_ms: Annotated[float, within(0.0, LONGEST_MS, "the first update waits for cameras without a report")] = 3000.0
+    lpips: Annotated[Literal["alex", "squeeze", "none"], about("network to score with, where it is installed")] = "alex"
+    noisy_truth: Annotated[bool, about("held-out frames are noisy video")] = False
+    metrics: Annotated[tuple[Literal["perceptual"], ...], about("the stand-in where there is no LPIPS")] = ()
+    embedding: Annotated[Any, about("for policies that look at what cameras see")] = None
+    keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None
+    foreground: Annotated[Any, about("cuts the background out of every view")] = None
+    export: Annotated[ExportConfig | None, about("what the launcher makes of the field when the run ends")] = None
+    scores: Annotated[Any, about("what policies reach in virtual time")] = None
 
 
 def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:
@@ -239,9 +188,9 @@ def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
     if section.get("scores") is not None:
         section["scores"] = _read_json(scenario, "scores", section["scores"], _Scores)
-    config = read_section(EdgeConfig, section, f"{scenario.path}: edge")
+    config = read_settings(EdgeConfig, section, f"{scenario.path}: edge")
     name = resolve_checkpoint(config.policy.name, scenario.path.parent)
-    return dataclasses.replace(config, policy=dataclasses.replace(config.policy, name=name))
+    return replace(config, policy=replace(config.policy, name=name))
 
 
 def _read_json(scenario: Scenario, key: str, name: str, model: type | None = None) -> dict[str, Any]:

@@ -9,11 +9,12 @@ enables it; without that key this package is not imported.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from freshfield.scenario import read_section
+from msgspec.structs import replace
+
+from freshfield.settings import Settings, about, read_settings, within
 
 if TYPE_CHECKING:
     from edge_server.embed.embedder import Embedder
@@ -22,7 +23,6 @@ DEFAULT = "default"
 MODELS = Path(__file__).parent / "models"
 # The faster of the two shipped models; their features have a mean cosine of 0.998 (detector.json).
 DETECTOR = "detector_int8.onnx"
-PROVIDERS = ("auto", "cpu", "cuda")
 
 
 class EmbeddingError(ValueError):
@@ -33,43 +33,24 @@ class SizeError(EmbeddingError):
     """The model was not exported for this image size."""
 
 
-@dataclass(frozen=True)
-class EmbeddingConfig:
-    """The section ``edge.embedding`` of a scenario.
+class EmbeddingConfig(Settings, frozen=True):
+    """The section ``edge.embedding`` of a scenario. provider: auto uses CUDA if ONNX Runtime has it."""
 
-    model: a YOLO detection ONNX, relative to the scenario, or ``default``.
-    dim: length of an embedding, at most the channels of the tapped layer.
-    size: side of the model's input, pixels; None: the model's own.
-    tap: the tensor to embed, or a module of the exporter's such as ``model.9``; None: the backbone's end.
-    provider: auto uses CUDA if ONNX Runtime has it.
-    threads: number of CPU threads.
-    """
-
-    model: str = DEFAULT
-    dim: int = 32
-    size: int | None = None
-    tap: str | None = None
-    provider: str = "auto"
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.dim <= 4096:
-            raise ValueError(f"dim: expected 1 to 4096, got {self.dim}")
-        if self.size is not None and not 32 <= self.size <= 2048:
-            raise ValueError(f"size: expected 32 to 2048 pixels, got {self.size}")
-        if self.provider not in PROVIDERS:
-            raise ValueError(f"provider: expected one of {', '.join(PROVIDERS)}, got {self.provider!r}")
-        if not 1 <= self.threads <= 256:
-            raise ValueError(f"threads: expected 1 to 256, got {self.threads}")
+    model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
+    dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels of the tapped layer")] = 32
+    size: Annotated[int, within(32, 2048, "side of the model's input, pixels; not given: its own")] | None = None
+    tap: Annotated[str | None, about("tensor or module (model.9) to embed; not given: the backbone's end")] = None
+    provider: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: Annotated[int, within(1, 256, "CPU threads")] = 1
 
 
 def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:
     """Read the section ``edge.embedding`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
-    config = read_section(EmbeddingConfig, values, f"{scenario}: edge.embedding")
+    config = read_settings(EmbeddingConfig, values, f"{scenario}: edge.embedding")
     if config.model == DEFAULT:
         return config
-    return EmbeddingConfig(**{**vars(config), "model": str(scenario.parent / config.model)})
+    return replace(config, model=str(scenario.parent / config.model))
 
 
 def model_path(name: str) -> Path:

@@ -26,6 +26,7 @@ from edge_server.scheduler import STATE_PARTS, short_name
 from freshfield.files import out_file, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.settings import as_mapping
 
 DESCRIPTION = """\
 Compare what policies show in a scenario: every policy runs with the same seeds, each of which draws a channel,
@@ -70,7 +71,7 @@ def _run(args: argparse.Namespace) -> None:
     if args.json is not None:
         about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}
-        about |= {"compute": dataclasses.asdict(setting.compute), "machine": machine(), "commit": commit()}
+        about |= {"compute": as_mapping(setting.compute), "machine": machine(), "commit": commit()}
         args.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.json, {**about, "policies": as_json(table, list(labels), own or {})}, indent=1)
 
@@ -90,7 +91,7 @@ def setting_of(
     scenario = dataclasses.replace(scenario, edge=edge)
     if channel is not None:
         scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])
-    charged = dataclasses.asdict(read_config(scenario).compute)
+    charged = as_mapping(read_config(scenario).compute)
     if not slower > 0.0 or (slower != 1.0 and not any(charged.values())):
         raise ValueError(f"--slower {slower:g}: expected more than 0, and a scenario or --costs that charge something")
     compute = ComputeConfig(**{name: slower * ms for name, ms in charged.items()})

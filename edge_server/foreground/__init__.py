@@ -9,11 +9,13 @@ are not masked: fidelity is measured on whole images, background included.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from freshfield.scenario import read_section
+from msgspec import field
+from msgspec.structs import replace
+
+from freshfield.settings import Settings, about, read_settings, within
 
 MODELS = Path(__file__).parent / "models"
 # The segmentation models that we ship, by the name of the object: the file in ``MODELS``.
@@ -32,32 +34,19 @@ class ForegroundError(ValueError):
     """A model or setting is unusable; the one-line message says what, where and what to do."""
 
 
-@dataclass(frozen=True)
-class ForegroundConfig:
-    """The section ``edge.foreground`` of a scenario.
+class ForegroundConfig(Settings, frozen=True):
+    """The section ``edge.foreground`` of a scenario. Of several detections the surest counts."""
 
-    detector: YOLO segmentation ONNX (v8, v11), relative to the scenario, or ``tile``, the shipped model of
-    the tile.
-    kinds: class names to detect; none: any.
-    confidence: minimum score, 0 to 1; of several detections the surest counts.
-    margin: added to each side of a detected box, as a share of it, 0 to 1.
-    """
-
-    detector: str
-    kinds: list[str] = field(default_factory=list)
-    confidence: float = 0.25
-    margin: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("confidence", "margin"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: expected 0 to 1, got {getattr(self, name)}")
+    detector: Annotated[str, about("YOLO segmentation ONNX (v8, v11), relative to the scenario, or tile: shipped")]
+    kinds: Annotated[list[str], about("class names to detect; none: any")] = field(default_factory=list)
+    confidence: Annotated[float, within(0.0, 1.0, "minimum score")] = 0.25
+    margin: Annotated[float, within(0.0, 1.0, "added to each side of a detected box, as a share of it")] = 0.05
 
 
 def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundConfig:
     """Read the section ``edge.foreground`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
-    config = read_section(ForegroundConfig, values, f"{scenario}: edge.foreground")
+    config = read_settings(ForegroundConfig, values, f"{scenario}: edge.foreground")
     if config.detector in SHIPPED:
         return config
     return replace(config, detector=str(scenario.parent / config.detector))

@@ -12,11 +12,12 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
+import msgspec
 import numpy as np
 
 from edge_server.config import EdgeConfig, described, embedding_for, read_config
@@ -117,7 +118,7 @@ class EdgeServer:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
         # What moves, in words: nothing yet, or what the earlier run knew.
         self._moving = str(about.get("moving") or ("a camera" if cameras_move(scenario) else ""))
-        config_if_moving = replace(read_config(scenario, moving=True), policy=config.policy)
+        config_if_moving = msgspec.structs.replace(read_config(scenario, moving=True), policy=config.policy)
         self.config = config = config_if_moving if about.get("moving") else config
         self.frontier = open_frontier(scenario, config)
         field = self._make_field(config)

@@ -10,20 +10,14 @@ The file is YAML::
     channel: {...}     # channel_emu.model.config
     edge:    {...}     # edge_server.config
 
-``read_section`` turns a mapping into a dataclass. It refuses unknown keys, wrong types and values out of
-range, with one line that names the file, the key and what was expected.
+Sections are ``freshfield.settings``.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import sys
-import types
-import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -35,7 +29,6 @@ from freshfield.untrusted import UntrustedError, read_yaml
 
 # Label of every fidelity of a run without held-out cameras: on page, report, console and in metrics.
 NOTHING_HELD_OUT = "training views, nothing is held out"
-T = TypeVar("T")
 _HERE = Path(__file__).resolve()
 _CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"
 SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios"
@@ -53,6 +46,18 @@ class Cameras(Settings, frozen=True):
     ids: Annotated[list[str], about("names of the cameras, instead of count")] = msgspec.field(default_factory=list)
     held_out: Annotated[list[str], about("cameras that are never trained on")] = msgspec.field(default_factory=list)
     phase: Literal["locked", "spread"] = "locked"
+
+
+class _File(Settings, frozen=True):
+    """What a scenario file may hold; each package reads its own section."""
+
+    cameras: Cameras = msgspec.field(default_factory=Cameras)
+    name: Annotated[str, about("not given: the file's name")] = ""
+    description: Annotated[str, about("one line for people")] = ""
+    seed: Annotated[int, within(0, 2**63 - 1, "of every random stream")] = 0
+    source: dict[str, Any] = msgspec.field(default_factory=dict)
+    channel: dict[str, Any] = msgspec.field(default_factory=dict)
+    edge: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -136,16 +141,8 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     data: the value of the YAML document. file: named in errors. seed: replaces that of ``data``.
     Raises ScenarioError.
     """
-    known = ("name", "description", "seed", "cameras", "source", "channel", "edge")
-    if not isinstance(data, dict):
-        raise ScenarioError(f"{file}: expected a mapping with the keys {', '.join(known)}")
-    _refuse_unknown(data, known, f"{file}: ")
-    if data.get("edge") is None:  # the edge chooses for itself
-        data = {**data, "edge": {}}
-    for key in ("source", "channel", "edge"):
-        if not isinstance(data.get(key, {}), dict):
-            raise ScenarioError(f"{file}: {key}: expected a mapping")
-    found = read_settings(Cameras, data.get("cameras", {}), f"{file}: cameras")
+    file_settings = read_settings(_File, data, f"{file}: ")
+    found = file_settings.cameras
     if bool(found.ids) == bool(found.count):
         raise ScenarioError(f"{file}: cameras: expected either count (1 to {MAX_CAMERAS}) or ids")
     ids = tuple(found.ids or (f"cam{i:02d}" for i in range(found.count)))
@@ -159,108 +156,15 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
             raise ScenarioError(f"{file}: cameras.held_out: {name!r} is not one of the cameras")
     if len(set(found.held_out)) == len(ids):
         raise ScenarioError(f"{file}: cameras.held_out: every camera is held out, none is left to train on")
-    number = data.get("seed", 0) if seed is None else seed
-    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**63:
-        raise ScenarioError(f"{file}: seed: expected a whole number from 0 to 2^63 - 1, got {number!r}")
     return Scenario(
         path=file,
-        name=str(data.get("name", file.stem)),
-        seed=number,
+        name=file_settings.name or file.stem,
+        seed=file_settings.seed if seed is None else seed,
         cameras=ids,
         held_out=tuple(dict.fromkeys(found.held_out)),
-        description=str(data.get("description", "")),
-        source=dict(data.get("source", {})),
-        channel=dict(data.get("channel", {})),
-        edge=dict(data["edge"]),
+        description=file_settings.description,
+        source=file_settings.source,
+        channel=file_settings.channel,
+        edge=file_settings.edge or {},
         phase=found.phase,
     )
-
-
-def read_section(cls: type[T], mapping: Any, where: str) -> T:
-    """Build a dataclass from a mapping, strictly by its annotations.
-
-    cls: dataclass with fields of int, float, bool, str, Path, list, dict, tuple, dataclasses, or unions of
-        them with None. A float field takes any finite number, an int field no float.
-    mapping: the value read from the file.
-    where: file and key, the beginning of every error.
-    Raises ScenarioError, also for a ValueError of the dataclass's ``__post_init__``, which checks ranges.
-    """
-    if issubclass(cls, Settings):
-        return read_settings(cls, mapping, where)
-    if not isinstance(mapping, dict):
-        raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
-    hints = typing.get_type_hints(cls)
-    given = sorted(dataclasses.fields(cls), key=lambda f: bool(f.kw_only))  # type: ignore[arg-type]
-    fields = {f.name: f for f in given if f.init}  # in the order of messages: keyword-only fields come last
-    _refuse_unknown(mapping, tuple(fields), f"{where}.")
-    values = {key: _convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
-    for name, spec in fields.items():
-        no_default = spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
-        if name not in values and no_default:
-            raise ScenarioError(f"{where}.{name}: missing")
-    try:
-        return cls(**values)
-    except ScenarioError:
-        raise
-    except ValueError as error:
-        raise ScenarioError(f"{where}: {error}") from None
-
-
-def _convert(value: Any, hint: Any, where: str) -> Any:
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        options = typing.get_args(hint)
-        if value is None and type(None) in options:
-            return None
-        errors = []
-        for option in options:
-            if option is type(None):
-                continue
-            try:
-                return _convert(value, option, where)
-            except ScenarioError as error:
-                errors.append(error)
-        raise errors[0]
-    if hint is Any:
-        return value
-    if origin is list or hint is list:
-        if not isinstance(value, list):
-            raise ScenarioError(f"{where}: expected a list, got {value!r}")
-        args = typing.get_args(hint)
-        return [_convert(v, args[0], f"{where}[{i}]") for i, v in enumerate(value)] if args else list(value)
-    if origin is tuple:
-        args = typing.get_args(hint)
-        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
-            count = "" if args[-1] is Ellipsis else f"{len(args)} "
-            raise ScenarioError(f"{where}: expected a list of {count}values, got {value!r}")
-        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
-        return tuple(_convert(v, k, f"{where}[{i}]") for i, (v, k) in enumerate(zip(value, kinds)))
-    if origin is dict or hint is dict:
-        if not isinstance(value, dict):
-            raise ScenarioError(f"{where}: expected a mapping, got {value!r}")
-        args = typing.get_args(hint)
-        return {str(k): _convert(v, args[1], f"{where}.{k}") for k, v in value.items()} if args else dict(value)
-    if dataclasses.is_dataclass(hint):
-        return read_section(typing.cast(type, hint), value, where)
-    if hint is float:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and abs(value) <= sys.float_info.max):  # also of a whole number that no float holds
-            raise ScenarioError(f"{where}: expected a number, got {value!r}")
-        return float(value)
-    if hint is Path:
-        if not isinstance(value, str):
-            raise ScenarioError(f"{where}: expected a path, got {value!r}")
-        return Path(value)
-    names = {int: "a whole number", str: "text", bool: "true or false"}
-    if type(value) is not hint:
-        quote = ": put it in quotes" if hint is str and type(value) in (int, float) else ""
-        raise ScenarioError(f"{where}: expected {names.get(hint, hint)}, got {value!r}{quote}")
-    return value
-
-
-def _refuse_unknown(mapping: dict[Any, Any], known: tuple[str, ...], prefix: str) -> None:
-    for key in mapping:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
-            raise ScenarioError(f"{prefix}{key}: unknown key; {hint}")

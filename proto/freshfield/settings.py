@@ -46,14 +46,14 @@ def read_settings(model: type[T], mapping: Any, where: str) -> T:
 
     model: the struct; fields may be numbers, text, truth values, Path, lists, tuples, mappings or structs.
     mapping: the value read from the file.
-    where: file and key, the beginning of every error.
+    where: file and key (``room.yaml: edge``) or the file alone (``room.yaml: ``), the beginning of every error.
     Raises ScenarioError, also for a ValueError of the struct's ``__post_init__``.
     """
     if not isinstance(mapping, dict):
-        raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
+        raise ScenarioError(f"{where.removesuffix(': ')}: expected a mapping, got {mapping!r:.100}")
     for path, value in _numbers(mapping):
         if not math.isfinite(value):
-            raise ScenarioError(f"{where}{path}: expected a number, got {value!r}")
+            raise ScenarioError(f"{_joined(where, path[1:])}: expected a number, got {value!r}")
     try:
         return msgspec.convert(mapping, model, dec_hook=_path)
     except msgspec.ValidationError as error:
@@ -122,7 +122,7 @@ def _message(error: msgspec.ValidationError, model: type, mapping: dict[str, Any
         kind = _bare(kind)
         if step["name"]:
             kind = next(f.type for f in msgspec.structs.fields(kind) if f.encode_name == step["name"])
-            value, path = value[step["name"]], f"{path}.{step['name']}"
+            value, path = value[step["name"]], _joined(path, step["name"])
         elif step["index"]:
             kinds, index = typing.get_args(kind), int(step["index"])
             kind = kinds[index] if index < len(kinds) and kinds[index] is not Ellipsis else kinds[0]
@@ -135,13 +135,17 @@ def _message(error: msgspec.ValidationError, model: type, mapping: dict[str, Any
         known = [f.name for f in msgspec.structs.fields(_bare(kind))]
         near = difflib.get_close_matches(unknown[1], known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
-        return f"{path}.{unknown[1]}: unknown key; {hint}"
+        return f"{_joined(path, unknown[1])}: unknown key; {hint}"
     if missing := re.match(r"Object missing required field `(.*)`", what):
-        return f"{path}.{missing[1]}: missing"
+        return f"{_joined(path, missing[1])}: missing"
     if what.startswith(("Expected ", "Invalid enum", "Number out of range")):
         quote = ": put it in quotes" if "`str`" in what and type(value) in (int, float) else ""
         return f"{path}: expected {_expected(what, kind)}, got {value!r:.100}{quote}"
     return f"{path}: {what}"
+
+
+def _joined(path: str, name: str) -> str:
+    return f"{path}{name}" if path.endswith(": ") else f"{path}.{name}"
 
 
 def _refused(kind: Any, value: Any) -> bool:

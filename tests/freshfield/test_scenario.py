@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX
-from freshfield.scenario import ScenarioError, load, parse, read_section
+from freshfield.scenario import ScenarioError, load, parse
 
 FILE = Path("s.yaml")
 
@@ -62,58 +61,6 @@ def test_errors_are_one_line_with_the_file(tmp_path, text, message):
 def test_a_missing_file_lists_what_is_shipped():
     with pytest.raises(ScenarioError, match=r"shipped scenarios: .*room"):
         load("no-such-scenario")
-
-
-@dataclass(frozen=True)
-class Inner:
-    rate: float
-    name: str = "x"
-
-
-@dataclass(frozen=True)
-class Outer:
-    count: int = 1
-    on: bool = False
-    share: float | None = None
-    size: tuple[int, int] = (1, 1)
-    inner: Inner | None = None
-    tags: list[str] = field(default_factory=list)
-    table: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.count < 0:
-            raise ValueError("count cannot be negative")
-
-
-def test_sections_become_dataclasses():
-    given = {"share": 1, "size": [3, 4], "inner": {"rate": 2}, "tags": ["a"], "table": {"k": 0.5}}
-    assert read_section(Outer, given, "s: x") == Outer(1, False, 1.0, (3, 4), Inner(2.0), ["a"], {"k": 0.5})
-    assert read_section(Outer, {"share": None}, "s: x").share is None
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"cuont": 1}, r"s: x\.cuont: unknown key; did you mean 'count'"),
-        ({"count": 1.0}, r"s: x\.count: expected a whole number"),
-        ({"on": 1}, r"s: x\.on: expected true or false"),
-        ({"share": float("nan")}, r"s: x\.share: expected a number"),
-        ({"share": float("inf")}, r"s: x\.share: expected a number"),
-        ({"share": 10**400}, r"s: x\.share: expected a number"),
-        ({"share": -(10**400)}, r"s: x\.share: expected a number"),
-        ({"size": [1, 2, 3]}, r"s: x\.size: expected a list of 2 values"),
-        ({"size": [1, "b"]}, r"s: x\.size\[1\]: expected a whole number"),
-        ({"inner": {}}, r"s: x\.inner\.rate: missing"),
-        ({"inner": {"rate": 1, "nmae": "y"}}, r"s: x\.inner\.nmae: unknown key; did you mean 'name'"),
-        ({"table": {"k": "v"}}, r"s: x\.table\.k: expected a number"),
-        ({"tags": "a"}, r"s: x\.tags: expected a list"),
-        ({"count": -1}, r"s: x: count cannot be negative"),
-        ([], "s: x: expected a mapping"),
-    ],
-)
-def test_sections_refuse_by_name(given, message):
-    with pytest.raises(ScenarioError, match=message):
-        read_section(Outer, given, "s: x")
 
 
 def test_random_streams_are_independent_of_the_number_of_cameras():

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from edge_server.experiments.bench.run import BenchRun
 from edge_server.experiments.common.tables import markdown_table, mean_or_none, number
 from edge_server.experiments.virtual.costs import UpdateCosts, beside_s
@@ -122,7 +124,7 @@ def measure_point(point: Point) -> dict[str, Any]:
     costs.watch(updates.field)
     deployment.run(point.free_s)
     cost = costs.measured(deployment.with_images(tuple(updates.buffer.newest().values())))
-    compute = replace(settings.compute, ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
+    compute = msgspec.structs.replace(settings.compute, ms_per_update=cost["update_ms"], ms_per_view=cost["view_ms"])
     deployment.settings = replace(settings, compute=compute)
     deployment.run(point.settling_s)
     shed, arrivals, beside = updates.buffer.shed, updates.buffer.arrivals, beside_s(updates.field)

@@ -13,7 +13,7 @@ import json
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from edge_server.fields.registry import make_field, option_help
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
+from freshfield.settings import as_mapping
 
 # Number of instants of a run at which the shown image is scored, and of publications that are scored: their
 # mean is as good as that of hundreds.
@@ -265,7 +266,7 @@ def measure_compute(asked: Charged) -> dict[str, float]:
         costs.watch(start.field)
         lead = start.lead(RunSettings(steps=1), costs=costs)
         cost = costs.measured(lead.with_images(tuple(lead.updates.buffer.newest().values())))
-        return asdict(Compute(ms_per_update=round(cost["update_ms"], 3), ms_per_view=round(cost["view_ms"], 3)))
+        return as_mapping(Compute(ms_per_update=round(cost["update_ms"], 3), ms_per_view=round(cost["view_ms"], 3)))
     taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
     for number in range(1, 2 * _UPDATES + 3):
         views = [_view(camera, number * _BETWEEN_NS) for camera in start.cameras]
@@ -278,7 +279,7 @@ def measure_compute(asked: Charged) -> dict[str, float]:
             taken[steps].append(1e3 * min(spent))
     few, many = (statistics.median(taken[steps]) for steps in (_FEW, _MANY))
     ms_per_step = max((many - few) / (_MANY - _FEW), 0.01)
-    return asdict(Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3)))
+    return as_mapping(Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3)))
 
 
 def static_steps(update_s: float) -> int:

@@ -30,6 +30,7 @@ from edge_server.report.machine import machine, versions
 from freshfield.files import out_file, write_json
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.settings import as_mapping
 
 DESCRIPTION = """\
 Measure what an update of a scenario takes on this machine: milliseconds per update, step and frame taken in.
@@ -83,7 +84,7 @@ def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dic
     rows = np.concatenate([_timed(scenario, share, seconds, data) for share in _SHARES])
     compute = fitted(rows)
     return {
-        "compute": dataclasses.asdict(compute),
+        "compute": as_mapping(compute),
         "scenario": scenario.name,
         "updates": len(rows),
         "median_ms": round(float(np.median(rows[:, 2])), 3),

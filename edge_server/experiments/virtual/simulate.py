@@ -30,6 +30,7 @@ from edge_server.report.machine import versions
 from edge_server.scheduler import parse_policy, short_name
 from freshfield.files import out_folder, write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.settings import as_mapping
 
 DESCRIPTION = """\
 Run cameras, emulated network, buffer, policy and field of a scenario in virtual time: no ports, no waiting.
@@ -114,7 +115,7 @@ def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -
         "policy": deployment.updates.policy.name,
         "value": deployment.updates.policy.value,
         "steps": deployment.settings.steps,
-        "compute": dataclasses.asdict(deployment.settings.compute),
+        "compute": as_mapping(deployment.settings.compute),
         "updates": len(publications),
         "frames": deployment.frames(),
         "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
@@ -187,11 +188,11 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     edge = dict(scenario.edge)
     if args.policy:
         try:
-            edge["policy"] = dataclasses.asdict(PolicyConfig(*parse_policy(args.policy)))
+            edge["policy"] = as_mapping(PolicyConfig(*parse_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     if args.compute:
-        edge["compute"] = dataclasses.asdict(_compute(args.compute))
+        edge["compute"] = as_mapping(_compute(args.compute))
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     if not 0.0 < args.seconds <= 1e6:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_server.scheduler import Policy
+from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.embed import EmbeddingConfig
@@ -31,7 +31,7 @@ class DecisionLog:
         if self._record is None:
             from edge_server.scheduler.learned.decision_record import DecisionWriter
 
-            known = None if self._embedding is None else dataclasses.asdict(self._embedding)
+            known = None if self._embedding is None else as_mapping(self._embedding)
             self._record = DecisionWriter(self._out, known)
         self._record.write(decision)
 
