@@ -99,12 +99,11 @@ class StepBudget:
         whole = self._budget.seconds
         return whole is None or self.elapsed_s() < share * whole
 
-    def begin_step(self, timer: StepTimer, then_s: float = 0.0) -> float | None:
+    def begin_step(self, timer: StepTimer) -> float | None:
         """Begin a step, unless the budget is spent: then None. Returns the progress in [0, 1] through the
         part of the budget that was left when the first step of this kind began.
 
         timer: that of this kind of step; ``end_step`` adds to it.
-        then_s: seconds of what has to follow within the budget.
         """
         self._step_start, self._timer = self._now(), timer
         if self._budget.steps is not None:
@@ -112,8 +111,8 @@ class StepBudget:
             return self._progress(timer, self.steps, self._budget.steps) if left else None
         assert self._budget.seconds is not None
         spent, first = self._step_start - self._start, timer not in self._made
-        most = self._budget.seconds * (LATE if first and not then_s else 1.0)
-        if spent + timer.seconds + then_s <= most:
+        most = self._budget.seconds * (LATE if first else 1.0)
+        if spent + timer.seconds <= most:
             return self._progress(timer, spent, self._budget.seconds)
         if first:
             timer.drop_longest()

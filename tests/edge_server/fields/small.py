@@ -1,7 +1,7 @@
 """Every representation made small, and the views that tests fit it to.
 
-``NAME/small.py`` beside this file has the class (FIELD), settings for images of 48 pixels (SMALL), of 24
-(TINY, for hard cases) and of 64 (POISONED), and REACHED_DB: the PSNR that a healthy field reaches in these
+``NAME/small.py`` beside this file has the class (FIELD), settings for images of 48 pixels (SMALL) and of 24
+(TINY, for hard cases), and REACHED_DB: the PSNR that a healthy field reaches in these
 tests. Another CPU rounds differently, which costs tenths of a decibel. Where the parameters are not a table
 and a network, it also has FINITE, the arrays of a state that are always finite, and ``check_bounds``.
 """
@@ -27,7 +27,6 @@ CLASSES: dict[str, Any] = {name: module.FIELD for name, module in _MODULES.items
 SMALL: dict[str, Any] = {name: module.SMALL for name, module in _MODULES.items()}
 TINY: dict[str, Any] = {name: module.TINY for name, module in _MODULES.items()}
 REACHED_DB: dict[str, dict[str, float]] = {name: module.REACHED_DB for name, module in _MODULES.items()}
-POISONED: dict[str, Any] = {name: module.POISONED for name, module in _MODULES.items()}
 every_field = pytest.mark.parametrize("name", NAMES)
 
 VIEWS = ring(13)

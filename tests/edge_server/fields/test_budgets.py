@@ -22,11 +22,11 @@ class Fits:
     def __init__(self) -> None:
         self.clock_s, self.step_s, self.usual = 0.0, 1.0, StepTimer()
 
-    def fit(self, budget_s: float, first_s: float = 0.0, then_s: float = 0.0) -> tuple[int, float]:
+    def fit(self, budget_s: float, first_s: float = 0.0) -> tuple[int, float]:
         """first_s: taken before the first step. Returns steps and seconds."""
         pace = StepBudget(Budget(seconds=budget_s), lambda: self.clock_s)
         self.clock_s += first_s
-        while (progress := pace.begin_step(self.usual, then_s)) is not None:
+        while (progress := pace.begin_step(self.usual)) is not None:
             assert 0.0 <= progress <= 1.0
             self.clock_s += self.step_s
             pace.end_step()
@@ -82,16 +82,9 @@ def test_fits_too_short_for_a_step_make_one_now_and_then() -> None:
     assert sum(fits.fit(0.5)[0] for _ in range(8)) >= 20
 
 
-def test_what_must_follow_finds_room() -> None:
-    fits = Fits()
-    fits.fit(5.0)
-    assert fits.fit(5.0, then_s=2.5) == (2, 2.0)
-    assert fits.fit(5.0, then_s=9.0) == (0, 0.0)
-
-
 def test_budgets_in_steps_ask_no_clock() -> None:
     pace, usual, said = StepBudget(Budget(steps=4), lambda: 0.0), StepTimer(), []
-    while (progress := pace.begin_step(usual, then_s=1e9)) is not None:
+    while (progress := pace.begin_step(usual)) is not None:
         said.append(progress)
         pace.end_step()
     assert said == [0.0, 0.25, 0.5, 0.75]

@@ -18,7 +18,7 @@ from camera_node.synthetic import make_scene
 from edge_server.fields import Budget, View
 from edge_server.fields.common.scene_box import scene_box
 from tests.edge_server.fields.scenes import psnr, ring
-from tests.edge_server.fields.small import CLASSES, POISONED, every_field
+from tests.edge_server.fields.small import every_field, small
 
 STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
 WITHIN_DB = 0.5
@@ -78,11 +78,6 @@ PICTURES: list[Poison] = [_noise, _black, _inverted, _another_scene]
 POSES: list[Poison] = [_a_meter_off, _turned, _in_millimeters]
 
 
-def field_of(name: str, **changed: Any) -> Any:
-    """A field of these tests, with other settings as ``changed`` says."""
-    return CLASSES[name](replace(POISONED[name], **changed))
-
-
 class Deployment:
     """A field and cameras that go on sending: every update has new frames, equal where nothing changed."""
 
@@ -105,13 +100,13 @@ class Deployment:
 
 @cache
 def _warm(name: str) -> dict[str, NDArray[Any]]:
-    deployment = Deployment(field_of(name))
+    deployment = Deployment(small(name))
     deployment.update(WARM)
     return deployment.field.state()
 
 
 def _deployment(name: str) -> Deployment:
-    field = field_of(name)
+    field = small(name)
     field.load_state(_warm(name))
     deployment = Deployment(field)
     deployment.updates = WARM
@@ -121,7 +116,7 @@ def _deployment(name: str) -> Deployment:
 @cache
 def _unharmed(name: str, updates: int, warm: bool = True) -> float:
     """The score of a field that never saw the poison, after as many updates."""
-    deployment = _deployment(name) if warm else Deployment(field_of(name))
+    deployment = _deployment(name) if warm else Deployment(small(name))
     deployment.update(updates)
     return deployment.score()
 
@@ -135,7 +130,7 @@ CASES += [("ngp", poison) for poison in (_noise, _in_millimeters)]
 @pytest.mark.parametrize("warm", [True, False])
 def test_a_poisoned_view_is_survived(name: str, poison: Poison, warm: bool) -> None:
     """Also in the very first update: before anything is known, and where the scene's box is found."""
-    deployment = _deployment(name) if warm else Deployment(field_of(name))
+    deployment = _deployment(name) if warm else Deployment(small(name))
     deployment.update(1, poison)
     deployment.update(AFTER)
     assert all(np.isfinite(a).all() for a in deployment.field.state().values() if a.dtype.kind == "f")
@@ -145,7 +140,7 @@ def test_a_poisoned_view_is_survived(name: str, poison: Poison, warm: bool) -> N
 @every_field
 def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
     """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
-    deployment = Deployment(field_of(name))
+    deployment = Deployment(small(name))
     memory = deployment.field.view_store.memory
     deployment.update(1)
     deployment.update(1, _noise)

@@ -71,20 +71,3 @@ def test_of_two_that_disagree_the_heavier_one_is_believed(name: str) -> None:
         views.append(replace(view, camera=f"blue{k}", image=blue, weight=np.full((24, 24), 0.05, np.float32)))
     color = fitted(name, views, steps=150).render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
     assert color[..., 0].mean() > 2.0 * color[..., 2].mean()
-
-
-@pytest.mark.parametrize(
-    "weight",
-    [
-        np.ones((24, 23), np.float32),
-        np.ones((24, 24)),
-        np.full((24, 24), np.nan, np.float32),
-        np.full((24, 24), 1.5, np.float32),
-        np.full((24, 24), -0.1, np.float32),
-    ],
-    ids=["shape", "float64", "nan", "above", "below"],
-)
-def test_a_weight_that_is_none_is_refused_by_camera(weight) -> None:
-    field = tiny("ngp")
-    with pytest.raises(ValueError, match=r"cam02: weight must be float32 of shape .24, 24. within 0..1"):
-        field.fit([*VIEWS[:2], replace(VIEWS[2], weight=weight)], Budget(steps=1))

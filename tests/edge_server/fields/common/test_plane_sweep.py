@@ -48,11 +48,6 @@ def test_depth_is_where_the_scene_is(size: int) -> None:
     assert np.median(wrong) < 0.5 * np.median(np.abs(middle / truth[told & there] - 1.0))
 
 
-def test_depth_does_not_depend_on_threads() -> None:
-    data, box = _packed(SEEN)
-    np.testing.assert_array_equal(_guide(SEEN, data, box, 1), _guide(SEEN, data, box, 2))
-
-
 def test_transparent_sky_has_no_depth() -> None:
     views = [cut_out(v) for v in SEEN]
     data, box = _packed(views)
@@ -162,19 +157,6 @@ def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatc
     assert sky.step > steps + 20 and len(swept) == 1
     sky.fit([replace(v, generated_ns=5000) for v in SEEN], Budget(steps=1))
     assert len(swept) == 2, "steps have no clock"
-
-
-def test_the_same_pictures_are_swept_once(monkeypatch) -> None:
-    from edge_server.fields.common import plane_sweep
-
-    swept, guide_ = [], plane_sweep.depth_guide
-    monkeypatch.setattr(plane_sweep, "depth_guide", lambda *given: swept.append(1) or guide_(*given))
-    field = small("ngp")
-    for _ in range(3):
-        field.fit(SEEN, Budget(steps=2))
-    assert len(swept) == 1
-    field.fit([replace(v, generated_ns=9000) for v in SEEN], Budget(steps=2))
-    assert len(swept) == 2
 
 
 def test_it_falls_to_nothing() -> None:

@@ -84,20 +84,6 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0
 
 
-@pytest.mark.parametrize("aside_m", [1.0, 2.0])
-def test_a_camera_that_looks_elsewhere_does_not_move_the_box(aside_m: float) -> None:
-    views = ring(9, distance_m=1.5)
-    expected = scene_box(views)
-    pose = views[2].camera_to_world.copy()
-    pose[:3, 3] += aside_m * pose[:3, 0]
-    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
-    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
-    turned = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    pose[:3, :3] = turned
-    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
-    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
-
-
 @pytest.mark.parametrize("scene", ["tile", "room", "tower"])
 @pytest.mark.parametrize("off_m", [30.0, 1e3, 1e6])
 def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:

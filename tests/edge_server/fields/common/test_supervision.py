@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.fields import View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels, pack_views
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields_for_tests import tiny_field
 
 VIEW = ring(1, size=16)[0]
 
@@ -19,6 +20,10 @@ def _posed(rotation: np.ndarray, position_m: float = 1.0) -> View:
     pose = VIEW.camera_to_world.copy()
     pose[:3, :3], pose[:3, 3] = rotation, position_m
     return replace(VIEW, camera_to_world=pose)
+
+
+def _lens(*distortion: float) -> View:
+    return replace(VIEW, intrinsics=replace(VIEW.intrinsics, distortion=distortion))
 
 
 @pytest.mark.parametrize(
@@ -33,6 +38,18 @@ def _posed(rotation: np.ndarray, position_m: float = 1.0) -> View:
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fy=1e30)), "no lens"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cx=1e308)), "principal point .* far outside"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cy=-16.1)), "principal point .* far outside"),
+        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=0.0)), "focal"),
+        (replace(VIEW, image=VIEW.image[:-1]), "16 x 15"),
+        (replace(VIEW, image=VIEW.image.astype(np.float32)), "uint8"),
+        (_lens(0.0, 0.0, 78.0, 69.6), "distortion"),
+        (_lens(100.0, 100.0, 100.0, 100.0), "distortion"),
+        (_lens(-100.0, 100.0, 0.0, 0.0), "distortion"),
+        (_lens(1e30, 0.0, 0.0, 0.0), "distortion"),
+        (replace(VIEW, weight=np.ones((16, 15), np.float32)), "weight must be float32 of shape .16, 16. within 0..1"),
+        (replace(VIEW, weight=np.ones((16, 16))), "weight must be float32"),
+        (replace(VIEW, weight=np.full((16, 16), np.nan, np.float32)), "weight must be"),
+        (replace(VIEW, weight=np.full((16, 16), 1.5, np.float32)), "weight must be"),
+        (replace(VIEW, weight=np.full((16, 16), -0.1, np.float32)), "weight must be"),
     ],
 )
 def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> None:
@@ -45,6 +62,15 @@ def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
     check_view(_posed(np.eye(3), FARTHEST_M))
     check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=1e4, fy=1e4)))
     check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, cx=-16.0, cy=32.0)))
+    check_view(_lens(-0.046183, 0.139983, 0.000608, 0.00069))
+
+
+def test_a_field_that_was_given_what_cannot_be_goes_on() -> None:
+    field = tiny_field()
+    with pytest.raises(ValueError, match="camera cam00: its distortion"):
+        field.fit([_lens(1e30, 0.0, 0.0, 0.0)], Budget(steps=2))
+    assert field.step == 0 and not field.view_store.memory
+    assert field.fit([VIEW], Budget(steps=2)).steps == 2
 
 
 def test_pixels_move_where_they_change_beyond_the_noise_and_two_around() -> None:

@@ -35,22 +35,6 @@ TINY = NerfactoSettings(
     anneal=40,
     threads=2,
 )
-POISONED = NerfactoSettings(
-    levels=6,
-    levels_every=10,
-    log2_table=12,
-    finest_resolution=64,
-    bins=48,
-    proposal_cells=32,
-    hidden=16,
-    rays=512,
-    batch_samples=4096,
-    samples=16,
-    samples_start=16,
-    samples_ramp=100,
-    cells=32,
-    threads=2,
-)
 REACHED_DB = {
     "held out": 23.0,
     "moved": 21.15,

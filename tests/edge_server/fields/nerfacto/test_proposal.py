@@ -271,7 +271,7 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
     assert not dirty[0] and dirty.any()
 
 
-def test_appearances_equal_the_oracle_and_finite_differences() -> None:
+def test_appearances_equal_the_oracle() -> None:
     rng = np.random.default_rng(5)
     size, row, a, b = 2, 4, 3, 17
     raw, embedding = rng.normal(size=(12, 20)).astype(F), rng.normal(size=size).astype(F)
@@ -294,13 +294,6 @@ def test_appearances_equal_the_oracle_and_finite_differences() -> None:
     assert shares.grad is not None and e.grad is not None
     np.testing.assert_allclose(d_out[4:10, a:b], shares.grad.numpy()[4:10, a:b], atol=1e-5)
     np.testing.assert_allclose(d_embedding, e.grad.numpy(), rtol=1e-5, atol=1e-5)
-    for k in range(size):
-        step = torch.zeros(size, dtype=torch.float64)
-        step[k] = 1e-4
-        with torch.no_grad():
-            both = oracle(shares, e + step) - oracle(shares, e - step)
-        slope = (both * torch.as_tensor(wanted[:, a:b])).sum().item() / 2e-4
-        assert slope == pytest.approx(d_embedding[k], rel=1e-4)
 
 
 def test_a_whole_steps_gradients_equal_finite_differences() -> None:

@@ -30,19 +30,6 @@ TINY = NgpSettings(
     cells=16,
     threads=2,
 )
-POISONED = NgpSettings(
-    levels=6,
-    levels_every=10,
-    log2_table=12,
-    finest_resolution=64,
-    hidden=16,
-    rays=512,
-    batch_samples=4096,
-    samples=64,
-    samples_ramp=100,
-    cells=32,
-    threads=2,
-)
 REACHED_DB = {
     "held out": 23.25,
     "moved": 21.77,

@@ -25,10 +25,8 @@ def test_the_smoothing_applied_is_the_same_whatever_the_number_of_rays(name: str
     np.testing.assert_allclose(applied[0], applied[1], rtol=1e-5, atol=1e-5)
     side = int(field._encoding.resolution[0]) + 1
     cube = field._encoding.table[: side**3].reshape(side, side, side, 2).astype(np.float64)
-    at = cube[3, 3, 3]
-    around = [
-        cube[3 + a, 3 + b, 3 + c] for a, b, c in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-    ]
+    at, sides = cube[3, 3, 3], np.eye(3, dtype=int)
+    around = cube[tuple((3 + np.concatenate([sides, -sides])).T)]
     # Every fourth step, four times the weight.
     np.testing.assert_allclose(
         applied[0][3 * (side * side + side + 1)], 4 * 0.5 * (6 * at - around.sum(axis=0)), rtol=1e-4

@@ -10,7 +10,6 @@ from edge_server.fields.splat.still_field import StillField
 FIELD = StillField
 SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)
 TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
-POISONED = SplatSettings(gaussians=600, start=400, seed_cells=24, densify_every=20, threads=2)
 FINITE = ("params", "m", "v", "slope", "looks", "reach", "behind")
 REACHED_DB = {
     "held out": 23.1,

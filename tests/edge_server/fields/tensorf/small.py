@@ -30,19 +30,6 @@ TINY = TensorfSettings(
     cells=16,
     threads=2,
 )
-POISONED = TensorfSettings(
-    color_rank=8,
-    resolution_start=16,
-    resolution=48,
-    upsample=(40, 100),
-    hidden=16,
-    rays=512,
-    batch_samples=4096,
-    samples=64,
-    samples_ramp=100,
-    cells=32,
-    threads=2,
-)
 REACHED_DB = {
     "held out": 24.76,
     "moved": 24.16,

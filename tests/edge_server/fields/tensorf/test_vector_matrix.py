@@ -105,18 +105,6 @@ def test_gradient_equals_the_oracle() -> None:
     assert (dirty >= touched).all() and not dirty.all()
 
 
-def test_gradient_equals_finite_differences() -> None:
-    planes, (x, rng) = _planes(), _points(20)
-    d, counts = rng.normal(size=(2, 49, 20)).astype(np.float32), np.array([20, 20])
-    gradient, _ = _gradient(planes, x, d, counts)
-    table = torch.as_tensor(planes.table, dtype=torch.float64)
-    for row, column in [tuple(at) for at in np.argwhere(gradient != 0)[::97]]:
-        step = torch.zeros_like(table)
-        step[row, column] = 1e-4
-        slope = _loss(planes, table + step, x, d, counts) - _loss(planes, table - step, x, d, counts)
-        assert slope.item() / 2e-4 == pytest.approx(gradient[row, column], rel=1e-3, abs=1e-4)
-
-
 @pytest.mark.parametrize("new", [17, 31])
 def test_finer_planes_say_the_same(new: int) -> None:
     """Exactly at 2 n - 1 vertices a side; nearly, otherwise."""

@@ -1,4 +1,4 @@
-"""Hash encoding: forward and table gradient against plain torch, and against finite differences."""
+"""Hash encoding: forward and table gradient against plain torch."""
 
 from __future__ import annotations
 
@@ -25,15 +25,10 @@ def _case(points: int, chunks: int = 2):
     return grid, x, rng
 
 
-def test_some_levels_are_dense_and_some_are_hashed() -> None:
-    grid, _, _ = _case(4)
-    assert grid.dense.any() and not grid.dense.all()
-    assert (np.diff(grid.first) % SEGMENT == 0).all()
-
-
 @pytest.mark.parametrize("levels", [5, 3])
 def test_features_equal_the_oracle(levels: int) -> None:
     grid, x, _ = _case(300)
+    assert grid.dense.any() and not grid.dense.all()
     features = np.full((12, 300), np.nan, np.float32)
     encode(grid, levels, x[0], 0, 300, features)
     expected = torch_model.encode(torch_model.to_torch(grid), levels, torch.as_tensor(x[0].T))
@@ -86,7 +81,7 @@ def _smoothed(grid: Grid, levels: int, dirty: NDArray[np.bool_]) -> NDArray[np.f
     return gradient
 
 
-def test_gradient_of_the_variation_equals_the_oracle_and_finite_differences() -> None:
+def test_gradient_of_the_variation_equals_the_oracle() -> None:
     grid, _, _ = _case(2)
     everywhere = np.ones(len(grid.table) // SEGMENT, np.bool_)
     gradient = _smoothed(grid, 4, everywhere)
@@ -94,13 +89,6 @@ def test_gradient_of_the_variation_equals_the_oracle_and_finite_differences() ->
     (0.3 * _variation(grid, 4, table)).backward()
     assert table.grad is not None
     np.testing.assert_allclose(gradient, table.grad.numpy(), atol=1e-5)
-    for row in (0, 7, int(grid.first[1]) + 3):
-        both = []
-        for sign in (1.0, -1.0):
-            moved = table.detach().clone()
-            moved[row, 1] += sign * 1e-5
-            both.append(0.3 * _variation(grid, 4, moved).item())
-        assert gradient[row, 1] == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-3, abs=1e-5)
     assert not gradient[grid.first[np.flatnonzero(~grid.dense)[0]] :].any(), "a hashed level was smoothed"
     assert not _smoothed(grid, 1, everywhere)[grid.first[1] :].any(), "a level that is off was smoothed"
 
