@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from camera_node.config import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
@@ -99,7 +100,7 @@ def open_stage(
 
 def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None) -> Stage:
     if size is not None:
-        source = replace(source, width=size, height=size)
+        source = structs.replace(source, width=size, height=size)
     scene, _ = exact_scene(scenario, source)
     lens, pose = next(iter(scene.cameras.values()))
     target = np.asarray(scene.target)
