@@ -28,6 +28,10 @@ FIGURES ?= all viewpoints preferences learning
 JOBS ?=
 STUDY ?=
 
+# Options of `make mutants`: seed and number of edits.
+SEED ?= 1
+COUNT ?= 200
+
 # Options of `make images`: docker or podman, and more for its build, such as --build-arg TORCH=cpu.
 ENGINE ?= docker
 BUILD ?=
@@ -57,7 +61,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format types bench figures proto proto-check lock images clean
+.PHONY: help demo test lint format types bench figures mutants proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -105,6 +109,9 @@ figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/th
 	done  # after Ctrl-C the same command goes on
 	@mkdir -p docs/results/thesis
 	cp $$(ls -d runs/figures/*.json runs/figures/*.csv runs/figures/*.png runs/figures/*.md 2>/dev/null) docs/results/thesis
+
+mutants: .venv/.ok-test  ## careless edits drawn from a seed, and whether quick tests notice, hours: SEED=1 COUNT=200
+	$(PY) -m tests.mutation_sample --seed $(SEED) --count $(COUNT)
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)

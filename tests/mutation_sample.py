@@ -1,0 +1,292 @@
+"""Draw careless edits from a seed, and see whether the nearest quick tests notice.
+
+    python -m tests.mutation_sample --seed 1 --count 200                 # resumes; hours on two cores
+    python -m tests.mutation_sample --seed 1 --count 200 --part 1/2      # half of them, beside another process
+    python -m tests.mutation_sample --seed 1 --count 200 --only 7,31
+
+cosmic-ray makes the edits (operators, comparisons, numbers, conditions, loops); this draws a sample of them, spread
+over the rooms by lines, and runs for each the tests beside the file: those of the same name, then the others of their
+folder. Slow tests are left out. Each edit is written into a copy of the checkout, where nothing else is changed.
+
+(cosmic-ray by itself runs one command for every edit of a file, in the checkout; mutmut imports everything through
+trampolines, which numba cannot compile.)
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401 -- loaded once, before the forks
+import hypothesis.strategies  # noqa: F401
+import numba  # noqa: F401
+import pytest
+import scipy.stats
+import torch  # noqa: F401
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator
+
+from edge_server.experiments.engine.result_store import ResultStore
+
+ROOT = Path(__file__).resolve().parent.parent
+# Folders of sources, and where their tests are.
+SOURCES = {
+    "proto/freshfield": "tests/freshfield",
+    "camera_node": "tests/camera_node",
+    "channel_emu": "tests/channel_emu",
+    "edge_server": "tests/edge_server",
+    "deploy/freshfield_up": "tests/deploy",
+}
+_SWAPS = {
+    "Binary": "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd "
+    "LShift_RShift RShift_LShift",
+    "Comparison": "Lt_LtE LtE_Lt Gt_GtE GtE_Gt Lt_Gt Gt_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is",
+    "Unary": "USub_UAdd Delete_Not",
+}
+OPERATORS = (
+    *(f"core/Replace{kind}Operator_{swap}" for kind, swaps in _SWAPS.items() for swap in swaps.split()),
+    *(f"core/Replace{a}With{b}" for a, b in (("True", "False"), ("False", "True"), ("And", "Or"), ("Or", "And"))),
+    *(f"core/Replace{a}With{b}" for a, b in (("Break", "Continue"), ("Continue", "Break"))),
+    "core/NumberReplacer",
+    "core/AddNot",
+    "core/ZeroIterationForLoop",
+)
+# What these hold is not computed with: messages, types, names of modules, what a file does when it is run.
+_PASSED_OVER = (ast.Raise, ast.JoinedStr, ast.Assert, ast.Import, ast.ImportFrom)
+_SPOKEN = ("print(", "log.", "__name__ ==")
+_SELECT = "not slow and not browser and not chaos"
+_LEAST_LIMIT_S, _TIMES = 30.0, 5.0
+_COMPILING_S = 600.0  # more for an edit of a kernel: all kernels are compiled anew
+Span = tuple[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Edit:
+    """An edit: the ``occurrence``-th that an operator of cosmic-ray makes in a file."""
+
+    file: str
+    operator: str
+    occurrence: int
+    line: int
+
+    def made(self) -> str:
+        """The file's text after the edit."""
+        made = mutate_code((ROOT / self.file).read_text(), get_operator(self.operator)(), self.occurrence)
+        assert made is not None
+        return str(made)
+
+    def text(self) -> str:
+        """What it changes, for people."""
+        before, after = (ROOT / self.file).read_text().splitlines(), self.made().splitlines()
+        old, new = next(((a, b) for a, b in zip(before, after) if a != b), ("", ""))
+        return f"{self.file}:{self.line}: {old.strip()}  ->  {new.strip()}"
+
+
+def files() -> list[str]:
+    """The source files, generated ones left out."""
+    listed = subprocess.run(
+        ["git", "-C", str(ROOT), "ls-files", *SOURCES], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    generated = ("_pb2.py", "_pb2_grpc.py")
+    return [name for name in listed if name.endswith(".py") and not name.endswith(generated)]
+
+
+def room(file: str) -> str:
+    """The room of a file: two folders, in experiments three."""
+    parts = Path(file).parent.parts
+    return "/".join(parts[: 3 if "experiments" in parts else 2])
+
+
+def places(file: str) -> dict[Span, list[Edit]]:
+    """The edits of each place of a file."""
+    source = (ROOT / file).read_text()
+    passed, nodes = list(_passed_over(ast.parse(source))), list(ast_nodes(get_ast(source)))
+    found: dict[Span, list[Edit]] = defaultdict(list)
+    for name in OPERATORS:
+        operator, occurrence = get_operator(name)(), 0
+        for node in nodes:
+            for start, end in operator.mutation_positions(node):
+                if not any(first <= start and end <= last for first, last in passed):
+                    found[start, end].append(Edit(file, name, occurrence, start[0]))
+                occurrence += 1
+    return found
+
+
+def _passed_over(tree: ast.AST) -> Iterator[Span]:
+    for node in ast.walk(tree):
+        spoken = isinstance(node, ast.Call | ast.Compare) and ast.unparse(node).startswith(_SPOKEN)
+        skipped: list[Any] = [node] if spoken or isinstance(node, _PASSED_OVER) else []
+        skipped += [getattr(node, name, None) for name in ("annotation", "returns")]
+        skipped += getattr(node, "decorator_list", [])
+        for part in skipped:
+            if part is not None:
+                yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
+
+
+def drawn(seed: int, count: int) -> list[Edit]:
+    """``count`` edits: of each room as its share of the lines, a place of its files, then one of the place's edits."""
+    lines: dict[str, int] = defaultdict(int)
+    of_room: dict[str, list[str]] = defaultdict(list)
+    for file in files():
+        lines[room(file)] += len((ROOT / file).read_text().splitlines())
+        of_room[room(file)].append(file)
+    rng, chosen = random.Random(seed), []
+    for name, number in _shares(lines, count).items():
+        if number:
+            every = [edits for file in of_room[name] for _, edits in sorted(places(file).items())]
+            chosen += [rng.choice(edits) for edits in rng.sample(every, min(number, len(every)))]
+    rng.shuffle(chosen)  # so that a part of them is spread, too
+    return chosen
+
+
+def _shares(lines: dict[str, int], count: int) -> dict[str, int]:
+    """``count`` divided in proportion to the lines, by largest remainders."""
+    exact = {name: count * n / sum(lines.values()) for name, n in lines.items()}
+    found = {name: int(share) for name, share in exact.items()}
+    rest = sorted(exact, key=lambda name: found[name] - exact[name])
+    for name in rest[: count - sum(found.values())]:
+        found[name] += 1
+    return found
+
+
+def nearest_tests(file: str) -> list[list[str]]:
+    """Tests to run in turn: those of the file's name, then the others of their folder, or of the first folder above
+    that has any."""
+    source = next(folder for folder in SOURCES if file.startswith(f"{folder}/"))
+    path = Path(file)
+    folder = ROOT / SOURCES[source] / path.parent.relative_to(source)
+    while not list(folder.glob("test_*.py")):
+        folder = folder.parent
+    every = sorted(str(test.relative_to(ROOT)) for test in folder.glob("test_*.py"))
+    same = [test for test in every if Path(test).stem.startswith(f"test_{path.stem}")]
+    return [tests for tests in (same, [test for test in every if test not in same]) if tests]
+
+
+def passes(copy: Path, tests: Sequence[str], limit_s: float) -> bool:
+    """Whether tests pass in the copy within the time, in a fork that has all libraries."""
+    until_s = time.monotonic() + limit_s
+    child = os.fork()
+    if not child:
+        os.setsid()
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        os.chdir(copy)
+        sys.path[:0] = [str(copy / part) for part in ("proto", "", "deploy")]
+        ours = {"tests", "freshfield", "camera_node", "channel_emu", "edge_server", "freshfield_up"}
+        for name in [name for name in sys.modules if name.partition(".")[0] in ours]:
+            del sys.modules[name]
+        code = pytest.main(["-qx", "-m", _SELECT, "-p", "no:cacheprovider", "-p", "no:randomly", *tests])
+        os._exit(0 if code in (0, 5) else 1)  # 5: none is quick
+    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
+        if time.monotonic() > until_s:
+            os.killpg(child, signal.SIGKILL)
+        time.sleep(0.05)
+    return ended[1] == 0
+
+
+class Runner:
+    """Runs edits in a copy of the checkout."""
+
+    def __init__(self, copy: Path) -> None:
+        self.copy = copy
+        listed = subprocess.run(["git", "-C", str(ROOT), "ls-files"], capture_output=True, text=True, check=True).stdout
+        for name in listed.splitlines():
+            if (ROOT / name).is_file():
+                (copy / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, copy / name)
+        self._taken_s = cache(self._taken)
+
+    def outcome(self, edit: Edit) -> dict[str, Any]:
+        """{caught_by: the tests that fail with the edit, or None; broken: tests that fail without it}."""
+        broken: list[str] = []
+        for tests in nearest_tests(edit.file):
+            taken_s = self._taken_s(tuple(tests))
+            if taken_s is None:
+                broken += tests
+                continue
+            limit_s = _LEAST_LIMIT_S + _TIMES * taken_s + (_COMPILING_S if "/kernels/" in edit.file else 0.0)
+            (self.copy / edit.file).write_text(edit.made())
+            try:
+                if not passes(self.copy, tests, limit_s):
+                    return {"caught_by": tests, "broken": broken}
+            finally:
+                shutil.copy2(ROOT / edit.file, self.copy / edit.file)
+        return {"caught_by": None, "broken": broken}
+
+    def _taken(self, tests: tuple[str, ...]) -> float | None:
+        """Seconds of the tests without an edit, in which kernels may be compiled; None: they fail."""
+        begun = time.monotonic()
+        return time.monotonic() - begun if passes(self.copy, tests, 1800.0) else None
+
+
+def share(caught: int, total: int) -> str:
+    """The caught share with its 95 % interval (Wilson)."""
+    if not total:
+        return "nothing was run"
+    low, high = scipy.stats.binomtest(caught, total).proportion_ci(method="wilson")
+    return f"{caught} of {total} caught: {caught / total:.1%} [{low:.1%}, {high:.1%}]"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns 1 if an edit survives."""
+    parser = argparse.ArgumentParser("mutation_sample", None, __doc__, formatter_class=argparse.RawTextHelpFormatter)
+    add = parser.add_argument
+    add("--seed", type=int, default=1, help="seed of the sample [%(default)s]")
+    add("--count", type=int, default=200, help="number of edits [%(default)s]")
+    add("--only", type=lambda text: [int(n) for n in text.split(",")], metavar="K,...", help="only these of them")
+    add("--part", default="1/1", metavar="K/N", help="only the K-th of N parts [%(default)s]")
+    add("--list", action="store_true", help="print the sample, and run nothing")
+    add("--out", type=Path, default="runs/mutants.jsonl", metavar="FILE", help="where results are kept [%(default)s]")
+    args = parser.parse_args(argv)
+    part, parts = map(int, args.part.split("/"))
+    sample = [
+        (number, edit)
+        for number, edit in enumerate(drawn(args.seed, args.count))
+        if number % parts == part - 1 and (args.only is None or number in args.only)
+    ]
+    if args.list:
+        print("\n".join(f"{number:3} {edit.text()}" for number, edit in sample))
+        return 0
+    store, outcomes = ResultStore(args.out), []
+    with tempfile.TemporaryDirectory(prefix="freshfield-mutants-") as folder:
+        runner = None
+        for number, edit in sample:
+            source = hashlib.sha256((ROOT / edit.file).read_bytes()).hexdigest()[:16]
+            key = f"{source} {edit.file} {edit.operator} {edit.occurrence}"
+            if key not in store.results:
+                runner = runner or Runner(Path(folder))
+                store.put(key, {**asdict(edit), "text": edit.text()}, runner.outcome(edit))
+            found = store.results[key]
+            word = "SURVIVED" if found["caught_by"] is None else "caught"
+            note = f" (fail without it: {', '.join(found['broken'])})" if found["broken"] else ""
+            print(f"{number:3} {word:8} {edit.text()}{note}", flush=True)
+            outcomes.append((edit, found["caught_by"] is not None))
+    print(f"\nsurvivors of seed {args.seed}:")
+    for edit, _ in (one for one in outcomes if not one[1]):
+        print(f"  {edit.text()}")
+    for name in sorted({room(edit.file) for edit, _ in outcomes}):
+        of = [caught for edit, caught in outcomes if room(edit.file) == name]
+        print(f"{name:40} {sum(of)} of {len(of)}")
+    caught = sum(was for _, was in outcomes)
+    print(share(caught, len(outcomes)))
+    return int(caught < len(outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
