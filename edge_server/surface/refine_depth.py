@@ -20,18 +20,8 @@ from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
-from edge_server.surface.kernels.patch_match import (
-    SOURCES,
-    WORST,
-    Images,
-    Planes,
-    Search,
-    View,
-    choose_sources,
-    confirm,
-    match,
-    offer,
-)
+from edge_server.surface.kernels.patch_images import Images, Planes, Search, View
+from edge_server.surface.kernels.patch_match import SOURCES, WORST, choose_sources, confirm, match, offer
 
 REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
 GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness

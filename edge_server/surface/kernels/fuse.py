@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.surface.kernels.lens import distort
 
 SIDE = 8  # voxels per side of a block
 CELLS = SIDE**3
@@ -51,20 +52,6 @@ class Blocks(NamedTuple):
     distance: NDArray[np.float32]
     weight: NDArray[np.float32]
     color: NDArray[np.float32]
-
-
-@njit(inline="always")
-def _distort(look, a, b):
-    """Distorted normalised coordinates; NaN far outside, where the polynomial folds back into the picture."""
-    k1, k2, p1, p2 = look.lens[4], look.lens[5], look.lens[6], look.lens[7]
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (k1 + r2 * k2)
-    if not (radial > 0.0 and r2 < 16.0):
-        return np.nan, np.nan
-    return (
-        a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
-        b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
-    )
 
 
 @njit(inline="always")
@@ -138,7 +125,7 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
             over = 1.0 / deep
             u, v = (r00 * x + r10 * y + r20 * z) * over, (r01 * x + r11 * y + r21 * z) * over
             if distorted:
-                u, v = _distort(look, u, v)
+                u, v = distort(u, v, look.lens[4], look.lens[5], look.lens[6], look.lens[7])
             u, v = fx * u + cx, fy * v + cy
             if not (u >= 0.0 and v >= 0.0 and u < f_width and v < f_height):
                 continue

@@ -11,13 +11,11 @@ is not, and on surfaces that only shading varies it alone locates the surface.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
+from edge_server.surface.kernels.patch_images import depth_shown, offset_to, project, within
 
 SOURCES = 5  # images that a pixel is compared with
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
@@ -36,100 +34,6 @@ SMOOTH_PX = 2.0
 BETTER = np.float32(1e-4)  # a plane replaces another if it is cheaper by this
 LEAST_DEG, BEST_DEG, SPREAD_DEG, MOST_DEG = 3.0, 25.0, 15.0, 70.0  # between two images' lines of sight
 HIDDEN = 0.02  # a surface nearer by this share of the distance hides a point
-
-
-class Images(NamedTuple):
-    """N images with P pixels together.
-
-    lens: float64 (N, 8), fx fy cx cy k1 k2 p1 p2.
-    rotation, origin: float64 (N, 3, 3), camera-to-world, and (N, 3), meters.
-    first: int64 (N + 1,), each image's first pixel. size: int64 (N, 2), width and height.
-    gray, depth: float32 (P,), row by row: gray levels, and meters along the ray (0: unknown).
-    """
-
-    lens: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    first: NDArray[np.int64]
-    size: NDArray[np.int64]
-    gray: NDArray[np.float32]
-    depth: NDArray[np.float32]
-
-
-class View(NamedTuple):
-    """The image whose planes are sought.
-
-    index: its number in ``Images``. rays: float64 (H, W, 3), world, unit. gray: float32 (H, W).
-    chosen: int16 (H, W, SOURCES), images to compare each pixel with, best first; -1: none.
-    """
-
-    index: int
-    rays: NDArray[np.float64]
-    gray: NDArray[np.float32]
-    chosen: NDArray[np.int16]
-
-
-class Planes(NamedTuple):
-    """A plane per pixel. depth: float32 (H, W), meters along the ray; 0: none. normal: float32 (H, W, 3),
-    unit, world, towards the camera. cost: float32 (H, W)."""
-
-    depth: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    cost: NDArray[np.float32]
-
-
-class Search(NamedTuple):
-    """What one pass tries.
-
-    wide: number of planes with random normal. reach: how far their depth is from ``guess``, as a share of it.
-    share, turn: largest random changes of depth (as a share of it) and of the normal.
-    geometric: weight of the distance, pixels, to where the other image's depth leads back to.
-    """
-
-    wide: int
-    reach: float
-    share: float
-    turn: float
-    geometric: float
-
-
-@part
-def _project(images, s, x, y, z):
-    """Project a world point to image s; -1e9 if behind the camera or far outside."""
-    x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]
-    r, lens = images.rotation, images.lens
-    deep = r[s, 0, 2] * x + r[s, 1, 2] * y + r[s, 2, 2] * z
-    if not deep > 1e-6:
-        return -1e9, -1e9
-    a = (r[s, 0, 0] * x + r[s, 1, 0] * y + r[s, 2, 0] * z) / deep
-    b = (r[s, 0, 1] * x + r[s, 1, 1] * y + r[s, 2, 1] * z) / deep
-    k1, k2, p1, p2 = lens[s, 4], lens[s, 5], lens[s, 6], lens[s, 7]
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (k1 + r2 * k2)
-    if not (radial > 0.0 and r2 < 16.0):
-        return -1e9, -1e9
-    u = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-    v = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-    return lens[s, 0] * u + lens[s, 2], lens[s, 1] * v + lens[s, 3]
-
-
-@part
-def _within(images, s, u, v, margin):
-    """Whether (u, v) lies in image s, ``margin`` pixels from its border or more."""
-    return u >= margin and v >= margin and u < images.size[s, 0] - margin and v < images.size[s, 1] - margin
-
-
-@part
-def _shown(images, s, u, v):
-    """Depth of image s at the pixel of (u, v)."""
-    return np.float64(images.depth[images.first[s] + np.int64(v) * images.size[s, 0] + np.int64(u)])
-
-
-@part
-def _to(images, s, x, y, z):
-    """Direction (not unit) from camera s to a point, and distance."""
-    x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]
-    return x, y, z, np.sqrt(x * x + y * y + z * z)
 
 
 @kernel
@@ -156,10 +60,10 @@ def choose_sources(counter, worker, images, view, planes, visible):
                 nz = np.float64(planes.normal[row, column, 2])
                 x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
                 for s in range(images.first.size - 1):
-                    u, v = _project(images, s, x, y, z)
-                    if s == k or not _within(images, s, u, v, PATCH_RADIUS_PX):
+                    u, v = project(images, s, x, y, z)
+                    if s == k or not within(images, s, u, v, PATCH_RADIUS_PX):
                         continue
-                    ex, ey, ez, far = _to(images, s, x, y, z)
+                    ex, ey, ez, far = offset_to(images, s, x, y, z)
                     cosine = min(1.0, max(-1.0, (ex * rx + ey * ry + ez * rz) / far))
                     apart = np.degrees(np.arccos(cosine))
                     if not (apart >= LEAST_DEG and apart <= MOST_DEG):
@@ -167,7 +71,7 @@ def choose_sources(counter, worker, images, view, planes, visible):
                     off = (apart - BEST_DEG) / SPREAD_DEG
                     facing = -(ex * nx + ey * ny + ez * nz) / far
                     good = np.exp(-0.5 * off * off) * min(1.0, max(2.0 * facing, 0.2))
-                    shown = _shown(images, s, u, v)
+                    shown = depth_shown(images, s, u, v)
                     if visible and shown > 0.0 and shown < far * (1.0 - HIDDEN):
                         good *= 0.1
                     if good > score[SOURCES - 1]:
@@ -244,12 +148,12 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         s = np.int64(view.chosen[row, column, i])
         if s < 0:
             break
-        u, v = _project(images, s, x, y, z)
-        ur, vr = _project(images, s, ax, ay, az)
-        ud, vd = _project(images, s, bx, by, bz)
+        u, v = project(images, s, x, y, z)
+        ur, vr = project(images, s, ax, ay, az)
+        ud, vd = project(images, s, bx, by, bz)
         ux, vx, uy, vy = right * (ur - u), right * (vr - v), below * (ud - u), below * (vd - v)
         margin = 1.0 + PATCH_RADIUS_PX * max(abs(ux) + abs(uy), abs(vx) + abs(vy))
-        if not _within(images, s, u, v, margin):
+        if not within(images, s, u, v, margin):
             continue
         u0, v0 = np.float32(u - 0.5), np.float32(v - 0.5)
         fux, fvx, fuy, fvy = np.float32(ux), np.float32(vx), np.float32(uy), np.float32(vy)
@@ -289,13 +193,13 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
 def _way_back(images, k, s, row, column, u, v, x, y, z):
     """Pixels between a pixel of image k and where the depth of image s, in which its point (x, y, z) is at
     (u, v), leads back to; MOST_PX at most."""
-    shown = _shown(images, s, u, v)
+    shown = depth_shown(images, s, u, v)
     if not shown > 0.0:
         return MOST_PX
-    ex, ey, ez, far = _to(images, s, x, y, z)
+    ex, ey, ez, far = offset_to(images, s, x, y, z)
     far = shown / far
     ox, oy, oz = images.origin[s, 0], images.origin[s, 1], images.origin[s, 2]
-    u, v = _project(images, k, ox + far * ex, oy + far * ey, oz + far * ez)
+    u, v = project(images, k, ox + far * ex, oy + far * ey, oz + far * ez)
     u, v = u - column - 0.5, v - row - 0.5
     return min(MOST_PX, np.sqrt(u * u + v * v))
 
@@ -336,10 +240,10 @@ def offer(counter, worker, images, points, normals, costs, owners, nearest, winn
             if owners[m] == k:
                 continue
             x, y, z = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
-            u, v = _project(images, k, x, y, z)
-            if not _within(images, k, u, v, 0):
+            u, v = project(images, k, x, y, z)
+            if not within(images, k, u, v, 0):
                 continue
-            x, y, z, far = _to(images, k, x, y, z)
+            x, y, z, far = offset_to(images, k, x, y, z)
             if not normals[m, 0] * x + normals[m, 1] * y + normals[m, 2] * z < -LEAST_COS * far:
                 continue
             value = np.float32(far) if nearest else costs[m]
@@ -477,11 +381,11 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
                 s = np.int64(view.chosen[row, column, i])
                 if s < 0:
                     break
-                u, v = _project(images, s, x, y, z)
-                if not _within(images, s, u, v, 0):
+                u, v = project(images, s, x, y, z)
+                if not within(images, s, u, v, 0):
                     continue
-                shown = _shown(images, s, u, v)
-                _, _, _, far = _to(images, s, x, y, z)
+                shown = depth_shown(images, s, u, v)
+                _, _, _, far = offset_to(images, s, x, y, z)
                 tolerance = (share + 1.0 / min(images.lens[s, 0], images.lens[s, 1])) * far
                 if abs(shown - far) <= tolerance:
                     agree[row, column] += 1

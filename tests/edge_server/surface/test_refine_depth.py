@@ -12,6 +12,7 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
+from edge_server.surface.kernels.patch_images import Images, Planes, View
 from edge_server.surface.kernels.patch_match import (
     DIFFERENCE,
     FADE,
@@ -22,9 +23,6 @@ from edge_server.surface.kernels.patch_match import (
     SIMILAR,
     SOURCES,
     WORST,
-    Images,
-    Planes,
-    View,
     choose_sources,
 )
 from edge_server.surface.refine_depth import UNSURE, exposures, refine_depth, smooth_normals
