@@ -10,7 +10,7 @@ from edge_server.config import read_config
 from edge_server.live.frontier import Frontier, FrontierPoint
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
-from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
+from edge_server.page.colors import HELD_OUT, STALE, css
 from edge_server.page.panel import age_parts_ms
 from freshfield.scenario import ScenarioError, parse
 
@@ -74,14 +74,6 @@ def test_unknown_values_are_dashes():
     assert html.count("&ndash;") == 4
     assert "nan" not in html and "None" not in html
     assert markup.number(float("inf")) == "&infin;"  # PSNR of equal images
-
-
-def test_a_tile_s_name_may_wrap_and_a_swatch_stays_beside_its_word():
-    html = markup.status(summary(scored_on=None, age_parts_ms={"network": 50.0}))
-    assert 'white-space:normal">PSNR on held-out views<' in html
-    assert 'white-space:nowrap">&#9473; omega</span>' in markup.chart_caption("age", [("omega", STALE)])
-    swatch = f'<span style="color:{css(scale_color(0.0))}">&#9632;</span>'
-    assert f'white-space:nowrap">{swatch} network 50</span>' in html
 
 
 def test_what_comes_from_outside_is_escaped():

@@ -245,49 +245,6 @@ def test_a_picture_of_what_is_newer_takes_no_longer_than_its_share_of_an_update(
     assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s
 
 
-@pytest.mark.slow  # 6 s
-def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
-    """200 publications a second and a restless visitor: images, text and pictures keep their rates."""
-    with preview_page(tmp_path, cameras=9) as (preview, page), Visitor(page.port) as visitor:
-        visitor.wait_for(lambda: visitor.images > 0, "an image")
-        before, images, began = visitor.counts.copy(), visitor.images, time.monotonic()
-        number = 1000
-        while (seconds := time.monotonic() - began) < 5.0:
-            preview.state.publish(publication(number), BallScene(seconds))
-            visitor.stand_at((4.0, np.sin(seconds), 3.0))
-            number += 1
-            time.sleep(0.005)
-        sent = visitor.counts - before
-        assert 2 <= visitor.images - images <= 25 * seconds
-        # Two refreshes a second of some ten elements, nine frustums' colors and pictures.
-        assert sent["GuiUpdateMessage"] <= 2 * 12 * (seconds + 1)
-        assert sent["SceneNodeUpdateMessage"] <= 9 * 5 * (seconds + 1)
-        assert visitor.bytes / seconds < 3e6
-
-
-@pytest.mark.slow  # 6 s
-def test_a_visitor_who_does_not_read_costs_no_memory_and_delays_nobody(tmp_path):
-    with (
-        preview_page(tmp_path) as (_, page),
-        Visitor(page.port, reads=False) as stuck,
-        Visitor(page.port, (0.0, 4.0, 3.0)) as visitor,
-    ):
-        visitor.wait_for(lambda: visitor.images > 2, "images for who does read")
-        handle = page._server.get_clients()[0]
-        waiting = handle._websock_connection._state.message_buffer.message_from_id
-        noise = np.random.default_rng(0).integers(0, 256, (800, 1200, 3), dtype=np.uint8)
-        for _ in range(40):  # more than the network itself can hold
-            handle.scene.set_background_image(noise)
-            time.sleep(0.05)
-        for i in range(40):
-            stuck.stand_at((4.0, 0.05 * i, 3.0))
-            time.sleep(0.05)
-        # What is not read is replaced, not queued: at most one image and the starting place.
-        assert 1 <= len(waiting) <= 12
-        at = visitor.images
-        visitor.wait_for(lambda: visitor.images > at, "an image for who does read")
-
-
 def test_nothing_is_rendered_without_visitors(tmp_path):
     broken = Broken()
     state = bare_state()
@@ -351,14 +308,6 @@ def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
             visitor.wait_for(lambda: visitor.counts["GuiUpdateMessage"] > at, "the table")
     finally:
         page.stop()
-
-
-def test_no_visitor_can_open_a_public_tunnel(tmp_path, caplog):
-    with preview_page(tmp_path) as (_, page), Visitor(page.port) as visitor:
-        visitor.wait_for(lambda: visitor.counts["GuiHtmlMessage"] > 0, "the panel")
-        visitor.send("ShareUrlRequest")
-        wait_until(lambda: "that visitors do not send" in caplog.text, "no log entry")
-        assert page._server._share_tunnel is None
 
 
 # --- helpers -----------------------------------------------------------------------------------

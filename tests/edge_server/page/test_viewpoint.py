@@ -15,7 +15,7 @@ from edge_server.page.viewpoint import (
     visitor_camera,
     world_up,
 )
-from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse, so3_exp
+from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.preview import BallScene
 
 TARGET = np.array([1.0, -2.0, 0.5])
@@ -52,14 +52,6 @@ def test_up_is_vertical_although_the_cameras_look_down(elevation_deg):
     assert np.allclose(world_up(poses), (0, 0, 1), atol=1e-9)
     poses[:, :3, :2] *= -1  # held upside down
     assert np.allclose(world_up(poses), (0, 0, -1), atol=1e-9)
-
-
-def test_up_of_a_shaky_hand_is_nearly_vertical():
-    rng = np.random.default_rng(3)
-    poses = rig(40, 120, 30)
-    for pose in poses:
-        pose[:3, :3] = pose[:3, :3] @ so3_exp(rng.normal(0, 0.05, 3))
-    assert world_up(poses) @ (0, 0, 1) > np.cos(np.deg2rad(3))
 
 
 def test_up_without_a_common_level_is_the_cameras_own():
@@ -104,13 +96,6 @@ def test_one_camera_uses_the_fields_box_or_else_what_is_before_it():
     alone = initial_viewpoint(pose)
     ahead = alone.look_at - pose[0, :3, 3]
     assert np.allclose(ahead / np.linalg.norm(ahead), pose[0, :3, 2], atol=1e-6)
-
-
-def test_cameras_that_look_straight_down_and_cameras_in_one_place():
-    for poses in (np.stack([look_at((0, 0, 5), (0, 0, 0))] * 3), np.stack([np.eye(4)] * 4)):
-        view = initial_viewpoint(poses)
-        assert all(np.isfinite(v).all() for v in (view.position, view.look_at, view.up))
-        assert np.linalg.norm(view.position - view.look_at) > 0.5 * view.radius_m
 
 
 @settings(max_examples=150, deadline=None)

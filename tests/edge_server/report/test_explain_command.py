@@ -88,8 +88,3 @@ def test_what_cannot_be_explained_is_said_in_one_line(tmp_path, capsys, words, s
     assert main([str(tmp_path), *words]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
-
-
-def test_a_run_without_decisions_says_so(tmp_path, capsys):
-    assert main([str(tmp_path)]) == 2
-    assert "bandit:FILE" in capsys.readouterr().err

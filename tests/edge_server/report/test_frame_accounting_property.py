@@ -30,34 +30,6 @@ EVENTS = {
 }
 
 
-def lines_of(role):
-    key = st.tuples(st.sampled_from(["a", "b"]), st.sampled_from(["s", "t"]), st.integers(0, 3))
-    event = st.tuples(key, st.sampled_from(EVENTS[role]), st.sampled_from(["", "crc", "dropped_busy"]))
-    return st.lists(event.map(lambda x: (*x[0], x[1], x[2])), max_size=40)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.fixed_dictionaries({role: st.lists(lines_of(role), max_size=2) for role in EVENTS}), st.booleans())
-def test_terms_of_any_ledgers_are_as_written(ledgers, closed):
-    """Even of nonsense each term counts its own lines, none is negative, and what is off is a doubt."""
-    written = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for role, files in ledgers.items():
-            for start, lines in enumerate(files):
-                write(Path(folder), role, lines, start_ns=start, closed=closed)
-                written.update(f"{role} {line[3]}" for line in lines)
-        accounting = account_frames(Path(folder))
-    found = accounting.as_dict()
-    rejected = found["rejected"].values()
-    assert all(found[end] >= 0 for end in ENDS if end != "rejected") and all(n > 0 for n in rejected)
-    assert found["delivered"] == written["edge delivered"]
-    assert found["lost"] == written["emulator lost"]
-    assert found["in_flight"] == written["emulator in_flight"]
-    assert found["closes"] == (accounting.total.without_end == (0, 0) and not accounting.contradictions)
-    if closed:
-        assert found["cut_off"] == 0
-
-
 # What really becomes of one frame.
 FATES = st.sampled_from(
     [

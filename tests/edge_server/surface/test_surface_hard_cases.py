@@ -14,7 +14,7 @@ from edge_server.surface.reconstruct import mesh_from_depth_maps
 from edge_server.surface.refine_depth import REACH, refine_depth
 from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
-from tests.edge_server.surface.ball import LENS, RADIUS_M, BallRenderer, ball_depth, ball_maps, poses_around
+from tests.edge_server.surface.ball import LENS, RADIUS_M, BallRenderer, ball_maps, poses_around
 
 skimage = pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 
@@ -45,11 +45,6 @@ def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
     if not any(m.seen.any() for m in maps):
         with pytest.raises(SurfaceError, match="no camera sees anything solid"):
             bounding_box(maps, 0.01)
-
-
-def test_no_maps_at_all():
-    with pytest.raises(SurfaceError, match="no surface"):
-        extract_mesh(fuse_maps(GRID, []))
 
 
 def test_noise_averages_out():
@@ -115,38 +110,6 @@ def test_a_renderer_that_has_diverged():
 
     maps = list(render_depth_maps(Diverged(), [(pose, LENS) for pose in poses_around(3)]))
     assert not any(m.seen.any() or m.trust.any() for m in maps)
-
-
-@pytest.mark.parametrize("level", [0, 90, 255])
-def test_pictures_without_texture_leave_depth_where_it_was(level):
-    maps = ball_maps(8)
-    flat = [np.full((64, 64, 3), level, np.uint8)] * 8
-    found = refine_depth(maps, flat)
-    for before, after in zip(maps, found):
-        both = before.seen & after.seen
-        assert both.sum() > 0.8 * before.seen.sum()
-        assert np.abs(after.depth[both] - before.depth[both]).max() < 0.004
-        assert after.trust[both].max() < 0.1  # a flat picture says nothing
-
-
-def test_pictures_of_noise_do_not_make_a_surface_anywhere_else():
-    maps = ball_maps(8)
-    noise = [RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8) for _ in maps]
-    found = refine_depth(maps, noise)
-    for before, after in zip(maps, found):
-        both = before.seen & after.seen
-        assert np.isfinite(after.depth[both]).all()
-        # Of the depth, all passes together may search no farther than this.
-        assert (np.abs(after.depth / np.where(both, before.depth, 1) - 1)[both] <= REACH + 1e-5).all()
-        assert np.median(after.trust[both]) < 0.1  # and next to nothing is trusted
-
-
-def test_cameras_that_see_nothing_in_common_are_left_as_they_are():
-    pose = poses_around(1)[0]
-    alone = [depth_map(ball_depth(LENS, pose), GRAY, pose, LENS)]
-    (found,) = refine_depth(alone, [GRAY])
-    assert found.seen.sum() > 0.8 * alone[0].seen.sum()
-    np.testing.assert_array_equal(found.depth[found.seen], alone[0].depth[found.seen])
 
 
 def test_a_volume_of_one_block():
