@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ import grpc
 import pytest
 
 from channel_emu.model import trace
-from channel_emu.testing import EmulatedLink, channel, put_behind
+from channel_emu.testing import EmulatedLink, channel
 from channel_emu.virtual.replay import compare
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
@@ -157,21 +156,6 @@ def _code(call) -> str:
         return error.code().name
 
 
-def test_a_dropped_answer_is_unavailable_too(channel, greeter, client) -> None:
-    link = channel({"faults": {"loss": {"probability": 1.0}}}, to=greeter.address, direction="down")
-    stub = client(link)
-    with pytest.raises(grpc.RpcError) as missed:
-        stub.unary_unary(HELLO)(b"you", timeout=10)
-    assert missed.value.code() is grpc.StatusCode.UNAVAILABLE
-    assert "dropped the answer" in missed.value.details()
-    # The request got through, whose answer did not; so did those of a stream.
-    assert _code(lambda: stub.stream_unary(COLLECT)(paced(5, 0.0), timeout=10)) == "UNAVAILABLE"
-    assert greeter.collected == [b"0", b"1", b"2", b"3", b"4"]
-    # A stream of several answers ends as it did, with none of them.
-    assert list(stub.unary_stream(COUNT)(b"5", timeout=10)) == []
-    assert link.settle().outcomes == {"lost": 7}
-
-
 def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greeter, client) -> None:
     link = channel(LOSSY, to=greeter.address, seed=5, direction="both")
     answers = list(client(link).stream_stream(ECHO)(paced(60, 0.001), timeout=20))
@@ -278,23 +262,6 @@ def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
     assert set(link.report().by_method) == {"up"}
 
 
-@pytest.mark.parametrize(
-    ("channel_", "options", "why"),
-    [
-        ("ch7", {}, "preset: expected one of ideal"),
-        ({"rain": 1}, {}, "rain: unknown key"),
-        ("ideal", {"direction": "sideways"}, "direction: expected one of up, down, both"),
-        ("ideal", {"listen": "nowhere"}, "cannot listen on nowhere"),
-        ("ideal", {"replay": Path("/no/such/trace")}, "cannot be read"),
-    ],
-)
-def test_mistakes_are_said_in_one_line(channel_, options: dict, why: str) -> None:
-    before = threading.active_count()
-    with pytest.raises(ValueError, match=why):
-        put_behind(channel_, to="127.0.0.1:1", **options)
-    assert threading.active_count() == before
-
-
 pytest_plugins = ["pytester"]
 
 
@@ -314,11 +281,3 @@ def test_a_failing_test_shows_the_seed_and_the_figures(pytester: pytest.Pytester
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*emulated channel*", "channel('ch5', to='127.0.0.1:1', seed=77, *"])
     assert "channel('ideal'" not in result.stdout.str()
-
-
-def test_the_report_is_plain_data(channel, greeter, client) -> None:
-    link = channel("ideal", to=greeter.address)
-    client(link).unary_unary(HELLO)(b"you", timeout=5)
-    assert json.loads(json.dumps(link.report().plain()))["by_method"][f"up {HELLO}"]["delivered"] == 1
-    link.close()
-    assert link.report().delivered == 1  # the last one, after its end

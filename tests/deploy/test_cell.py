@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -32,19 +31,6 @@ def test_a_simulated_arm_and_its_driver_belong_to_the_run(process_set) -> None:
     assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
 
 
-def test_a_real_arm_is_neither_simulated_nor_driven(process_set) -> None:
-    arm = {**CELL.source["arm"], "simulated": False}
-    real = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
-    assert [child.name for child in process_set(real).children] == ["node", "emulator", "edge"]
-    assert [child.name for child in process_set(load("tile")).children] == ["node", "emulator", "edge"]
-
-
-def test_a_simulated_arm_without_a_path_stands_still(process_set) -> None:
-    arm = {key: value for key, value in CELL.source["arm"].items() if key != "path"}
-    still = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
-    assert process_set(still).arms and not process_set(still).drivers
-
-
 def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: Path) -> None:
     from freshfield_up import commands, mesh
 
@@ -58,16 +44,6 @@ def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: P
     with pytest.raises(commands.MissingCommand, match=r"edge.export: a mesh needs scikit-image: pip install"):
         mesh.check(CELL)
     mesh.check(load("tile"))
-
-
-@pytest.mark.parametrize(
-    "status, possible", [('{"updates": {"count": 3}}', True), ('{"updates": {"count": 0}}', False), ("", False)]
-)
-def test_there_is_a_mesh_from_the_first_update_on(tmp_path: Path, status: str, possible: bool) -> None:
-    from freshfield_up import mesh
-
-    (tmp_path / "edge.json").write_text(status)
-    assert mesh.possible(tmp_path) == possible
 
 
 @pytest.mark.slow

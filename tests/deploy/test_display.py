@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from freshfield_up.display import LiveTable, draw
+from freshfield_up.display import draw
 from freshfield_up.resources import ResourceUse
 from freshfield_up.status import read_status
 
@@ -54,13 +54,6 @@ def test_the_table_shows_what_the_processes_wrote(tmp_path: Path) -> None:
     assert "delay error p99 0.12 ms" in text
 
 
-def test_the_table_of_thirteen_cameras_fits_a_small_terminal(tmp_path: Path) -> None:
-    write_status(tmp_path)
-    lines = drawn(tmp_path, width=80).rstrip().splitlines()
-    assert len(lines) < 24
-    assert all(any(c in line for line in lines) for c in CAMERAS)
-
-
 def test_there_is_a_table_before_any_process_has_written(tmp_path: Path) -> None:
     text = drawn(tmp_path)
     assert "no channel yet" in text and "no update yet" in text
@@ -72,15 +65,3 @@ def test_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
     (tmp_path / "channel.json").write_text("[1, 2")
     (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
     assert "no channel yet" in drawn(tmp_path)
-
-
-def test_messages_and_table_share_the_terminal(tmp_path: Path) -> None:
-    write_status(tmp_path)
-    with (tmp_path / "screen").open("w") as file:
-        console = Console(file=file, force_terminal=True, width=100, height=40)
-        with LiveTable(console) as table:
-            table.update(read_status(tmp_path, CAMERAS), "1 of 60 s", {})
-            table.message("page: http://127.0.0.1:8080 [not markup]")
-            table.update(read_status(tmp_path, CAMERAS), "2 of 60 s", {})
-    text = (tmp_path / "screen").read_text()
-    assert "[not markup]" in text and "2 of 60 s" in text

@@ -10,11 +10,6 @@ import pytest
 from freshfield_up.folder import EARLIER, MARKER, FolderError, forget_earlier, prepare
 
 
-def test_a_new_folder_gets_a_marker(tmp_path: Path) -> None:
-    with prepare(tmp_path / "a" / "b", {"scenario": "room"}):
-        assert json.loads((tmp_path / "a" / "b" / MARKER).read_text()) == {"scenario": "room"}
-
-
 def test_an_earlier_run_is_replaced(tmp_path: Path) -> None:
     prepare(tmp_path, {"run": 1}).close()
     (tmp_path / "ledger-edge-edge-1.tsv").write_text("old")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -29,15 +27,6 @@ def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path)
     assert "process one ended by itself with exit code 1" in text
     assert "| the lens cap is on" in text and "| reading" in text
     assert str(child.log) in text
-
-
-def test_the_exit_summary_names_the_signal(tmp_path: Path) -> None:
-    child = python(tmp_path, "import time; time.sleep(60)")
-    child.start()
-    os.kill(child.pid, signal.SIGKILL)
-    wait_until(lambda: not child.running, "it did not end")
-    assert "killed by SIGKILL" in child.exit_summary()
-    assert "wrote nothing" in child.exit_summary()
 
 
 def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
@@ -90,36 +79,3 @@ def _lives(pid: int) -> bool:
     except FileNotFoundError:
         return False
     return state != "Z"  # a zombie has ended
-
-
-def test_the_tail_of_a_large_log_has_whole_lines_only(tmp_path: Path) -> None:
-    log = tmp_path / "log.txt"
-    log.write_text("$ the command\n" + "".join(f"line {i} äöü\n" for i in range(20_000)))
-    lines = processes.tail(log, 5)
-    assert lines == [f"line {i} äöü" for i in range(19_995, 20_000)]
-    assert processes.tail(tmp_path / "missing", 5) == []
-
-
-def test_grpc_does_not_act_when_a_process_starts(tmp_path: Path) -> None:
-    """With gRPC's fork handlers, the launcher sometimes hung between two processes."""
-    code = """
-        import subprocess, sys
-        from concurrent import futures
-        from freshfield_up import net
-        import grpc
-        server = grpc.server(futures.ThreadPoolExecutor(1))
-        port = server.add_insecure_port("127.0.0.1:0")
-        server.start()
-        net.is_serving(f"127.0.0.1:{port}")
-        for _ in range(3):
-            subprocess.run([sys.executable, "-c", ""], preexec_fn=lambda: None)
-        server.stop(0)
-    """
-    found = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert found.returncode == 0 and "fork" not in found.stderr, found.stderr

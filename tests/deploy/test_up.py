@@ -156,19 +156,6 @@ def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     assert not leftovers(run.out)
 
 
-def test_ctrl_c_before_the_first_update_makes_no_mesh_and_is_no_failure(tmp_path: Path) -> None:
-    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    scenario = SMALL.replace("lpips: none", "lpips: none, export: {mesh: room.ply}")
-    run = Up(tmp_path, "--for", "0", scenario=scenario)
-    try:
-        run.wait_until(lambda: "logs and results" in run.output)
-        run.process.send_signal(signal.SIGINT)
-        assert run.end() == 0, run.output
-    finally:
-        run.process.kill()
-    assert "no mesh: nothing to export yet" in run.output and "making the mesh" not in run.output
-
-
 def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) -> None:
     prepare(tmp_path / "run", {}).close()
     (tmp_path / "run" / "report.json").write_text("{}")
@@ -230,11 +217,6 @@ def test_a_run_does_not_delete_the_policy_that_it_loads(tmp_path: Path) -> None:
     words = ("room", "--out", str(out), "--port", str(free_port()), "--policy", f"bandit:{learned}")
     assert "is emptied first; choose another --out" in refusal(*words)
     assert learned.read_bytes() == b"weights"
-
-
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "letter.txt").write_text("dear")
-    assert "not an earlier run's" in refusal("room", "--out", str(tmp_path), "--port", str(free_port()))
 
 
 @pytest.mark.parametrize("text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)])

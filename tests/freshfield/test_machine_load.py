@@ -3,42 +3,17 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 
-from freshfield.machine_load import LoadMeter, cpu_s, outside_cores, outside_load, peak_rss_mb, rss_mb
-
-
-@pytest.mark.alone
-def test_a_busy_loop_is_counted_as_ours_and_not_as_others():
-    meter = LoadMeter("me")
-    before, until = time.process_time(), time.perf_counter() + 0.5
-    while time.perf_counter() < until:
-        pass
-    used = time.process_time() - before
-    row = meter.row(1.0)
-    assert row["t_s"] == 1.0 and row["me"]["pid"] == os.getpid()
-    assert abs(row["me"]["cpu"] - used / 0.5) < 0.15
-    outside = outside_cores(row)
-    assert outside is not None and 0.0 <= outside <= (os.cpu_count() or 1) + 0.2
+from freshfield.machine_load import cpu_s, outside_load, peak_rss_mb, rss_mb
 
 
 def test_memory_and_processor_time_of_a_process():
     block = np.ones(8 * 2**20)  # 64 MB that are touched
     assert rss_mb() > 60.0 and peak_rss_mb() >= rss_mb() * 0.9
     assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
-
-
-def test_the_peak_of_a_child_is_its_own():
-    block = np.ones(60 * 2**20)  # 500 MB that are touched; numpy and OpenCV alone take less than 200
-    program = "from freshfield.machine_load import peak_rss_mb; print(peak_rss_mb())"
-    child = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert peak_rss_mb() > 500.0 and block[-1] == 1.0
-    assert float(child.stdout) < 400.0
 
 
 def test_a_process_that_is_gone_tells_nothing():

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import struct
-import subprocess
-import sys
 import zlib
 
 import cv2
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from freshfield.geometry import Pinhole
@@ -207,40 +205,6 @@ def test_truncated_data_is_refused(codec):
         assert error.value.reason in ("bad_payload", "undecodable"), length
 
 
-@given(data=st.binary(max_size=300), codec=st.sampled_from(["jpeg", "png", "zstd"]), start=st.booleans())
-def test_random_bytes_raise_nothing_but_payload_error(data, codec, start):
-    head = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "zstd": b"\x28\xb5\x2f\xfd"}[codec]
-    try:
-        image = decode((head if start else b"") + data, codec, 8, 8)
-    except PayloadError as error:
-        assert error.reason in ("too_large", "bad_payload", "size_mismatch", "undecodable")
-    else:
-        assert image.shape[:2] == (8, 8) and image.dtype == np.uint8
-
-
-@settings(max_examples=150)
-@given(data=st.data(), codec=st.sampled_from(["jpeg", "png", "zstd"]))
-def test_flipped_bytes_raise_nothing_but_payload_error(data, codec):
-    image = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
-    good = bytearray(encode(image, codec))
-    for _ in range(data.draw(st.integers(1, 4))):
-        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
-    try:
-        back = decode(bytes(good), codec, 16, 12)
-    except PayloadError:
-        return
-    assert back.shape[:2] == (12, 16) and back.shape[2] in (3, 4) and back.dtype == np.uint8
-
-
-@given(width=st.integers(-10, 10**6), height=st.integers(-10, 10**6))
-def test_impossible_sizes_are_refused(width, height):
-    if 0 < width <= MAX_IMAGE_SIDE_PX and 0 < height <= MAX_IMAGE_SIDE_PX:
-        return
-    for codec in ("jpeg", "png", "zstd"):
-        with pytest.raises(PayloadError):
-            check(JPEG, codec, width, height)
-
-
 def test_other_depths_never_come_back_as_something_else():
     """16-bit and palette PNGs are decoded to 8 bits a channel or refused, never passed on as they are."""
     for depth, kind in ((16, 2), (16, 0), (1, 0), (8, 4), (8, 3), (16, 6)):
@@ -250,35 +214,6 @@ def test_other_depths_never_come_back_as_something_else():
             assert error.reason == "undecodable"
         else:
             assert image.dtype == np.uint8 and image.shape[2] in (3, 4)
-
-
-def test_refusing_bombs_takes_no_memory(tmp_path):
-    """In a process of its own: 200 refused bombs of each kind raise the peak by less than 20 MB."""
-    (tmp_path / "png").write_bytes(png(30000, 30000))
-    (tmp_path / "png-chunk").write_bytes(claim(PNG, b"IEND", 2**31))
-    (tmp_path / "jpeg").write_bytes(forge_jpeg(JPEG, 30000, 30000))
-    (tmp_path / "zstd").write_bytes(BOMB)
-    program = """
-import sys
-from freshfield import payload
-from pathlib import Path
-def peak_kb():  # not ru_maxrss: this process would inherit that of the tests, and never exceed it
-    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-bombs = [(p.name.split("-")[0], p.read_bytes()) for p in Path(sys.argv[1]).iterdir()]
-before = peak_kb()
-for _ in range(200):
-    for codec, data in bombs:
-        for size in ((64, 48), (30000, 30000)):
-            try:
-                payload.decode(data, codec, *size)
-            except payload.PayloadError:
-                continue
-            raise SystemExit("a bomb was decoded")
-print(peak_kb() - before)
-"""
-    run = [sys.executable, "-c", program, str(tmp_path)]
-    grown_kb = int(subprocess.check_output(run))
-    assert grown_kb < 20_000
 
 
 @pytest.mark.parametrize("codec", CODECS)

@@ -144,50 +144,13 @@ def test_host_and_port_are_told_apart(text, expected):
     assert host_port(text) == expected
 
 
-NO_ADDRESSES = [
-    "",
-    "host",
-    "7001",
-    "host:",
-    "host:x",
-    "host:-1",
-    "host:65536",
-    "host:99999",
-    "host:\u00b2",
-    "::1",
-    "::1:7001",
-    "http://host:80",
-    "ho st:80",
-    "unix:/tmp/s",
-    "host:" + "9" * 5000,
-]
+NO_ADDRESSES = ["", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"]
 
 
 @pytest.mark.parametrize("text", NO_ADDRESSES)
 def test_what_is_no_address_is_refused_by_name(text):
     with pytest.raises(TransportError, match="expected HOST:PORT"):
         host_port(text)
-
-
-@pytest.mark.parametrize("address", ["nonsense", "localhost:99999", "unix:/tmp/s"])
-def test_bind_refuses_what_is_no_address(address):
-    async def scene():
-        with pytest.raises(TransportError, match=f"cannot listen on {address}: expected HOST:PORT") as error:
-            Transport().bind(Transport().aio_server(), address)
-        assert "\n" not in str(error.value)
-
-    asyncio.run(scene())
-
-
-def test_bind_says_why_in_its_own_words():
-    async def scene():
-        with pytest.raises(TransportError) as error:
-            Transport(insecure=True).bind(Transport().aio_server(), "192.0.2.1:7001")
-        return str(error.value)
-
-    said = asyncio.run(scene())
-    assert said.startswith("cannot listen on 192.0.2.1:7001: ") and "this machine" in said
-    assert "GRPC" not in said and "Failed to bind" not in said
 
 
 @pytest.fixture(scope="module")
@@ -197,56 +160,16 @@ def pem(tmp_path_factory):
         pytest.skip("openssl is not installed")
     folder = tmp_path_factory.mktemp("pem")
 
-    def openssl(*arguments: str) -> None:
-        subprocess.run(["openssl", *arguments], check=True, capture_output=True, cwd=folder)
+    def openssl(line: str) -> None:
+        subprocess.run(["openssl", *line.split()], check=True, capture_output=True, cwd=folder)
 
     for name in ("ca", "stranger"):
-        openssl(
-            "req",
-            "-x509",
-            "-newkey",
-            "rsa:2048",
-            "-nodes",
-            "-days",
-            "2",
-            "-subj",
-            f"/CN={name}",
-            "-keyout",
-            f"{name}.key",
-            "-out",
-            f"{name}.pem",
-        )
+        openssl(f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN={name} -keyout {name}.key -out {name}.pem")
     (folder / "ext").write_text("subjectAltName=DNS:localhost")
     for name, subject in (("server", "server"), ("client", "viewer")):
-        openssl(
-            "req",
-            "-newkey",
-            "rsa:2048",
-            "-nodes",
-            "-subj",
-            f"/CN={subject}",
-            "-keyout",
-            f"{name}.key",
-            "-out",
-            f"{name}.csr",
-        )
-        openssl(
-            "x509",
-            "-req",
-            "-in",
-            f"{name}.csr",
-            "-CA",
-            "ca.pem",
-            "-CAkey",
-            "ca.key",
-            "-days",
-            "2",
-            "-CAcreateserial",
-            "-extfile",
-            "ext",
-            "-out",
-            f"{name}.pem",
-        )
+        openssl(f"req -newkey rsa:2048 -nodes -subj /CN={subject} -keyout {name}.key -out {name}.csr")
+        signing = "-CA ca.pem -CAkey ca.key -days 2 -CAcreateserial -extfile ext"
+        openssl(f"x509 -req -in {name}.csr {signing} -out {name}.pem")
     return folder
 
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import json
-import os
-import sys
 from pathlib import Path
 
 import grpc
@@ -17,9 +14,9 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from channel_emu.live import frame_stream
 from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
-from freshfield.ledger import Ledger, read_all
+from freshfield.ledger import read_all
 from freshfield.transport import Transport
-from tests.channel_emu.live.emulator import Camera, make, offer, run
+from tests.channel_emu.live.emulator import make, offer, run
 from tests.integration.peer import Peer
 from tests.ports import free_port
 
@@ -85,49 +82,6 @@ def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytes
 
     run(live(lambda proxy, _: setattr(proxy.channel, "forget", raising)))
     run(live(lambda _, flow: setattr(flow.link, "advance", raising)))
-
-
-@pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
-def test_the_command_says_so_and_exits_1(tmp_path: Path) -> None:
-    plan = {"name": "t", "seed": 3, "cameras": {"count": 1}, "channel": {"preset": "ideal"}}
-    scenario, out, port = tmp_path / "t.yaml", tmp_path / "out", free_port()
-    scenario.write_text(json.dumps(plan))
-
-    async def live() -> None:
-        edge = await Peer().start()
-        words = [
-            "-m",
-            "channel_emu.cli",
-            "run",
-            str(scenario),
-            "--listen",
-            f"127.0.0.1:{port}",
-            "--to",
-            edge.address,
-            "--out",
-            str(out),
-            "--trace",
-            str(FULL),
-        ]
-        process = await asyncio.create_subprocess_exec(sys.executable, *words, stderr=asyncio.subprocess.PIPE)
-        camera = Camera("cam00", port, Transport(), False, Ledger(tmp_path, "node", "n", 1))
-        try:
-            # Some hundred lines stay in memory before the first meets the disk.
-            with pytest.raises((grpc.aio.AioRpcError, asyncio.InvalidStateError)):
-                await camera.stream(3000, 0.001)
-            async with asyncio.timeout(20):
-                _, said = await process.communicate()
-        finally:
-            if process.returncode is None:
-                process.kill()
-        assert process.returncode == 1, said
-        last = said.decode().splitlines()[-1]
-        assert last.startswith("channel-emu: stopped") and os.strerror(errno.ENOSPC) in last
-        await camera.close()
-        await edge.stop()
-
-    run(live())
-    assert all(file.closed for file in read_all(out))
 
 
 def test_an_answer_that_is_none_ends_the_stream_and_not_the_emulator(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def late_ms(records: list[Record]) -> np.ndarray:
 LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "mahimahi": [4] * 20}}
 
 
-@pytest.mark.parametrize("section", [FAST, CHAPTER_5, PARALLEL, LOSSY], ids=["ch6", "ch5", "parallel", "lossy"])
+@pytest.mark.parametrize("section", [FAST, LOSSY], ids=["ch6", "lossy"])
 def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path, section: dict) -> None:
     """The trace's offers in virtual time deliver each frame when it is due, live a moment later: the age is
     greater by that moment, weighted by what the frame was worth."""

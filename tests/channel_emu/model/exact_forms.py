@@ -55,11 +55,6 @@ def mg1_blocking(lam: float, mean: float, second_moment: float) -> float:
     return mean + square / (2 * (mean + 1 / lam))
 
 
-def md1_preemptive(lam: float, service: float) -> float:
-    """1 / (lambda E[e^(-lambda S)])."""
-    return math.exp(lam * service) / lam
-
-
 def mg1_preemptive(lam: float, shape: float, mean: float) -> float:
     """1 / (lambda E[e^(-lambda S)]) for gamma service."""
     return (1 + lam * mean / shape) ** shape / lam

@@ -64,7 +64,7 @@ def test_age_of_incorrect_information_of_poisson_updates(rate: float, away: floa
         assert found == near(away / (2 * away + rate) / (away + rate))
 
 
-def test_a_source_that_is_from_notation() -> None:
+def test_a_source_that_the_metric_draws_itself() -> None:
     """The metric draws its source itself, another one for each seed."""
     once = metric("incorrect:0.3:0.3", 20, arrivals="poisson:1")
     assert once == pytest.approx(exact.incorrect_without_delay(1.0, 0.3, 0.3), rel=0.15)

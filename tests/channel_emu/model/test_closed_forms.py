@@ -208,21 +208,6 @@ def _unequal(discipline: str, rates: tuple[float, float]) -> list[float]:
     return merged
 
 
-@pytest.mark.parametrize("discipline", ["lcfs-preempt", "drop-new", "fcfs"])
-def test_many_cameras_share_a_server(discipline: str) -> None:
-    """18 cameras that load it to .5 together: each as one source against seventeen."""
-    lam = 0.5 / 18
-    expected = {
-        "lcfs-preempt": exact.shared_mm1_preemptive(lam, 17 * lam, 1.0),
-        "drop-new": exact.shared_mg1_blocking(lam, 17 * lam, 1.0, 2.0),
-        "fcfs": exact.shared_mm1_fcfs(lam, 17 * lam, 1.0),
-    }[discipline]
-    config = channel_from_mapping(
-        {"arrivals": poisson(lam), "service": exponential(1.0), "discipline": discipline, "server": {"shared": True}}
-    )
-    assert simulate(config, 18, 100, seed=3).mean_age_ms() == pytest.approx(expected, rel=TOLERANCE)
-
-
 def test_slotted_age_differs_by_what_theory_says() -> None:
     """Deliveries anywhere within a slot: sampling at boundaries neither adds nor removes age on average.
     Deliveries on boundaries: each tooth is sampled from its foot on, half a slot below its mean."""

