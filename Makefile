@@ -73,7 +73,7 @@ ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).
 MESH := $(if $(shell grep -ls '^ *export:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-mesh)
 
 demo: .venv/.ok-run $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
-	@$(PY) deploy/up.py $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
+	@$(PY) -m freshfield_up.cli $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
 CHOSEN = ($(SELECT))$(if $(BROWSER),, and not browser)
@@ -94,7 +94,7 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
-	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/check_report.py deploy/freshfield_up
+	MYPYPATH=proto:deploy $(PY) -m mypy deploy/check_report.py deploy/freshfield_up
 
 bench: .venv/.ok-test  ## measure this machine, hours: runs/bench, docs/results; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs

@@ -3,10 +3,9 @@
     freshfield-up SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
                            [--policy NAME[:VALUE]]
 
-In a checkout: ``python deploy/up.py SCENARIO``. It starts the three commands that otherwise run by hand on
-separate machines: camera-node, channel-emu and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of
---for stops them in the order of the data. Exit code: 0 for a run that ended as asked, 1 if a process died, 2
-if the run could not start.
+It starts the three commands that otherwise run by hand on separate machines: camera-node, channel-emu and
+edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for stops them in the order of the data. Exit code: 0
+for a run that ended as asked, 1 if a process died, 2 if the run could not start.
 """
 
 from __future__ import annotations
@@ -113,3 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-table", action="store_true", help="print plain lines instead of a live table, even on a terminal")
     add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
     return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

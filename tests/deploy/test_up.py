@@ -18,7 +18,6 @@ import pytest
 
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.status import read_json
-from tests.conftest import ROOT
 from tests.ports import free_port
 
 SMALL = """
@@ -36,7 +35,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Up:
-    """A running ``up.py``; its output goes to a file, as with nohup."""
+    """A running launcher; its output goes to a file, as with nohup."""
 
     def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
         self.out = folder / "run"
@@ -46,7 +45,7 @@ class Up:
         self._log = folder / "output.txt"
         words = [str(file), "--out", str(self.out), "--port", str(self.port), *options]
         with self._log.open("wb") as log:
-            command = [sys.executable, str(ROOT / "deploy" / "up.py"), *words]
+            command = [sys.executable, "-m", "freshfield_up.cli", *words]
             self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
     @property
@@ -56,7 +55,7 @@ class Up:
     def wait_until(self, what: Callable[[], Any], seconds: float = READY_S) -> Any:
         deadline = time.monotonic() + seconds
         while not (found := what()):
-            assert self.process.poll() is None, f"up.py ended too early:\n{self.output}"
+            assert self.process.poll() is None, f"the launcher ended too early:\n{self.output}"
             assert time.monotonic() < deadline, f"it did not happen in {seconds:.0f} s:\n{self.output}"
             time.sleep(0.1)
         return found
@@ -187,7 +186,7 @@ def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., 
 
 def refusal(*words: str) -> str:
     done = subprocess.run(
-        [sys.executable, str(ROOT / "deploy" / "up.py"), *words], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "freshfield_up.cli", *words], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2, done.stdout + done.stderr
     assert done.stderr.count("\n") == 1, "the message is one line"
