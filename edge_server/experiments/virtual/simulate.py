@@ -30,7 +30,7 @@ from edge_server.report.machine import versions
 from edge_server.scheduler import parse_policy, short_name
 from freshfield.files import out_folder, write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
-from freshfield.settings import as_mapping
+from freshfield.settings import as_mapping, read_settings
 
 DESCRIPTION = """\
 Run cameras, emulated network, buffer, policy and field of a scenario in virtual time: no ports, no waiting.
@@ -221,7 +221,8 @@ def _compute(text: str) -> ComputeConfig:
         return ComputeConfig()
     step, _, update = text.partition(":")
     try:
-        return ComputeConfig(float(step), float(update or 0.0))
+        found = {"ms_per_step": float(step), "ms_per_update": float(update or 0.0)}
+        return read_settings(ComputeConfig, found, "--compute")
     except ValueError:
         raise ScenarioError(f"--compute {text}: expected zero, or ms a step and ms an update such as 4:30") from None
 

@@ -35,11 +35,11 @@ def test_a_model_is_relative_to_the_scenario():
     "section, told",
     [
         ({"dims": 3}, "edge.embedding.dims: unknown key; did you mean 'dim'?"),
-        ({"dim": 0}, "edge.embedding: dim: expected 1 to 4096, got 0"),
+        ({"dim": 0}, "edge.embedding.dim: expected a whole number, 1 to 4096, got 0"),
         ({"dim": "32"}, "edge.embedding.dim: expected a whole number"),
-        ({"size": 8}, "edge.embedding: size: expected 32 to 2048 pixels, got 8"),
-        ({"provider": "tpu"}, "edge.embedding: provider: expected one of auto, cpu, cuda, got 'tpu'"),
-        ({"threads": 0}, "edge.embedding: threads"),
+        ({"size": 8}, "edge.embedding.size: expected a whole number, 32 to 2048, got 8"),
+        ({"provider": "tpu"}, "edge.embedding.provider: expected one of auto, cpu, cuda, got 'tpu'"),
+        ({"threads": 0}, "edge.embedding.threads"),
         ("default", "edge.embedding: expected a mapping"),
     ],
 )
@@ -52,5 +52,5 @@ def test_one_line_for_what_is_wrong(section, told):
 def test_metrics_are_perceptual_or_nothing():
     assert read_config(scenario()).metrics == ()
     assert read_config(scenario(metrics=["perceptual"])).metrics == ("perceptual",)
-    with pytest.raises(ScenarioError, match="edge: metrics: expected perceptual, got fid"):
+    with pytest.raises(ScenarioError, match="edge.metrics.0.: expected one of perceptual"):
         read_config(scenario(metrics=["fid"]))

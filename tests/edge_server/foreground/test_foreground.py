@@ -186,8 +186,8 @@ def test_the_loop_fits_to_cut_views(tmp_path):
     "section, part",
     [
         ({}, "detector: missing"),
-        ({"detector": "tile", "confidence": 1.5}, "confidence: expected 0 to 1"),
-        ({"detector": "tile", "margin": -0.1}, "margin: expected 0 to 1"),
+        ({"detector": "tile", "confidence": 1.5}, "confidence: expected a number, 0 to 1"),
+        ({"detector": "tile", "margin": -0.1}, "margin: expected a number, 0 to 1"),
         ({"detector": "tile", "box": [0, 0, 1, 1]}, "box: unknown key"),
     ],
 )
@@ -199,7 +199,7 @@ def test_wrong_sections_are_refused_by_file_and_key(section, part):
 def test_a_scenario_turns_it_on_with_a_file_beside_it(tmp_path):
     scenario = load("tile")
     assert read_config(scenario).foreground is None
-    text = scenario.path.read_text().replace("edge:\n", "edge:\n  foreground: {detector: cat-seg.onnx}\n")
+    text = scenario.path.read_text().replace("channel:\n", "edge: {foreground: {detector: cat-seg.onnx}}\nchannel:\n")
     (tmp_path / "cut.yaml").write_text(text)
     assert read_config(load(str(tmp_path / "cut.yaml"))).foreground.detector == str(tmp_path / "cat-seg.onnx")
 

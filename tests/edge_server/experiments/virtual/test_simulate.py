@@ -119,7 +119,7 @@ def test_the_scenario_says_zero_or_milliseconds():
 @pytest.mark.parametrize("name", ["grace_ms", "update_ms"])
 @pytest.mark.parametrize("value", [-1.0, 1e308])
 def test_a_time_that_nobody_waits_is_refused(name: str, value: float):
-    with pytest.raises(ScenarioError, match=f"x.yaml: edge: {name}: expected .* to 3600000, got"):
+    with pytest.raises(ScenarioError, match=f"x.yaml: edge.{name}: expected .* to 3600000, got"):
         read_config(parse({"cameras": {"count": 2}, "edge": {name: value}}, Path("x.yaml")))
 
 
