@@ -52,5 +52,5 @@ def test_one_line_for_what_is_wrong(section, told):
 def test_metrics_are_perceptual_or_nothing():
     assert read_config(scenario()).metrics == ()
     assert read_config(scenario(metrics=["perceptual"])).metrics == ("perceptual",)
-    with pytest.raises(ScenarioError, match="edge.metrics.0.: expected one of perceptual"):
+    with pytest.raises(ScenarioError, match=r"edge\.metrics\[0\]: expected one of perceptual"):
         read_config(scenario(metrics=["fid"]))
