@@ -42,8 +42,8 @@ class CallFlow:
         self._dropped = 0
         self._ended = False
         self._wake = asyncio.Event()
-        self._room = asyncio.Event()
-        self._room.set()
+        self._not_full = asyncio.Event()
+        self._not_full.set()
         if link is not None:
             link.calls.add(call)
 
@@ -115,8 +115,8 @@ class CallFlow:
                 else:
                     self._link.offer(message, self._now_ns())
                 if len(self._messages) >= _MOST_READY and self._messages[0].delivered is not None:
-                    self._room.clear()
-                    await self._room.wait()
+                    self._not_full.clear()
+                    await self._not_full.wait()
             self._ended = True
         finally:
             self._wake.set()
@@ -132,4 +132,4 @@ class CallFlow:
             if message.duplicated and self._read > 1:
                 await write(message.raw)
         if len(self._messages) < _MOST_READY:
-            self._room.set()
+            self._not_full.set()

@@ -71,8 +71,8 @@ class DelayStats:
 
 
 @dataclass
-class Room:
-    """The space that several links share. held_bytes: size of all messages inside them."""
+class ByteBudget:
+    """The bytes that several links share. held_bytes: size of all messages inside them."""
 
     held_bytes: int = 0
 
@@ -85,7 +85,7 @@ class LiveLink:
     stats: counts the link's messages.
     damage: applies flips to the bytes of a message.
     trace: None records nothing.
-    room: limits the bytes inside, shared with other links; None: this link's own.
+    budget: limits the bytes inside, shared with other links; None: this link's own.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class LiveLink:
         stats: DelayStats,
         damage: Callable[[bytes, Flips], bytes],
         trace: TraceWriter | None = None,
-        room: Room | None = None,
+        budget: ByteBudget | None = None,
     ) -> None:
         self.name = name
         self.model = model
@@ -113,7 +113,7 @@ class LiveLink:
         """Number of messages that the link delivered after their call was over."""
         self.overfull = 0
         """Number of messages dropped before the link because there was no room for their bytes."""
-        self._room = Room() if room is None else room
+        self._budget = ByteBudget() if budget is None else budget
         self._events = events
         self._damage = damage
         self._trace = trace
@@ -125,12 +125,12 @@ class LiveLink:
 
     def has_room(self, raw: bytes) -> bool:
         """Whether a message may be offered: the bytes inside all links are limited (MAX_QUEUED_BYTES)."""
-        return self._room.held_bytes + len(raw) <= MAX_QUEUED_BYTES
+        return self._budget.held_bytes + len(raw) <= MAX_QUEUED_BYTES
 
     def offer(self, message: Message, at_ns: int) -> Transit:
         """Offer a message that came in at the channel's instant ``at_ns``, and act on all decisions due."""
         self.last_ns = at_ns
-        self._room.held_bytes += len(message.raw)
+        self._budget.held_bytes += len(message.raw)
         transit, events = self.model.offer(at_ns, message, len(message.raw))
         message.transit = transit
         self._act(events)
@@ -181,7 +181,7 @@ class LiveLink:
             # Break the reference cycle, which would keep the bytes until the next garbage collection.
             message.transit = replace(event.transit, item=None)
             if kind is not EventKind.DUPLICATED:
-                self._room.held_bytes -= len(message.raw)
+                self._budget.held_bytes -= len(message.raw)
             if kind is EventKind.DELIVERED and event.transit.flips:
                 message.raw = self._damage(message.raw, event.transit.flips)
             message.receiver.settle(message, kind)

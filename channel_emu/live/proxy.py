@@ -27,7 +27,7 @@ import grpc.aio
 
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.event_queue import EventQueue
-from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, LiveLink, Room
+from channel_emu.live.live_link import STREAM_ENDED, ByteBudget, DelayStats, Flips, LiveLink
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.report import Report, figures_of
 from channel_emu.model.channel import Channel
@@ -119,7 +119,7 @@ class Proxy(grpc.GenericRpcHandler):
         self.channel = Channel(config, seed)
         self.stats = DelayStats()
         """Delays of all links together."""
-        self._room = Room()
+        self._budget = ByteBudget()
         self.links: dict[str, LiveLink] = {}
         self.port = 0
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -235,7 +235,7 @@ class Proxy(grpc.GenericRpcHandler):
         elif self.options.replay is not None:
             log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
-            name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace, self._room
+            name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace, self._budget
         )
         # A fault may act before the first message.
         self.events.schedule(link)

@@ -272,11 +272,11 @@ def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monkeypatc
             for name in r.cameras:
                 await r.cameras[name].stream(5, 0)
             inside = [len(t.item.raw) for f in r.stream.flows.values() for t in f.link.model.pending()]
-            assert 0 < sum(inside) == r.proxy._room.held_bytes <= 20_000
+            assert 0 < sum(inside) == r.proxy._budget.held_bytes <= 20_000
             full = r.stream.rejected["queue_full"]
             assert full == 10 - len(inside) and r.cameras["cam01"].reasons["queue_full"] > 0
             await r.settled()
-            assert r.proxy._room.held_bytes == 0
+            assert r.proxy._budget.held_bytes == 0
             await r.cameras["cam00"].stream(1, 0)
             assert r.stream.rejected["queue_full"] == full
 
