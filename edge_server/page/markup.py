@@ -263,9 +263,9 @@ def channel_state(channel: dict[str, Any] | None) -> str:
         return ""
     cells = ""
     for k, name in enumerate(states):
-        look = f"border-left:3px solid {css(scale_color(k / (len(states) - 1)))};font-weight:600"
-        look = look if name == state else f"{_DIM};opacity:.6"
-        cells += f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{look}">{escape(str(name))}</span>'
+        style = f"border-left:3px solid {css(scale_color(k / (len(states) - 1)))};font-weight:600"
+        style = style if name == state else f"{_DIM};opacity:.6"
+        cells += f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{style}">{escape(str(name))}</span>'
     since = ""
     with suppress(KeyError, TypeError, ValueError, IndexError):  # of an emulator of another version
         since = f"for {float(channel['uptime_s']) - float(series[-1][0]):.1f} s"  # type: ignore[index]

@@ -62,16 +62,16 @@ PHASES = (
 
 def refine_depth(
     maps: Sequence[DepthMap],
-    pictures: Sequence[NDArray[np.uint8]],
+    photos: Sequence[NDArray[np.uint8]],
     pool: Pool | None = None,
     on_map: Callable[[float], None] | None = None,
 ) -> list[DepthMap]:
-    """Refine the depth of ``maps``. pictures: camera images, uint8 (H, W, 3 or 4) each. on_map: called with
+    """Refine the depth of ``maps``. photos: camera images, uint8 (H, W, 3 or 4) each. on_map: called with
     the completed share. SurfaceError: the images do not match the maps."""
-    if len(maps) != len(pictures):
-        raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
+    if len(maps) != len(photos):
+        raise SurfaceError(f"{len(photos)} images do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
-    grays = [_gray(picture, found) for picture, found in zip(pictures, maps)]
+    grays = [_gray(photo, found) for photo, found in zip(photos, maps)]
     gains = exposures(maps, grays)
     grays = [(gray / np.float32(gain)).astype(np.float32) for gray, gain in zip(grays, gains)]
     guesses = [_fill_unknown(found) for found in maps]
@@ -157,11 +157,11 @@ def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDA
     return np.where(away, -normal, normal).astype(np.float32)
 
 
-def _gray(picture: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
+def _gray(photo: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
     """Gray levels, not rounded: a third of the noise where only shading varies."""
-    if picture.shape[:2] != found.depth.shape:
-        raise SurfaceError(f"a picture of {picture.shape} does not belong to a depth map {found.depth.shape}")
-    color = np.ascontiguousarray(picture[..., :3]).astype(np.float32)
+    if photo.shape[:2] != found.depth.shape:
+        raise SurfaceError(f"an image of {photo.shape} does not belong to a depth map {found.depth.shape}")
+    color = np.ascontiguousarray(photo[..., :3]).astype(np.float32)
     return cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 

@@ -107,17 +107,17 @@ def _optimize(
             values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
         values = values.detach().clone().requires_grad_()
         extent = torch.tensor([(n - 1) * voxel for n in shape])
-        optimiser = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
+        optimizer = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
         for step in range(s.steps):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
             drawn = torch.searchsorted(chances, torch.rand(s.points, generator=generator, dtype=torch.float64)).clamp_(
                 max=len(chances) - 1
             )
             loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], s, generator)
-            optimiser.param_groups[0]["lr"] = s.rate * voxel * 0.1 ** (step / s.steps)
-            optimiser.zero_grad(set_to_none=True)
+            optimizer.param_groups[0]["lr"] = s.rate * voxel * 0.1 ** (step / s.steps)
+            optimizer.zero_grad(set_to_none=True)
             loss.backward()
-            optimiser.step()
+            optimizer.step()
             if say is not None and (step + 1) % 20 == 0:
                 say("sdf", (level + (step + 1) / s.steps) / s.levels)
     found: NDArray[np.float32] = values.detach().numpy()[0, 0]

@@ -120,9 +120,9 @@ def fuse_maps(
     coarse = np.argwhere(np.ones(across, np.bool_)).astype(np.int32)
     middles = _blocks(coarse, np.array(grid.lower) + 0.5 * (side - grid.voxel_m), grid.band_m)
     for done, found in enumerate(maps, 1):
-        look = kernel_depth(found)
-        pool.run(fuse, blocks, look, float(grid.voxel_m), float(grid.band_m))
-        pool.run(fuse, middles, look, float(side), float(grid.band_m))
+        depths = kernel_depth(found)
+        pool.run(fuse, blocks, depths, float(grid.voxel_m), float(grid.band_m))
+        pool.run(fuse, middles, depths, float(side), float(grid.band_m))
         if on_map is not None:
             on_map(done)
     free = unblock(((middles.weight > 0) & (middles.distance > 0)).reshape(*across, CELLS))

@@ -42,7 +42,7 @@ class Blocks(NamedTuple):
     """B blocks of SIDE^3 voxels, x slowest.
 
     place: int32 (B, 3), position of each block in the grid, in blocks.
-    lowest: float64 (3,), centre of voxel (0, 0, 0), meters.
+    lowest: float64 (3,), center of voxel (0, 0, 0), meters.
     distance, weight: float32 (B, CELLS), meters and weights of (3.9) and (3.10).
     color: float32 (B, CELLS, 4), sums of weighted colors in [0, 255] and of their weights.
     """
@@ -74,13 +74,13 @@ def _depth_at(depth, u, v, band):
 
 
 @njit(inline="always")
-def _row(look, k):
-    return look.rotation[k, 0], look.rotation[k, 1], look.rotation[k, 2]
+def _row(depths, k):
+    return depths.rotation[k, 0], depths.rotation[k, 1], depths.rotation[k, 2]
 
 
 @kernel
-def fuse(counter, worker, blocks, look, voxel_m, band_m):
-    """Fuse ``look`` into all voxels it observes. Tasks are blocks, so the order of a voxel's sums does not
+def fuse(counter, worker, blocks, depths, voxel_m, band_m):
+    """Fuse ``depths`` into all voxels it observes. Tasks are blocks, so the order of a voxel's sums does not
     depend on the number of workers. band_m: d_max of (3.8).
 
     A voxel's distance is that along its ray times the cosine at the surface: the distance to the plane there.
@@ -89,13 +89,13 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
     surface have weight FREE: enough to remove a surface that only one camera sees, too little for passing
     rays to pull a round surface inwards.
     """
-    height, width = look.depth.shape
+    height, width = depths.depth.shape
     f_width, f_height = np.float64(width), np.float64(height)
     # Copy to locals: the compiler must assume that writes to the blocks may alias the camera.
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = _row(look, 0), _row(look, 1), _row(look, 2)
-    ox, oy, oz = look.origin[0], look.origin[1], look.origin[2]
-    fx, fy, cx, cy = look.lens[0], look.lens[1], look.lens[2], look.lens[3]
-    distorted = look.lens[4] != 0.0 or look.lens[5] != 0.0 or look.lens[6] != 0.0 or look.lens[7] != 0.0
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = _row(depths, 0), _row(depths, 1), _row(depths, 2)
+    ox, oy, oz = depths.origin[0], depths.origin[1], depths.origin[2]
+    fx, fy, cx, cy = depths.lens[0], depths.lens[1], depths.lens[2], depths.lens[3]
+    distorted = depths.lens[4] != 0.0 or depths.lens[5] != 0.0 or depths.lens[6] != 0.0 or depths.lens[7] != 0.0
     half = 0.5 * (SIDE - 1) * voxel_m
     while True:
         b = fetch_add(counter, 1)
@@ -125,19 +125,19 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
             over = 1.0 / deep
             u, v = (r00 * x + r10 * y + r20 * z) * over, (r01 * x + r11 * y + r21 * z) * over
             if distorted:
-                u, v = distort(u, v, look.lens[4], look.lens[5], look.lens[6], look.lens[7])
+                u, v = distort(u, v, depths.lens[4], depths.lens[5], depths.lens[6], depths.lens[7])
             u, v = fx * u + cx, fy * v + cy
             if not (u >= 0.0 and v >= 0.0 and u < f_width and v < f_height):
                 continue
-            depth = _depth_at(look.depth, u, v, band_m)
+            depth = _depth_at(depths.depth, u, v, band_m)
             if not depth > 0.0:
                 continue
             row, column = np.int64(v), np.int64(u)
-            new = np.float64(look.trust[row, column])
+            new = np.float64(depths.trust[row, column])
             along = depth - np.sqrt(x * x + y * y + z * z)
             if not (along > -band_m and new > 0.0):
                 continue
-            ahead = along * look.cosine[row, column]
+            ahead = along * depths.cosine[row, column]
             new *= min(1.0, 1.0 + along / band_m)
             old = np.float64(blocks.weight[b, k])
             clipped = min(ahead, band_m)
@@ -147,5 +147,5 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
             blocks.weight[b, k] = old + new
             if ahead < band_m:
                 for c in range(3):
-                    blocks.color[b, k, c] += new * look.color[row, column, c]
+                    blocks.color[b, k, c] += new * depths.color[row, column, c]
                 blocks.color[b, k, 3] += new

@@ -24,7 +24,7 @@ SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48}
 
 
 def saved(folder, name: str, steps: int = 30):
-    """A checkpoint of a field that has learnt ``tile`` a little, as a run leaves it."""
+    """A checkpoint of a field that has learned ``tile`` a little, as a run leaves it."""
     options = OPTIONS.get(name, SMALL)
     field = make_field(name, options, seed=3)
     field.fit(synthetic_still("tile", cameras=9, size=32).training, Budget(steps=steps))
@@ -83,7 +83,7 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "mm (target 1.5)" in said and "% of the surface within 3 mm (target 95)" in said
     told = json.loads(about.read_text())
-    # The field has learnt the tile for a second: what is found is of its size, and nowhere exact.
+    # The field has learned the tile for a second: what is found is of its size, and nowhere exact.
     assert 0.5 < told["measured"]["chamfer_mm"] < 100.0 and 0.0 < told["measured"]["complete"] < 0.95
     assert told["file"] == "m.ply" and told["triangles"] > 10 and told["cameras"] == 8
     assert set(told["stages_s"]) == {"depth", "fuse", "extract"} and told["seconds"] > 0.0

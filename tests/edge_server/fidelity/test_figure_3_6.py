@@ -20,7 +20,7 @@ from edge_server.fidelity.ssim import ssim
 from tests.conftest import data_dir
 
 
-def artefacts(reference):
+def artifacts(reference):
     """Figure 3.6's three: a shift by 0.12 (18.4 dB), a blur, half of a shifted copy in the middle."""
     height, width = reference.shape[:2]
     rows, columns = slice(height // 4, 3 * height // 4), slice(width // 4, 3 * width // 4)
@@ -42,7 +42,7 @@ def test_orderings_of_the_table(photo, network):
     image = cv2.imread(str(data_dir("fox") / "images_2" / f"{photo}.jpg"))[..., ::-1] / 255.0
     # A little under-exposed, as a dark inspection scene is: the shift's luminance term needs dark pixels.
     reference = 0.8 * cv2.resize(image, (270, 480), interpolation=cv2.INTER_AREA)
-    made = artefacts(reference)
+    made = artifacts(reference)
     db = {name: psnr(x, reference) for name, x in made.items()}
     structure = {name: ssim(x, reference) for name, x in made.items()}
     perceived = {name: lpips(x, reference) for name, x in made.items()}

@@ -38,7 +38,7 @@ def test_equal_images_are_at_no_distance_and_it_is_symmetric(metric):
 
 
 def test_it_is_the_formula(metric):
-    """(3.35) written out: normalised features, weighted squares, mean over pixels, sum over layers."""
+    """(3.35) written out: normalized features, weighted squares, mean over pixels, sum over layers."""
     a, b = picture(), picture()[::-1]
     total, first = 0.0, 0
     for tap, width in zip(metric._layers.taps, metric._layers.widths()):

@@ -114,14 +114,14 @@ def test_the_channels_state_stands_out_among_all_its_states():
 def test_the_scores_of_policies_say_where_they_are_from():
     row = {"own_seed": {"psnr_db": 27.96, "views": 12.0}, "psnr_db_over_all": [-0.03, -0.11, 0.05]}
     scores = {
-        "policies": {"all": row, "<learnt>": row},
+        "policies": {"all": row, "<learned>": row},
         "seconds": 10.0,
         "seed": 7,
         "seeds": 12,
         "machine": {"cpu": "a machine", "cores": 2},
     }
     html = markup.policy_scores(scores)
-    for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learnt&gt;"):
+    for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learned&gt;"):
         assert part in html
     assert html.count("-0.03 [-0.11, +0.05]") == 1, "all is not compared with itself"
 
@@ -136,7 +136,7 @@ SCORES = {"policies": {"all": ROW}, "seconds": 8.0, "seed": 7, "seeds": 12, "mac
         ({}, ""),
         ({"policies": {}, "seconds": None}, "seconds"),
         ({"policies": {"all": 3}}, "policies"),
-        ({"policies": {"learnt": {**ROW, "psnr_db_over_all": [0.1]}}}, "psnr_db_over_all"),
+        ({"policies": {"learned": {**ROW, "psnr_db_over_all": [0.1]}}}, "psnr_db_over_all"),
         ({"machine": {}}, "machine"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Exact depth of a ball and a plate, and a fused volume worked out voxel by voxel in plain numpy."""
+"""Exact depth of a ball, and a fused volume worked out voxel by voxel in plain numpy."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def picture_of(gray) -> np.ndarray:
     return np.repeat(np.rint(np.clip(gray, 0, 255)).astype(np.uint8)[..., None], 3, axis=-1)
 
 
-def plate(pose, paint=texture) -> tuple[np.ndarray, np.ndarray]:
+def textured_plane(pose, paint=texture) -> tuple[np.ndarray, np.ndarray]:
     """Exact depth of the plane z = 0 and a picture of what is painted on it."""
     origin, rays = world_rays(LENS, pose)
     depth = -origin[2] / rays[..., 2]
@@ -86,7 +86,7 @@ def errors(found, exact, least_trust=0.0) -> np.ndarray:
 @pytest.fixture(scope="module")
 def rig() -> tuple[list[DepthMap], list[np.ndarray], list[np.ndarray]]:
     """Four cameras whose depth is 2 to 4 % off, their pictures, and the exact depth."""
-    shown = [plate(pose) for pose in POSES]
+    shown = [textured_plane(pose) for pose in POSES]
     y = np.linspace(0, 3, 72)[:, None]
     wrong = [(d * (1.03 + 0.01 * np.sin(y + k))).astype(np.float32) for k, (d, _) in enumerate(shown)]
     maps = [depth_map(d, picture, pose, LENS) for d, (_, picture), pose in zip(wrong, shown, POSES)]
@@ -95,7 +95,7 @@ def rig() -> tuple[list[DepthMap], list[np.ndarray], list[np.ndarray]]:
 
 def test_a_start_far_off_is_mended_too(rig):
     _, _, exact = rig
-    maps, pictures = maps_of([plate(pose) for pose in POSES], wrong=1.12)
+    maps, pictures = maps_of([textured_plane(pose) for pose in POSES], wrong=1.12)
     after = errors(refine_depth(maps, pictures, POOL), exact, 0.3)
     assert np.median(after) < 0.0006
     assert len(after) > 0.5 * sum(m.seen.sum() for m in maps)
@@ -103,7 +103,7 @@ def test_a_start_far_off_is_mended_too(rig):
 
 def test_shading_alone_locates_a_surface():
     """An even slope of brightness correlates with itself wherever it is shifted to; gray levels do not."""
-    shown = [plate(pose, shading) for pose in POSES]
+    shown = [textured_plane(pose, shading) for pose in POSES]
     maps, pictures = maps_of(shown, wrong=1.03)
     found = refine_depth(maps, pictures, POOL)
     inner = [(slice(8, -8), slice(8, -8))] * 4
@@ -113,7 +113,7 @@ def test_shading_alone_locates_a_surface():
 
 def test_a_trench_that_the_field_has_closed_opens():
     shown = [trench(pose) for pose in POSES]
-    closed = [plate(pose)[0] for pose in POSES]
+    closed = [textured_plane(pose)[0] for pose in POSES]
     maps, pictures = maps_of([(d, picture) for d, (_, picture) in zip(closed, shown)])
     found = refine_depth(maps, pictures, POOL)
     straight = found[0]  # looks down into it: the floor is 30 mm below the lid
@@ -260,7 +260,7 @@ def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):
 
 def test_pictures_must_belong_to_the_maps(rig):
     maps, pictures, _ = rig
-    with pytest.raises(SurfaceError, match="3 pictures do not belong to 4"):
+    with pytest.raises(SurfaceError, match="3 images do not belong to 4"):
         refine_depth(maps, pictures[:3])
     with pytest.raises(SurfaceError, match="does not belong to a depth map"):
         refine_depth(maps, [p[:10] for p in pictures])
