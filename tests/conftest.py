@@ -55,6 +55,7 @@ _SIDE_BY_SIDE = (
     "edge_server/fields",
     "edge_server/foreground",
     "edge_server/live/test_buffer.py",
+    "edge_server/live/test_clock_jumps.py",
     "edge_server/live/test_keyframes.py",
     "edge_server/report",
     "edge_server/scheduler",

@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -34,10 +35,9 @@ from edge_server.live.ingest import Ingest, RollingPercentiles
 from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
-from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.scheduler import short_name
+from edge_server.scheduler import LivePolicies, short_name
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson, write_json
 from freshfield.ledger import Ledger
@@ -133,7 +133,7 @@ class EdgeServer:
         scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)
         try:
-            self.policies = ServerPolicies(scenario, config)
+            self.policies = LivePolicies(config.policy.name, config.policy.value, partial(scenario.rng, "policy"))
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         policy = self.policies.first

@@ -6,6 +6,7 @@ Adding a policy takes a class and a line in ``POLICIES``. ``bandit:FILE`` is a l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from edge_server.scheduler import fixed, index
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
+from freshfield.limits import MAX_POLICY_CHARS
 
 # name -> (class, one line of help)
 POLICIES: dict[str, tuple[type[Policy], str]] = {
@@ -108,3 +110,27 @@ def policy_help(name: str) -> str:
     if name.startswith(BANDIT):
         return "a learned policy (edge-server train-scheduler)"
     return POLICIES[name][1] if name in POLICIES else ""
+
+
+class LivePolicies:
+    """Makes the policies of a running edge.
+
+    first: the policy that it starts with.
+    offered: names that may be chosen during the run. The only learned policy among them is the first one: no
+    client can name a file to open.
+    """
+
+    def __init__(self, name: str, value: float | None, rng: Callable[[str], np.random.Generator]) -> None:
+        """name, value: of the first policy. rng: gives the random stream of a policy's name. Raises ValueError
+        for a policy that is not possible."""
+        self._rng = rng
+        self.first = make_live_policy(name, value, rng(name))
+        self.offered = OFFERED if self.first.name in OFFERED else (self.first.name, *OFFERED)
+
+    def make(self, name: str, value: float | None) -> Policy:
+        """The policy that an operator asks for. Raises ValueError if it is not offered."""
+        if name not in self.offered and len(name) > MAX_POLICY_CHARS:
+            raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
+        if name.startswith(BANDIT) and name not in self.offered:
+            raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
+        return make_live_policy(name, value, self._rng(name))

@@ -60,18 +60,6 @@ def test_another_session_with_the_same_number_is_another_frame():
     assert means.asked == [1, 1]
 
 
-def test_the_same_frame_twice_in_one_question_is_embedded_once():
-    means, cache = cached()
-    rows, ok = cache.of([buffered()] * 3)
-    assert means.asked == [1] and ok.all() and (rows == rows[0]).all()
-
-
-def test_nothing_is_embedded_for_nothing():
-    means, cache = cached()
-    rows, ok = cache.of([])
-    assert rows.shape == (0, DIM) and ok.shape == (0,) and means.asked == []
-
-
 def test_a_nan_costs_its_own_camera_and_is_counted_once():
     cache = EmbeddingCache(NanForTheFirst(), ViewDecoder().view)
     items = [buffered("cam01"), buffered("cam02")]
@@ -107,11 +95,3 @@ def test_a_decision_larger_than_the_cache_is_answered_whole():
         rows, ok = cache.of(items)
         assert ok.all() and len(rows) == 9
     assert len(cache._rows) == 2
-
-
-def test_a_caller_that_writes_into_its_rows_does_not_change_the_cache():
-    _, cache = cached()
-    rows, _ = cache.of([buffered()])
-    rows[:] = np.nan
-    again, ok = cache.of([buffered()])
-    assert ok.all() and np.isfinite(again).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import numpy as np
@@ -36,22 +35,14 @@ def test_the_backbones_end_is_what_the_neck_enlarges_and_the_head_is_not_run(tmp
 
 
 @pytest.mark.parametrize("batch", [None, 1, 4])
-@pytest.mark.parametrize("count", [0, 1, 5])
+@pytest.mark.parametrize("count", [0, 1, 70])
 def test_fixed_and_free_batches_give_one_result(tmp_path, batch, count):
     free = embedder(detector(tmp_path / "a.onnx"))
     fixed = embedder(detector(tmp_path / "b.onnx", batch=batch))
-    images = [image(20 + k, 40) for k in range(count)]
+    images = [image(20 + k, 40) for k in range(count)]  # 70: more than one run, in order
     rows = fixed.embed(images)
     assert rows.shape == (count, CHANNELS) and rows.dtype == np.float32
     assert rows == pytest.approx(free.embed(images), abs=1e-5)
-
-
-def test_a_large_batch_goes_in_parts_and_keeps_its_order(tmp_path):
-    made = embedder(detector(tmp_path / "d.onnx"))
-    images = [image(32, 32) for _ in range(70)]
-    rows = made.embed(images)
-    assert rows[-1] == pytest.approx(made.embed(images[-1:])[0], abs=1e-5)
-    assert rows[33] == pytest.approx(made.embed(images[33:34])[0], abs=1e-5)
 
 
 def test_the_projection_keeps_lengths_and_is_the_same_in_every_process(tmp_path):
@@ -78,14 +69,6 @@ def test_the_size_is_the_files_or_the_scenarios_or_the_exporters(tmp_path):
     assert embedder(fixed, size=32).backbone.height == 32
     with pytest.raises(EmbeddingError, match="exported for 32 x 32 only"):
         embedder(fixed, size=64)
-
-
-def test_names_tell_embeddings_apart(tmp_path):
-    path = detector(tmp_path / "d.onnx", size=None)
-    other = detector(tmp_path / "e.onnx", size=None, gain=2.0)
-    made = [embedder(path, size=64), embedder(path, size=96), embedder(path, size=64, dim=4), embedder(other, size=64)]
-    assert len({m.name for m in made}) == 4
-    assert embedder(path, size=64).name == made[0].name
 
 
 def test_a_tap_is_a_tensor_or_a_module(tmp_path):
@@ -143,18 +126,6 @@ def test_a_provider_that_is_not_there_is_named_with_those_that_are(tmp_path):
     assert embedder(path, provider="auto").provider == "cpu"
     with pytest.raises(EmbeddingError, match="no cuda here, it has cpu"):
         embedder(path, provider="cuda")
-
-
-def test_loading_needs_no_torch_and_no_camera_code(tmp_path):
-    path = detector(tmp_path / "d.onnx")
-    code = (
-        "import sys\n"
-        "from edge_server.embed import EmbeddingConfig, make_embedder\n"
-        "assert not {'onnx', 'onnxruntime'} & set(sys.modules), 'imported before it is asked for'\n"
-        f"make_embedder(EmbeddingConfig({str(path)!r}, 3))\n"
-        "assert not {'torch', 'camera_node', 'channel_emu'} & set(sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_a_library_that_is_missing_is_named_with_what_installs_it(monkeypatch):

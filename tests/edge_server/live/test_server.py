@@ -17,7 +17,6 @@ from edge_server.cli import main as edge_server
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
 from edge_server.live.loop import UpdateLoop
-from edge_server.live.policies import ServerPolicies
 from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import frame as wire
 from freshfield import payload, scenario
@@ -29,7 +28,6 @@ from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, fr
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
 from tests.ports import free_port
-from tests.work import MOST_MS, work_ms
 
 
 def tiny_scenario(tmp_path, held_out=("cam00",), **edge):
@@ -286,17 +284,6 @@ def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeyp
     goes_on.set()
     assert not (tmp_path / "out" / "field.npz").exists()
     assert "field.npz: not written: the last update did not end" in caplog.text
-
-
-def test_a_name_of_eight_megabytes_is_no_policy(tmp_path):
-    made = tiny_scenario(tmp_path)
-    policies = ServerPolicies(made, read_config(made))
-
-    def ask():
-        with pytest.raises(ValueError, match="8000000 characters"):
-            policies.make("n" * 8_000_000, None)
-
-    assert work_ms(ask) < MOST_MS
 
 
 def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(serve, tmp_path):

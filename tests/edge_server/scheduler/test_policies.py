@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_server.scheduler import OFFERED, POLICIES, Epoch, make_live_policy, make_policy, policy_help
+from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_live_policy, make_policy, policy_help
 from edge_server.scheduler.learned.state import State
 from edge_server.scheduler.registry import resolve_checkpoint
+from tests.work import MOST_MS, work_ms
 
 MS = 1_000_000
 
@@ -220,3 +221,18 @@ def test_a_live_edge_refuses_what_only_virtual_time_can_do():
     assert make_live_policy("wait", 40.0, rng).name == "wait"
     with pytest.raises(ValueError, match="live, use wait"):
         make_live_policy("wait-flush", 40.0, rng)
+
+
+def test_a_running_edge_offers_what_it_began_with_and_no_other_file():
+    policies = LivePolicies("threshold", 70.0, lambda name: np.random.default_rng(len(name)))
+    assert (policies.first.name, policies.first.value, policies.offered) == ("threshold", 70.0, OFFERED)
+    assert policies.make("freshest-k", 3.0).value == 3
+    for name in ("bandit:other.npz", "wait-flush", "best"):
+        with pytest.raises(ValueError, match=name):
+            policies.make(name, None)
+
+    def ask():
+        with pytest.raises(ValueError, match="8000000 characters"):
+            policies.make("n" * 8_000_000, None)
+
+    assert work_ms(ask) < MOST_MS

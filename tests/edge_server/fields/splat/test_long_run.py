@@ -1,7 +1,4 @@
-"""Three hundred updates of a moving scene, warm starts only, against fields fitted afresh.
-
-``edge-server bench drift`` asks the same of full-sized fields; it takes minutes each.
-"""
+"""Three hundred updates of a moving scene, warm starts only, against fields fitted afresh."""
 
 from __future__ import annotations
 
@@ -13,6 +10,8 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.still_field import StillField
+
+pytestmark = pytest.mark.stability
 
 UPDATES, FRESH_TIMES, NEAR_DB = 300, 15, 0.5
 LAST = range(UPDATES - 9, UPDATES + 1)

@@ -17,6 +17,8 @@ from freshfield.geometry import Pinhole
 from tests.edge_server.embed.graphs import CHANNELS, detector
 from tests.edge_server.frames import frame
 
+pytestmark = pytest.mark.stability
+
 RNG = np.random.default_rng(3)
 HARD = {
     "black": np.zeros((128, 128, 3), np.uint8),
@@ -45,10 +47,6 @@ def test_every_picture_has_a_finite_embedding_that_its_neighbors_do_not_change(s
     assert np.abs(alone).max() < 100.0
     among = shipped.embed([HARD["checkers"], HARD[name], HARD["black"]])
     assert among[1] == pytest.approx(alone[0], abs=1e-4)
-
-
-def test_none_gives_none(shipped):
-    assert shipped.embed([]).shape == (0, shipped.dim)
 
 
 def test_what_is_no_picture_is_refused_by_number(shipped):

@@ -13,6 +13,8 @@ from edge_server.scheduler import POLICIES, Epoch, make_policy
 from freshfield.frame import FrameRejected
 from tests.edge_server.frames import frame
 
+pytestmark = pytest.mark.stability
+
 MS = 1_000_000
 START_NS = 1_700_000_000_000 * MS
 STEP_MS = 50
