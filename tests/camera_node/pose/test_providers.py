@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from camera_node.pose.providers import FixedPose, PoseGapError, Trajectory, TrajectoryError, read_tum
 from freshfield.geometry import Pose, so3_exp
@@ -36,17 +34,6 @@ def test_beyond_the_bound_there_is_no_pose():
     for t_ms in (-51, 100, 251):
         with pytest.raises(PoseGapError, match="nearest pose"):
             track.at(t_ms * MS)
-
-
-@given(st.lists(st.integers(-(10**12), 10**12), min_size=1, max_size=30, unique=True), st.integers(-(10**12), 10**12))
-def test_the_gap_is_the_distance_to_the_nearest_sample(times, t_ns):
-    times.sort()
-    track = Trajectory(times, [turn(k / 30, k) for k in range(len(times))], max_gap_ns=10**13)
-    found, gap_ns = track.at(t_ns)
-    assert gap_ns == min(abs(t - t_ns) for t in times)
-    if t_ns in times:
-        assert found == turn(times.index(t_ns) / 30, times.index(t_ns))
-    assert 0 <= found.translation_m[0] <= len(times) - 1
 
 
 def test_a_fixed_pose_has_no_gap():

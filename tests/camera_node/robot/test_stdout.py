@@ -5,8 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from camera_node.robot import stdout
-
 SPEAKS = """
 import ctypes, os, sys, threading
 from camera_node.robot import stdout
@@ -27,10 +25,3 @@ def test_only_what_python_prints_comes_out():
     done = subprocess.run([sys.executable, "-c", SPEAKS], capture_output=True, text=True, check=True)
     assert sorted(done.stdout.split("\n")) == sorted(["before", "the answer", "after", "as ever", ""])
     assert sorted(done.stderr.split("\n")) == sorted(["from a library", "held back by one", "from a child", ""])
-
-
-def test_what_stands_in_for_standard_output_is_left_alone(capsys):
-    with stdout.only_python_output():
-        print("the answer")
-    print("after")
-    assert capsys.readouterr().out == "the answer\nafter\n"

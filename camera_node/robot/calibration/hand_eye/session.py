@@ -67,8 +67,8 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         if args.samples is not None:
             files.write_json(args.samples, pairs_json(samples))
 
-    session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
     streams = StreamRecorder() if args.moving and arm is not None else None
+    session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep, streams is not None)
     source = guided.open_source(loaded, config, args)
     with contextlib.ExitStack() as stack:
         stack.callback(source.release)
@@ -125,6 +125,7 @@ class HandEyeSession:
     moving: also take images while the arm moves; its poses must then be exact in time.
     before: samples of an earlier session to continue.
     kept: called with all samples after each new one.
+    streams: the streams are recorded too, and calibrated at the end; solving in between would hold up the camera.
     samples: all that were kept.
     corners, target_pose: found in the last image.
     refined: current calibration, if there is one.
@@ -138,12 +139,14 @@ class HandEyeSession:
         moving: bool = False,
         before: Samples | None = None,
         kept: Callable[[Samples], None] = lambda samples: None,
+        streams: bool = False,
     ) -> None:
         self.samples = before or Samples(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), setup)
         self.corners: Corners | None = None
         self.target_pose: Array | None = None
         self.refined: Refinement | None = None
         self._target, self._want_mm, self._moving, self._kept = target, want_mm, moving, kept
+        self._streams = streams
         self._last: Array | None = None
         self._solve()
 
@@ -178,7 +181,7 @@ class HandEyeSession:
 
     def _solve(self) -> None:
         self._diversity = diversity(self.samples)
-        solvable = self._diversity.reason is None and len(self.samples) >= _MIN_TO_SOLVE
+        solvable = self._diversity.reason is None and len(self.samples) >= _MIN_TO_SOLVE and not self._streams
         self.refined = refine(self.samples) if solvable else None
 
     def _step(self, outcome: str, advice: str | None = None) -> Step:

@@ -179,13 +179,15 @@ def _angular_speed(track: Track) -> Array:
 
 
 def _correlation(a: Array, b: Array) -> Array:
-    """Correlation of a[k + lag] with b[k] for lags -(len(b) - 1) to len(a) - 1; 1 if one is the other, delayed. An
-    unknown sample (NaN) counts as the mean, and so does what one stream has beyond the other's ends."""
-    centered = [np.nan_to_num(v - np.nanmean(v)) for v in (a, b)]
-    cross = correlate(*centered, mode="full", method="fft")
-    inside = [correlate(v**2, np.ones(len(other)), mode="full", method="fft") for v, other in zip(centered, (b, a))]
-    # Of b the squares within a's ends are those of its mirror image.
-    power = np.sqrt(np.maximum(inside[0], 0.0) * np.maximum(inside[1][::-1], 0.0))
-    whole = np.sqrt((centered[0] ** 2).sum() * (centered[1] ** 2).sum())
+    """Correlation of a[k + lag] with b[k] for lags -(len(b) - 1) to len(a) - 1, over the samples that are known in
+    both (not NaN); 1 if one is the other, delayed."""
+    known_a, known_b = ((~np.isnan(v)).astype(np.float64) for v in (a, b))
+    a, b = (np.nan_to_num(v - np.nanmean(v)) for v in (a, b))
+
+    def cross(u: Array, v: Array) -> Array:
+        return np.asarray(correlate(u, v, mode="full", method="fft"))
+
+    power = np.sqrt(np.maximum(cross(a * a, known_b), 0.0) * np.maximum(cross(known_a, b * b), 0.0))
     # Where less than half of the motion overlaps, chance decides.
-    return np.where(power > 0.5 * whole, cross / np.maximum(power, 1e-12), -1.0)
+    enough = power > max(0.5 * float(power.max()), 1e-12)
+    return np.where(enough, cross(a, b) / np.where(enough, power, 1.0), -1.0)
