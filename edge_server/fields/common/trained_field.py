@@ -152,9 +152,11 @@ class TrainedField(SteppedField[RaySnapshot]):
     def _grow(self) -> None:
         """Give the encoding the size it has at ``self.step``; called after every step."""
 
-    def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
+    def _train(self, data: Views, ray_sampling: RaySampling, space: Space, weights: Weights) -> None:
         """Fill ``self._batch``, gradients included, from one step's rays."""
-        self.pool.run(train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch)
+        self.pool.run(
+            train_chunks, data, ray_sampling, space, self._encoding, self._net, weights, self._batch, self._scratch
+        )
 
     @abstractmethod
     def _gather(self, levels: int, scale: float) -> None:
@@ -258,7 +260,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             )
         space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
-        recipe = RaySampling(
+        ray_sampling = RaySampling(
             key=np.uint64(key + np.uint64(1)),
             chunk_rays=max(s.rays // batch.samples.size, 1),
             levels=levels,
@@ -268,7 +270,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             random_background=s.background == "random",
         )
         weights = Weights(distortion=np.float32(s.distortion), guide=np.float32(self._present_guide_weight()))
-        self._train(data, recipe, space, weights)
+        self._train(data, ray_sampling, space, weights)
         rays = max(int(batch.rays.sum()), 1)
         self._gather(levels, NOMINAL_RAYS / rays)
         if batch.dropped.any():

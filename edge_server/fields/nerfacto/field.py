@@ -104,7 +104,7 @@ class NerfactoField(NgpField):
             decay=np.float32(s.proposal_decay),
         )
 
-    def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
+    def _train(self, data: Views, ray_sampling: RaySampling, space: Space, weights: Weights) -> None:
         cameras, bins = self._cameras, self._proposal_gradients
         if bins.d_embeddings.shape[1:] != cameras.embeddings.shape:
             bins = self._proposal_gradients = bins._replace(
@@ -113,7 +113,7 @@ class NerfactoField(NgpField):
         self.pool.run(
             train_with_proposal,
             data,
-            recipe,
+            ray_sampling,
             self._sampling(),
             space,
             self._encoding,

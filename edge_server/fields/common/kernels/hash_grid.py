@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
-from edge_server.fields.common.kernels.simd import add_pair, fetch_add, weighted_pairs
+from edge_server.fields.common.kernels.simd import fetch_add
 
 FEATURES = 2  # a vertex; one 64-bit load
 SEGMENT = 16  # vertices a dirty flag stands for
@@ -81,13 +81,23 @@ def _weights(fx, fy, fz):
 
 
 @part
+def _interpolate(table, rows, weights):
+    """Weighted sum of eight rows of a table, two float32."""
+    a, b = np.float32(0.0), np.float32(0.0)
+    for k in range(8):
+        a += weights[k] * table[rows[k], 0]
+        b += weights[k] * table[rows[k], 1]
+    return a, b
+
+
+@part
 def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
         ix, fx = _corner(x[s], res)
         iy, fy = _corner(y[s], res)
         iz, fz = _corner(z[s], res)
         rows = _corners(dense, res, mask, ix, iy, iz)
-        out0[s], out1[s] = weighted_pairs(table, rows, _weights(fx, fy, fz))
+        out0[s], out1[s] = _interpolate(table, rows, _weights(fx, fy, fz))
 
 
 @part
@@ -121,6 +131,12 @@ def _mark(dirty, i, j):
 
 
 @part
+def _add_pair(table, row, weight, a, b):
+    table[row, 0] += weight * a
+    table[row, 1] += weight * b
+
+
+@part
 def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
     zero = np.float32(0.0)
     for s in range(d0.size):
@@ -132,14 +148,14 @@ def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
         iz, fz = _corner(x[2, s], res)
         i0, i1, i2, i3, i4, i5, i6, i7 = _corners(dense, res, mask, ix, iy, iz)
         w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-        add_pair(gradient, i0, w0, g0, g1)
-        add_pair(gradient, i1, w1, g0, g1)
-        add_pair(gradient, i2, w2, g0, g1)
-        add_pair(gradient, i3, w3, g0, g1)
-        add_pair(gradient, i4, w4, g0, g1)
-        add_pair(gradient, i5, w5, g0, g1)
-        add_pair(gradient, i6, w6, g0, g1)
-        add_pair(gradient, i7, w7, g0, g1)
+        _add_pair(gradient, i0, w0, g0, g1)
+        _add_pair(gradient, i1, w1, g0, g1)
+        _add_pair(gradient, i2, w2, g0, g1)
+        _add_pair(gradient, i3, w3, g0, g1)
+        _add_pair(gradient, i4, w4, g0, g1)
+        _add_pair(gradient, i5, w5, g0, g1)
+        _add_pair(gradient, i6, w6, g0, g1)
+        _add_pair(gradient, i7, w7, g0, g1)
         _mark(dirty, i0, i1)
         _mark(dirty, i2, i3)
         _mark(dirty, i4, i5)

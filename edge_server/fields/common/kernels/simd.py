@@ -95,61 +95,6 @@ def lowest_bit(typingctx: Any, value: Any) -> Any:
     return types.int64(types.uint64), codegen
 
 
-_PAIR = ir.VectorType(ir.FloatType(), 2)
-
-
-def _pair_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    pairs = builder.bitcast(data, _PAIR.as_pointer())
-    return builder.gep(pairs, [builder.zext(index, ir.IntType(64))])
-
-
-def _pair_of(builder: Any, a: Any, b: Any) -> Any:
-    pair = builder.insert_element(ir.Constant(_PAIR, ir.Undefined), a, ir.IntType(32)(0))
-    return builder.insert_element(pair, b, ir.IntType(32)(1))
-
-
-@intrinsic
-def add_pair(typingctx: Any, table: Any, row: Any, weight: Any, a: Any, b: Any) -> Any:
-    """``table[row] += weight * (a, b)``; table contiguous float32 (N, 2), row uint32, the rest float32.
-
-    One load and one store where LLVM makes two of each: the scatter takes half the time.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = _pair_pointer(context, builder, signature.args[0], args[0], args[1])
-        step = builder.fmul(
-            _pair_of(builder, args[2], args[2]), _pair_of(builder, args[3], args[4]), flags=("contract",)
-        )
-        old = builder.load(pointer)
-        old.align = 4
-        builder.store(builder.fadd(old, step, flags=("contract",)), pointer).align = 4
-        return context.get_dummy_value()
-
-    f32 = types.float32
-    return types.void(table, types.uint32, f32, f32, f32), codegen
-
-
-@intrinsic
-def weighted_pairs(typingctx: Any, table: Any, rows: Any, weights: Any) -> Any:
-    """``sum_k weights[k] * table[rows[k]]`` as two float32; table contiguous float32 (N, 2), tuples of
-    equal length of uint32 rows and float32 weights."""
-    signature = types.UniTuple(types.float32, 2)(table, rows, weights)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total = None
-        for k in range(len(signature.args[1])):
-            row, weight = builder.extract_value(args[1], k), builder.extract_value(args[2], k)
-            pair = builder.load(_pair_pointer(context, builder, signature.args[0], args[0], row))
-            pair.align = 4
-            term = builder.fmul(pair, _pair_of(builder, weight, weight), flags=("contract",))
-            total = term if total is None else builder.fadd(total, term, flags=("contract", "reassoc"))
-        parts = [builder.extract_element(total, ir.IntType(32)(k)) for k in (0, 1)]
-        return context.make_tuple(builder, signature.return_type, parts)
-
-    return signature, codegen
-
-
 _LANES, _VECTORS = 16, 2
 AT_ONCE = _LANES * _VECTORS
 _WIDE = ir.VectorType(ir.FloatType(), _LANES)

@@ -119,25 +119,25 @@ def _view_of(first, pixel):
 
 
 @part
-def draw_ray(views, recipe, n, ray):
+def draw_ray(views, ray_sampling, n, ray):
     """Draw the n-th ray of the step: fills ray (12,), returns its view's number."""
-    key, k = recipe.key, np.uint64(n) * np.uint64(8)
+    key, k = ray_sampling.key, np.uint64(n) * np.uint64(8)
     total = views.pixels.shape[0]
     # 53 bits, because float32 cannot count the pixels of a hundred pictures.
     choice = np.float64(uniform(key, k)) + np.float64(uniform(key, k + np.uint64(1))) * 5.9604644775390625e-08
-    if views.changed.size > 0 and uniform(key, k + np.uint64(2)) < recipe.changed_share:
+    if views.changed.size > 0 and uniform(key, k + np.uint64(2)) < ray_sampling.changed_share:
         pixel = views.changed[min(np.int64(choice * views.changed.size), views.changed.size - 1)]
     elif views.drawn.size > 0:
         pixel = views.drawn[min(np.int64(choice * views.drawn.size), views.drawn.size - 1)]
     else:
         pixel = min(np.int64(choice * total), total - 1)
-    return take_pixel(views, recipe, pixel, n, ray)
+    return take_pixel(views, ray_sampling, pixel, n, ray)
 
 
 @part
-def take_pixel(views, recipe, pixel, n, ray):
+def take_pixel(views, ray_sampling, pixel, n, ray):
     """Fill ray (12,), the step's n-th, from a pixel (see ``Scratch``). Returns the view's number."""
-    key, k = recipe.key, np.uint64(n) * np.uint64(8)
+    key, k = ray_sampling.key, np.uint64(n) * np.uint64(8)
     view = _view_of(views.first, pixel)
     local = pixel - views.first[view]
     width = views.size[view, 0]
@@ -147,8 +147,8 @@ def take_pixel(views, recipe, pixel, n, ray):
     if views.pixels.shape[1] == 4:
         alpha = np.float32(views.pixels[pixel, 3]) * _BYTE
     for c in range(3):
-        back = recipe.background[c]
-        if recipe.random_background:
+        back = ray_sampling.background[c]
+        if ray_sampling.random_background:
             back = uniform(key, k + np.uint64(3 + c))
         ray[6 + c] = back
         ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
@@ -167,18 +167,18 @@ _AT, _LEAVE, _DEPTH = 0, 1, 2  # columns of ``Scratch.travel``
 
 
 @part
-def begin_rays(views, recipe, space, chunk, first, end, ray, travel):
+def begin_rays(views, ray_sampling, space, chunk, first, end, ray, travel):
     """Draw the chunk's rays first to end: fills ray and travel (``Scratch``)."""
     for r in range(first, end):
         index = chunk * CHUNK_RAYS + r
-        view = draw_ray(views, recipe, index, ray[r])
+        view = draw_ray(views, ray_sampling, index, ray[r])
         enter, leave = interval(space, origin_of(views, view), (ray[r, 0], ray[r, 1], ray[r, 2]))
-        enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
+        enter += uniform(ray_sampling.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
         travel[r, _AT], travel[r, _LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
 
 @part
-def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, travel, span):
+def fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span):
     """Fill a chunk with rays, their samples and what ``query_density`` returns for them.
     Returns (rays drawn, columns, spans); rays that have not ended must not be used.
 
@@ -188,7 +188,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, t
     """
     ts, dts = line[0], line[1]
     sigma = acts[acts.shape[0] - net.widths[-1]]
-    limit = min(recipe.chunk_rays, ray.shape[0])
+    limit = min(ray_sampling.chunk_rays, ray.shape[0])
     # The rays of one round: first those under travel, then fresh ones; and where the samples of each end.
     active, stops = np.empty(limit, np.int64), np.empty(limit, np.int64)
     # Typed, since numba would compile the callees once more for every literal.
@@ -201,7 +201,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, t
             if marched == under_way:
                 if fresh == ready:
                     ready = min(ready + DRAWN, limit)
-                    begin_rays(views, recipe, space, chunk, fresh, ready, ray, travel)
+                    begin_rays(views, ray_sampling, space, chunk, fresh, ready, ray, travel)
                 active[marched] = fresh
                 fresh += 1
                 under_way += 1
@@ -211,7 +211,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, t
             end, travel[r, _AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED))
             stops[marched] = end
             marched += 1
-        query_density(encoding, recipe.levels, net, x, n, end, acts)
+        query_density(encoding, ray_sampling.levels, net, x, n, end, acts)
         activate_density(acts[acts.shape[0] - net.widths[-1] :], n, end)
         begin, left = n, 0
         for k in range(marched):
@@ -321,7 +321,7 @@ def add_exposure_sums(out, w, dts, first, end, ray, sums):
 
 
 @kernel
-def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, batch, scratch):
+def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, weights, batch, scratch):
     """Tasks are chunks. Does everything but the encoding's own gradient, which its scatter kernel adds up."""
     acts, d_acts, line = scratch.acts[worker], scratch.d_acts[worker], scratch.line[worker]
     by_ray, column, span = scratch.by_ray[worker], scratch.column[worker], scratch.span[worker]
@@ -334,15 +334,15 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
         if chunk >= batch.samples.size:
             return
         x = batch.x[chunk]
-        drawn, n, spans = fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, travel, span)
+        drawn, n, spans = fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span)
         rays = sort_by_ray(drawn, spans, span, ray, travel, column, ray_first)
         used = ray_first[rays]
-        query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
-        if recipe.harmonics > 1:
+        query_color(encoding, ray_sampling.levels, net, x, np.int64(0), n, acts)
+        if ray_sampling.harmonics > 1:
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_harmonics(out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
         activate_color(out, np.int64(0), n)
         gather_by_ray(out, line, column, used, by_ray)
         # Clear unused columns before sums over columns: 0 times NaN is NaN.
@@ -367,11 +367,11 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
                 if batch.exposure.shape[1] > 0:
                     add_exposure_sums(by_ray, w, dts, a, b, ray[r], batch.exposure[chunk])
         scatter_to_columns(by_ray, column, used, d_out)
-        if recipe.harmonics > 1:
+        if ray_sampling.harmonics > 1:
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics_backward(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_harmonics_backward(d_out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
         batch.d_params[chunk] = _F0
         query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, used, rays

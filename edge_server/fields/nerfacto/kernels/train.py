@@ -89,14 +89,16 @@ def compact_columns(rows, a, b, to):
 
 
 @part
-def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, bins, bin_first):
+def sample_chunk(
+    views, ray_sampling, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, bins, bin_first
+):
     """Fill a chunk with rays, their bins (see ``sample_ray``), their samples and the result of ``query_density``.
 
     Hidden samples are removed, and further rays fill their place. Returns (rays, samples, rays whose
     proposal is not finite).
     """
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
-    limit = min(recipe.chunk_rays, ray.shape[0])
+    limit = min(ray_sampling.chunk_rays, ray.shape[0])
     edges, share = np.empty((2, sampling.bins + 1), np.float32), np.empty(sampling.bins, np.int64)
     scratch = edges, np.empty((2, sampling.bins), np.int32), share
     n, rays = np.int64(0), np.int64(0)
@@ -106,10 +108,10 @@ def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, 
         end, drawn = n, rays
         while drawn < limit and end + 2 * sampling.samples + 1 <= CHUNK:
             index = chunk * CHUNK_RAYS + drawn
-            o = origin_of(views, draw_ray(views, recipe, index, ray[drawn]))
+            o = origin_of(views, draw_ray(views, ray_sampling, index, ray[drawn]))
             d = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
-            shift = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
-            within = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
+            shift = uniform(ray_sampling.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
+            within = uniform(ray_sampling.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
             first = bin_first[drawn]
             count, finite, end = sample_ray(
                 space, encoding, sampling, o, d, shift, within, bins, first, scratch, end, x, line
@@ -119,7 +121,7 @@ def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, 
             ray_first[drawn], bin_first[drawn] = end, first + count
         if drawn == rays:
             break
-        query_density(encoding, recipe.levels, net, x, n, end, acts)
+        query_density(encoding, ray_sampling.levels, net, x, n, end, acts)
         activate_density(out, n, end)
         begin = n
         for r in range(rays, drawn):
@@ -138,7 +140,20 @@ def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, 
 
 @kernel
 def train_with_proposal(
-    counter, worker, views, recipe, sampling, space, encoding, net, embeddings, weights, batch, bins, scratch, extra
+    counter,
+    worker,
+    views,
+    ray_sampling,
+    sampling,
+    space,
+    encoding,
+    net,
+    embeddings,
+    weights,
+    batch,
+    bins,
+    scratch,
+    extra,
 ):
     """Forward and backward of a step; a task is a chunk. Scatter kernels then add up the gradients of the
     encoding and of the proposal. embeddings: float32 (V, A), one a view; A = 0: none. extra: proposal's scratch."""
@@ -148,7 +163,7 @@ def train_with_proposal(
     ts, dts, group_of, w = line[0], line[1], line[2], line[3]
     bin_first = extra.first[worker]
     ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
-    outputs, row = net.widths[-1], 1 + 3 * recipe.harmonics
+    outputs, row = net.widths[-1], 1 + 3 * ray_sampling.harmonics
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
     slope = np.empty((2, sampling.bins), np.float32)
     while True:
@@ -159,13 +174,26 @@ def train_with_proposal(
         bins.d_embeddings[chunk] = _F0
         bins_of = cell, depth, weight, group
         rays, n, broken = sample_chunk(
-            views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, bins_of, bin_first
+            views,
+            ray_sampling,
+            sampling,
+            space,
+            encoding,
+            net,
+            chunk,
+            x,
+            acts,
+            ray_first,
+            ray,
+            line,
+            bins_of,
+            bin_first,
         )
-        query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
+        query_color(encoding, ray_sampling.levels, net, x, np.int64(0), n, acts)
         for r in range(rays):
             a, b = ray_first[r], ray_first[r + 1]
-            if recipe.harmonics > 1:
-                add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+            if ray_sampling.harmonics > 1:
+                add_harmonics(out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
             if embeddings.shape[1] > 0:
                 add_appearance(out, row, embeddings[np.int64(ray[r, 9])], a, b)
         activate_color(out, np.int64(0), n)
@@ -190,8 +218,8 @@ def train_with_proposal(
             interlevel_loss(encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, sampling, slope, grad)
             if batch.exposure.shape[1] > 0:
                 add_exposure_sums(out, w, dts, a, b, ray[r], batch.exposure[chunk])
-            if recipe.harmonics > 1:
-                add_harmonics_backward(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+            if ray_sampling.harmonics > 1:
+                add_harmonics_backward(d_out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
             if embeddings.shape[1] > 0:
                 view = np.int64(ray[r, 9])
                 add_appearance_backward(out, d_out, row, embeddings[view], a, b, bins.d_embeddings[chunk, view])

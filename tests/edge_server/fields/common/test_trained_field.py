@@ -17,9 +17,9 @@ def test_shipped_settings_regularize(name: str, monkeypatch: pytest.MonkeyPatch)
     field, given = small(name), []
     train = field._train
 
-    def noted(data, recipe, space, weights) -> None:
+    def noted(data, ray_sampling, space, weights) -> None:
         given.append(weights)
-        train(data, recipe, space, weights)
+        train(data, ray_sampling, space, weights)
 
     monkeypatch.setattr(field, "_train", noted)
     field.fit(SEEN, Budget(steps=1))

@@ -322,13 +322,13 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     field._net.params[-field._net.widths[-1]] = -1.0
     assert field.view_store.box is not None
     data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
-    recipe = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
+    ray_sampling = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
     weights = Weights(F(0.0))
     space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:
-        field._train(data, recipe, space, weights)
+        field._train(data, ray_sampling, space, weights)
         return float(field._batch.loss.sum())
 
     loss()

@@ -62,7 +62,7 @@ def _train(
 ) -> tuple[float, NDArray[np.float32], int]:
     """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
     takes everything to be ``over`` times as dense as it knows."""
-    recipe = RaySampling(
+    ray_sampling = RaySampling(
         key=np.uint64(7),
         chunk_rays=rays,
         levels=SETTINGS.levels,
@@ -75,7 +75,7 @@ def _train(
     space = space._replace(density=space.density * np.float32(over))
     weights = Weights(np.float32(DISTORTION))
     batch, scratch = field._batch, field._scratch
-    field.pool.run(train_chunks, data, recipe, space, field._encoding, field._net, weights, batch, scratch)
+    field.pool.run(train_chunks, data, ray_sampling, space, field._encoding, field._net, weights, batch, scratch)
     return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
 
 
