@@ -1,1 +1,1 @@
-"""Code shared by benches, studies and trainings: stored results, statistics, progress, machine speed."""
+"""Code shared by the experiments: arguments of commands, folders, statistics and tables."""

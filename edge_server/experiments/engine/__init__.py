@@ -28,6 +28,7 @@ most, which one process computes in the order given. Inputs without a group are 
 ``Engine(..., threads=1)`` fixes the number, in this process too.
 """
 
+from edge_server.experiments.engine.content_key import processor
 from edge_server.experiments.engine.engine import Engine, EngineError
 
-__all__ = ["Engine", "EngineError"]
+__all__ = ["Engine", "EngineError", "processor"]

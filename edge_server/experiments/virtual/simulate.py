@@ -18,8 +18,8 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, EdgeConfig, PolicyConfig, described, embedding_for, read_config
 from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
-from edge_server.experiments.common.result_store import processor
 from edge_server.experiments.common.tables import mean_or_none, number
+from edge_server.experiments.engine import processor
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips

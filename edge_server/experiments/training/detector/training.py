@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.training.detector.dataset import LabeledImages
 from edge_server.experiments.training.detector.loss import detection_loss
 from edge_server.experiments.training.detector.network import Detector
@@ -64,7 +63,6 @@ def train(dataset: LabeledImages, settings: Settings, checkpoint: Path) -> tuple
     parts = {"model": model, "averaged": averaged, "optimizer": optimizer}
     log = _resume(checkpoint, settings, parts)
     per_epoch = len(dataset) // BATCH
-    progress = Progress(settings.epochs - len(log))
     for epoch in range(len(log), settings.epochs):
         began, sums = time.perf_counter(), np.zeros(2)
         model.train()
@@ -85,9 +83,9 @@ def train(dataset: LabeledImages, settings: Settings, checkpoint: Path) -> tuple
         seconds = round(time.perf_counter() - began, 1)
         log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
         _save(checkpoint, settings, parts, log)
-        progress.advance(1)
-        words = f"loss {score_loss:.3f} + {box_loss:.3f}"
-        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", words)
+        left_s = seconds * (settings.epochs - epoch - 1)
+        words = f"epoch {epoch + 1} of {settings.epochs}, loss {score_loss:.3f} + {box_loss:.3f}"
+        print(f"  training: {words}; {left_s:.0f} s left", flush=True)
     return averaged, log
 
 
