@@ -224,6 +224,8 @@ def test_points_know_who_sees_them():
     found = sparse_points(maps, 1200)
     assert 1000 < len(found.points) <= 1200
     assert np.abs(np.linalg.norm(found.points, axis=1) - 0.1).max() < 1e-3
+    top, bottom = found.points[:, 2] > 0.01, found.points[:, 2] < -0.01
+    assert (found.color[top] == (200, 20, 20)).all() and (found.color[bottom] == 90).all()
     # Who sees a point of a ball stands on its side; nobody sees it through the ball.
     for k, m in enumerate(maps):
         front = found.points @ m.camera_to_world[:3, 3] > 0

@@ -50,6 +50,7 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
     assert parts == pytest.approx({"network": 50.0, "waiting": 30.0, "computing": 20.0, "display": 25.0})
     html = markup.status(summary(age_parts_ms=parts))
     assert "125 ms" in html and "width:40.0%" in html
+    assert [css(scale_color(k / 3)) in html for k in range(4)] == [True] * 4
     assert age_parts_ms([publication(0.0, 50.0)]) == age_parts_ms([publication(t, None) for t in (0, 1)]) == {}
     assert "age of what is shown" not in markup.status(summary())
 

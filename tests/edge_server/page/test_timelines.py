@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from unittest.mock import MagicMock
+
 import numpy as np
 
-from edge_server.live.state import CameraView
+from edge_server.live.state import CameraView, Publication
+from edge_server.page import timelines
 from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _latest_value, _stairs
 
 
@@ -71,3 +74,25 @@ def test_gaps_are_filled_with_what_was_known():
 def test_a_staircase_holds_each_value():
     t, y = _stairs(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
     assert t.tolist() == [0, 1, 1, 2, 2] and y.tolist() == [0, 0, 1, 1, 0]
+
+
+def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(monkeypatch):
+    drawn = []
+
+    def draw(chart, t, *curves, remark=""):
+        drawn.append((chart.title, t.tolist(), [curve.tolist() for curve in curves], remark))
+
+    monkeypatch.setattr(timelines._Chart, "draw", draw)
+    history = History(window_s=1000.0)
+    for t in (0.0, 200.0):
+        history.sample(t, views(100.0, 300.0), {"state": "high", "states": ["low", "high"]})
+    scores = ((10.0, 15.0), (90.0, 20.0), (190.0, None), (195.0, 22.0))
+    publications = [
+        Publication(k, t_s, 0, 50.0, (), (), 0.0, 0.0, psnr_db=db, psnr_moving_db=db, scored_on="truth")
+        for k, (t_s, db) in enumerate(scores)
+    ]
+    timelines.Timelines(MagicMock()).refresh(history, publications)
+    (_, t, (mean, worst, omega), _), (title, when, (psnr, _), _), (_, _, (state,), names) = drawn
+    assert t == [0.0, 200.0] and mean == [200.0, 200.0] and worst == [300.0, 300.0] and omega[1] == 50.0
+    assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
+    assert state == [1.0, 1.0] and names == "0 low, 1 high"

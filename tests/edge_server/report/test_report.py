@@ -7,6 +7,7 @@ import json
 import re
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -194,7 +195,7 @@ def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
 @pytest.mark.parametrize("wrong", [{"mesh": "../tile.ply"}, {"mesh": "tile.obj"}, {"mesh": "a.ply", "voxel_mm": 0}])
 def test_an_export_that_cannot_be_made_is_refused_when_the_scenario_is_read(wrong):
     with pytest.raises(ValueError, match=next(reversed(wrong))):
-        ExportConfig(**wrong)
+        msgspec.convert(wrong, ExportConfig)
 
 
 def test_a_report_of_the_same_files_is_the_same(run):
