@@ -10,7 +10,7 @@ from edge_server.config import read_config
 from edge_server.live.frontier import Frontier, FrontierPoint
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
-from edge_server.page.colors import HELD_OUT, STALE, css
+from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
 from edge_server.page.panel import age_parts_ms
 from freshfield.scenario import ScenarioError, parse
 
