@@ -27,7 +27,8 @@ from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import read_config
-from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment, WakeCondition
+from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment, WakeCondition
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import FieldUpdater, open_updater

@@ -22,8 +22,8 @@ import numpy as np
 
 from camera_node.capture import Camera
 from edge_server.experiments.virtual.from_scenario import training_cameras
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
 from edge_server.experiments.virtual.simulate import digest
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
 from edge_server.report.frame_accounting import FrameCounts, account_frames
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA
 from freshfield.scenario import Scenario

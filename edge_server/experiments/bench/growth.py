@@ -17,7 +17,7 @@ from edge_server.experiments.bench.run import BenchRun
 from edge_server.experiments.common.tables import markdown_table, mean_or_none, number
 from edge_server.experiments.virtual.costs import UpdateCosts, beside_s
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from freshfield.scenario import Scenario, load, parse
 
 FREE_S, SETTLING_S, SCORED_S = 7.0, 1.0, 4.0

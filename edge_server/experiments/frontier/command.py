@@ -24,7 +24,7 @@ from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
 from edge_server.experiments.frontier.update_time import MEDIUM, Charged, MovingRun, MovingScene, live_settings
-from edge_server.experiments.virtual.virtual_deployment import Compute
+from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions

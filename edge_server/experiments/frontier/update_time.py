@@ -25,7 +25,8 @@ from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.frontier.from_scratch import lpips_of
 from edge_server.experiments.virtual.costs import UpdateCosts
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import SHOWN, PerceptualMetric, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field, option_help

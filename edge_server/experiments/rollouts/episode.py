@@ -25,8 +25,9 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import GRID_MS, Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, exact_scene, training_cameras
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer, mean_score, open_listed_perceptual
 from edge_server.fields import Budget, Field, View

@@ -26,7 +26,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import SCORES, Choice, Episode, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.live.state import Publication
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
 from edge_server.scheduler.learned.actor import Actor

@@ -25,8 +25,9 @@ from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication

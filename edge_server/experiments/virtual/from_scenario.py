@@ -15,8 +15,9 @@ from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.config import channel_from_mapping
 from edge_server.config import EdgeConfig, read_config
 from edge_server.edge_defaults import cameras_move
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
 from edge_server.live.field_updater import open_updater

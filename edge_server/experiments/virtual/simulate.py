@@ -21,7 +21,8 @@ from edge_server.experiments.common.arguments import add_folders, command_parser
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
+from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog

@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.foreground import ForegroundConfig, ForegroundError, read_foreground
 from edge_server.foreground.detector import Detection, Detector, decode
 from edge_server.foreground.foreground import Foreground, clipped, make_foreground

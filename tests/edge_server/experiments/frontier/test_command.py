@@ -24,7 +24,7 @@ from edge_server.experiments.frontier.update_time import (
     steps_for,
 )
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.experiments.virtual.virtual_deployment import Compute
+from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.live.frontier import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 

@@ -11,7 +11,8 @@ from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory
 from edge_server.experiments.rollouts.rollout import choice_of_action, choose, named
 from edge_server.experiments.rollouts.setting import GRID_MS, PURPOSES, seeds
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.bandit import BanditPolicy

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
 from freshfield.scenario import parse
 from tests.edge_server.fields.small import small
 

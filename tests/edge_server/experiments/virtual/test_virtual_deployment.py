@@ -15,8 +15,9 @@ from camera_node.synthetic.effects import NAMES
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
+from edge_server.experiments.virtual.run_settings import Compute, RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
 from tests.conftest import data_dir
