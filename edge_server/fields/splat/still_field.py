@@ -14,6 +14,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_rows import camera_rows
@@ -59,9 +60,32 @@ class StillField(SteppedField[SplatSnapshot]):
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
+    @property
+    def step_time(self) -> StepTimer:
+        """How long a step takes."""
+        return self._step_time
+
+    def take_in(self, views: Sequence[View]) -> None:
+        """Take ``views`` as what to learn. ValueError: one is invalid."""
         with self._lock:
             self._ingest(views)
+
+    def train_step(self, progress: float, grow: bool) -> tuple[float, int, int]:
+        """One optimizer step at ``progress``, in [0, 1], of a schedule. grow: whether Gaussians may be split and
+        pruned. Returns the mean squared error, pixels, and pairs of a Gaussian and a tile."""
+        with self._lock:
+            loss, pixels, pairs, lost = self._one_step(progress, grow)
+            self.dropped += lost
+        return loss, pixels, pairs
+
+    def set_params(self, params: NDArray[np.float32]) -> None:
+        """Replace the parameters, float32 (N, P), of all Gaussians."""
+        with self._lock:
+            self.cloud.params[:] = params
+            self._snapshot = None
+
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
+        self.take_in(views)
         return self._one_step, 0, 0
 
     def _live(self) -> SplatSnapshot:
@@ -141,8 +165,8 @@ class StillField(SteppedField[SplatSnapshot]):
             self._order = drawn.permutation(count)
         return self._asked[self._order[self.step % count]]
 
-    def _one_step(self, progress: float) -> tuple[float, int, int, int]:
-        """One optimizer step at ``progress`` of the fit, in [0, 1].
+    def _one_step(self, progress: float, grow: bool = True) -> tuple[float, int, int, int]:
+        """One optimizer step at ``progress`` of the fit, in [0, 1]. grow: see ``train_step``.
 
         Returns the mean squared error, pixels, pairs of a Gaussian and a tile, and how many tiles and
         gradients were not finite.
@@ -187,7 +211,10 @@ class StillField(SteppedField[SplatSnapshot]):
         square, broken = losses.sum(axis=0).tolist()
         if broken:
             self._repair()
-        self._finish_step()
+        self.step += 1
+        # Not before every view has had a step.
+        if grow and self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
+            self._grow()
         pixels = TILE * TILE * len(tasks)
         pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
         return square / (3 * pixels), pixels, pairs, int(broken) + int(dropped.sum())
@@ -202,12 +229,6 @@ class StillField(SteppedField[SplatSnapshot]):
             camera = self._cams[[view]]
             self._render_raster.project_and_bin(camera, self.cloud.gaussians(), differentiate=False)
             align(self.cloud, s.align, self._render_raster, camera[0], self._views[view].intrinsics)
-
-    def _finish_step(self) -> None:
-        """Count a step; densify when it is time, but not before every view has had a step."""
-        self.step += 1
-        if self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
-            self._grow()
 
     def adam_parameters(self, progress: float) -> AdamParameters:
         """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""

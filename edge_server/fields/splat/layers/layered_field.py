@@ -1,11 +1,11 @@
-"""The Gaussian field of cameras that stand still: plates, a static field and a moving set.
+"""The Gaussian field of cameras that stand still: background plates, a still field and a moving set.
 
-A view becomes part of its camera's plate; what is not plate is foreground, and evidence of how things moved
-at the instant when it was taken. Data flow one way: view, plate, foreground, motion, moving set, image.
-Nothing that moves is written into the static field.
+A view becomes part of its camera's background plate; what is not plate is foreground, and evidence of how
+things moved at the instant when it was taken. Data flow one way: view, plate, foreground, motion, moving set,
+image. Once plates are known, nothing that moves is written into the still field.
 
 A fit of a number of seconds follows what moves in the calling thread alone, in kernels too short to be
-divided, and has the static field trained beside it. A fit of a number of steps does both in turn, so that it
+divided, and has the still field trained beside it. A fit of a number of steps does both in turn, so that it
 can be repeated bit for bit.
 """
 
@@ -20,22 +20,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
+from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.field_state import all_or_nothing
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, compile_kernels, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
+from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
-from edge_server.fields.splat.layers.static_field import PlateImage
-from edge_server.fields.splat.layers.static_layer import StaticLayer, gaussians
+from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer, gaussians
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.fields.splat.still_field import StillField
 from freshfield.geometry import Pinhole
 
@@ -43,17 +44,16 @@ log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
 
-LEAST_CAMERAS = 2  # one alone gives no depth: the first field is shown
+LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
 PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are learned
 EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
-PLATES_EVERY_S = 0.5  # how often plates are compared with what the static field has learned
-RENDERINGS_A_FIT = 2  # number of the static field's renderings that plates take over in a fit
+PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
+RENDERINGS_A_FIT = 2  # number of the still field's renderings that plates take over in a fit
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
-FINE_FRAMES = 6  # frames of each camera before the static field learns from fine plates
-EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # fits in which cameras agree on an exposure, and steps of each
-EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
-EXPOSURE_RATE = 1.6  # factor on a correction: after so few steps some six tenths of a difference show
+FINE_FRAMES = 6  # frames of each camera before the still field learns from fine plates
+EXPOSURE_ROUNDS = 6  # most fits in which cameras agree on an exposure
+SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
 MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 
 
@@ -61,8 +61,8 @@ class LayeredField:
     """See ``fields.Field`` for the protocol.
 
     Until plates are known, with a single camera, and for good where a camera moves or images are transparent,
-    views go to a ``StillField``. Call ``fit`` from one thread only; snapshots may be taken and rendered from
-    any thread.
+    the still field learns from the views themselves. Call ``fit`` from one thread only; snapshots may be taken
+    and rendered from any thread.
 
     part_s: seconds spent by part, in all fits.
     """
@@ -72,8 +72,8 @@ class LayeredField:
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self.caller = CallerPool()
         self.now = time.perf_counter  # the clock of budgets in seconds
-        self.first = StillField(self.settings, self.pool)
-        self.static = StaticLayer(self.settings, self.pool)
+        self.still = StillField(self.settings, self.pool)
+        self.static = StaticLayer(self.still)
         self.part_s = PartTimes(self.now)
         self._frame_time = StepTimer()
         self.reset()
@@ -82,21 +82,22 @@ class LayeredField:
 
     def reset(self) -> None:
         """Forget the scene, its cameras and their plates; keep settings and compiled kernels."""
-        self.first.reset()
-        self.static.reset()
+        self.static.forget()
+        self.still.reset()
         self.cameras: dict[str, FixedCamera] = {}
         self.observations = Observations()
         self.tracker: MotionTracker | None = None
         self.layered = True  # False: a camera moved
-        self.shown = False  # whether the layers are shown, and no longer the first field
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
         self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
-        self.fine = False  # whether the static field learns from fine plates
+        self.fine = False  # whether the still field learns from fine plates
         self.exposure_rounds = 0  # number of rounds of ``_exposures_agree`` so far
-        self._published: LayeredSnapshot | None = None
-        self._still: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
+        self.exposures_differ = False  # whether one of them has corrected any
+        self._published: SplatSnapshot | None = None
+        self._begun_anew = False  # whether the still field is young, and what it showed before is still shown
+        self._exposed: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
 
     @property
     def frame_s(self) -> float | None:
@@ -116,7 +117,7 @@ class LayeredField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Take in the views not seen before, follow what moves, and train. ValueError: a view is invalid.
 
-        A budget in steps bounds the steps of the static field, which do not count as steps of the fit: they
+        A budget in steps bounds the steps of the still field, which do not count as steps of the fit: they
         delay no publication.
         """
         if not views:
@@ -127,30 +128,28 @@ class LayeredField:
         if self.layered and (reasons := [why for view in views if (why := self._unfit_for_layers(view))]):
             self._give_up_layers(reasons[0])
         if not self.layered:
-            return self._fit_first(views, budget, pace)
-        if self.tracker is not None and self.tracker.moving.box is not self.static.field.view_store.box:
+            return self._fit_still(views, budget, pace)
+        if self.tracker is not None and self.tracker.moving.box is not self.still.view_store.box:
             self._begin_again()
         taken = self._take_in(views)
         if self.tracker is None:
             if not self._plates_are_known() or not self._exposures_agree():
-                return self._fit_first(views, budget, pace)
+                return self._fit_still(views, budget, pace)
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
         self._compare_plates(beside)
         self._find_rows()
-        parameters = self.static.field.moving_parameters(STEP_PROGRESS)
+        parameters = self.still.adam_parameters(STEP_PROGRESS)
         steps, rays, samples = tracker.follow(pace, self._publish, parameters)
         loss = 0.0
         if not beside:
             begun = self.now()
-            loss, static_rays, static_samples = self.static.field.train(pace)
+            loss, static_rays, static_samples = self.static.train(pace)
             self.static.publish()
             rays, samples = rays + static_rays, samples + static_samples
             self.part_s.add("static field", begun)
         self._publish()
-        if beside and not self.shown:
-            return self._fit_first(views, budget, pace)
         self._take_renderings(beside)
         self._take_whole(taken)
         note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
@@ -164,19 +163,19 @@ class LayeredField:
             refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
         )
 
-    def _fit_first(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
-        """Spend what is left of a budget on the first field."""
+    def _fit_still(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
+        """Spend what is left of a budget on the still field, on the newest view of each camera."""
         begun, left = self.now(), budget
         if budget.seconds is not None:
             left = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
-        report = self.first.fit(_newest_of_each(views), left)
-        self.part_s.add("first field", begun)
+        report = self.still.fit(_newest_of_each(views), left)
+        self.part_s.add("static field", begun)
         return report
 
     def _why_no_step(self, moving: MovingSet) -> str:
         if moving.alive:
             return "motion was followed, without time for a step"
-        return "nothing is left to learn" if self.static.field.finished else "only the static field learns"
+        return "nothing is left to learn" if self.static.finished else "only the still field learns"
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -186,14 +185,14 @@ class LayeredField:
         """Surface points in world meters and their colors; none before the first fit."""
         return self.snapshot().points(count)
 
-    def snapshot(self, present_ns: int | None = None) -> Snapshot:
+    def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
         """The scene at an instant; None: that of the newest view."""
         published = self._published
-        return self.first.snapshot(present_ns) if published is None else published.at(present_ns)
+        return self.still.snapshot(present_ns) if published is None else published.at(present_ns)
 
     def warm_up(self) -> float:
         """Compile every kernel, or load it from numba's cache; returns the seconds taken."""
-        return self.first.warm_up() + compile_kernels(self._run_kernels)
+        return self.still.warm_up() + compile_kernels(self._run_kernels)
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel of the layers once, in a small field of its own."""
@@ -222,11 +221,10 @@ class LayeredField:
 
     def finish_loading(self) -> None:
         """What follows from the loaded parts."""
-        self._published = self._still = None
+        self._published, self._exposed, self._begun_anew = None, None, False
         if self.tracker is not None:
             self.static.publish()
             self._find_rows()
-        if self.shown and self.layered:
             self._publish()
 
     # --- intake -------------------------------------------------------------------------------
@@ -243,16 +241,12 @@ class LayeredField:
         return ""
 
     def _give_up_layers(self, reason: str) -> None:
-        """Go on with the first field, until ``reset``, with what the static field has learned if that is
-        shown."""
+        """Go on with the still field alone, until ``reset``."""
         log.info("layers are given up until a reset: %s", reason)
-        self.static.stop()
-        if self.shown:
-            self.first.load_state(self.static.field.state())
-        self.layered = self.shown = self.fine = False
+        self.static.forget()
+        self.layered = self.fine = False
         self._published, self.tracker, self.observations = None, None, Observations()
         self.cameras = {}
-        self.static.reset()
 
     def _take_in(self, views: Sequence[View]) -> list[View]:
         """Plates and foregrounds of the views not seen before. Returns these views."""
@@ -322,12 +316,15 @@ class LayeredField:
             and all(self.cameras[o.camera].plate.count >= PLATE_FRAMES for o in self.observations)
         )
 
-    # --- the static field ---------------------------------------------------------------------
+    # --- the still field ---------------------------------------------------------------------
 
     def _begin_layers(self) -> MotionTracker:
-        """Give the static field its first plates, and the moving set the scene's box."""
+        """Give the still field its first plates, and the moving set the scene's box."""
         begun = self.now()
-        self.static.field.learn(self._plates())
+        if self.exposures_differ:  # and it has learned them
+            self._begin_anew()
+        else:
+            self.static.begin(self._plates())
         self.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
@@ -339,12 +336,20 @@ class LayeredField:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
         measured. Plates stay."""
         log.info("layers begin again: another camera has changed the box of the scene")
-        self.static.reset()
-        self.tracker = self._published = self._still = None
-        self.shown, self.exposure_rounds = False, 0
+        self.static.forget()
+        self._begin_anew()
+        self.tracker = None
+        self.exposure_rounds = 0
         self.observations = Observations()
         for camera in self.cameras.values():
             camera.row, camera.depth_m, camera.rendered_step = None, None, -1
+
+    def _begin_anew(self) -> None:
+        """Let the still field forget everything and begin with the plates; what it showed is shown until it is
+        better."""
+        self._published, self._begun_anew, self._exposed = self.snapshot(), True, None
+        self.still.reset()
+        self.static.begin(self._plates())
 
     def make_tracker(self) -> None:
         """A tracker of nothing yet, in the static field's box."""
@@ -352,17 +357,17 @@ class LayeredField:
         self.tracker = MotionTracker(moving, self.observations, self.cameras, self.part_s)
 
     def _compare_plates(self, beside: bool) -> None:
-        """Have the static field learn plates that have changed. beside: in a thread, until it has learned
+        """Have the still field learn plates that have changed. beside: in a thread, until it has learned
         them; or else only note that there is something to learn."""
         begun, now_s = self.now(), self.observations.newest_s
         if not self.fine and self._fine_plates_are_known():
             self.static.stop()
             self.fine = True
-            self.static.field.refine(self._plates())
+            self.static.refine(self._plates())
             self.plates_s = now_s
         if beside and self.static.training:
             return
-        finished = self.static.field.finished
+        finished = self.static.finished
         if finished and now_s - self.plates_s < PLATES_EVERY_S:
             return
         if finished or beside:
@@ -371,36 +376,19 @@ class LayeredField:
             if beside:
                 self.static.train_beside(plates, [camera.view for camera in self.cameras.values()])
             else:
-                self.static.field.learn_again(plates)
+                self.static.learn_again(plates)
         self.part_s.add("static field", begun)
 
     def _exposures_agree(self) -> bool:
-        """Correct the cameras' exposures by how their plates differ from what a field learns of all plates in
-        its first steps. A field trained for longer hides the difference: Gaussians that one camera alone sees
-        take over its exposure. The geometric mean of the exposures stays, and a camera with too few well
-        exposed pixels is left as it is.
-
-        One round a call. Returns whether it was the last."""
-        if self.exposure_rounds >= EXPOSURE_ROUNDS:
-            return True
+        """Correct the cameras' exposures, one round a call. Returns whether it was the last."""
         begun = self.now()
-        self.exposure_rounds += 1
-        self.static.field.learn(self._plates())
-        self.static.field.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
-        self.static.publish()
-        self.static.render([camera.view for camera in self.cameras.values()])
-        renderings = {name: rendering.color for name, (_, rendering) in self.static.rendered.items()}
-        self.static.reset()
-        ratios = {n: c.plate.exposure_over(renderings[n]) for n, c in self.cameras.items()}
-        logs = {name: np.log(ratio) for name, ratio in ratios.items() if ratio is not None}
-        spread = np.stack(list(logs.values())) if logs else np.zeros((1, 3), np.float32)
+        if self.exposure_rounds < EXPOSURE_ROUNDS:
+            self.exposure_rounds += 1
+            if equalize_exposures(self.settings, self.pool, self._box(), list(self.cameras.values())):
+                self.exposure_rounds = EXPOSURE_ROUNDS
+            else:
+                self.exposures_differ = True
         self.part_s.add("exposures", begun)
-        if spread.std(axis=0).max() < EXPOSURES_AGREE:
-            self.exposure_rounds = EXPOSURE_ROUNDS
-            return True
-        for name, log_ratio in logs.items():
-            ratio = np.exp(EXPOSURE_RATE * (log_ratio - spread.mean(axis=0)))
-            self.cameras[name].correct_exposure(ratio.astype(np.float32))
         return self.exposure_rounds >= EXPOSURE_ROUNDS
 
     def _plates(self) -> list[PlateImage]:
@@ -418,10 +406,10 @@ class LayeredField:
                 camera.row = camera_rows([view.camera_to_world], [view.intrinsics], self._box())
 
     def _take_renderings(self, beside: bool) -> None:
-        """Give cameras depth and color of the static field, as far as it has learned since. Where no thread
+        """Give cameras depth and color of the still field, as far as it has learned since. Where no thread
         has rendered them, they are rendered here: all at first, then one a fit."""
         begun, shown, cameras = self.now(), self.static.shown, self.cameras
-        if not beside and self.shown and shown is not None:
+        if not beside and shown is not None:
             stale = sorted((c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step)
             never = [c for c in stale if c.rendered_step < 0]
             self.static.render([c.view for c in never or stale[:1]])
@@ -431,21 +419,20 @@ class LayeredField:
         self.part_s.add("static renders", begun)
 
     def _box(self) -> Any:
-        box = self.static.field.view_store.box
+        box = self.still.view_store.box
         assert box is not None
         return box
 
     # --- what is shown ------------------------------------------------------------------------
 
     def _publish(self) -> None:
-        """Show the layers as they are now, once the static field is better than the first one."""
+        """Show the layers as they are now, but not yet a still field that has just begun anew."""
         still, tracker = self.static.shown, self.tracker
-        if still is None or not self.static.ready:
+        if still is None or (self._begun_anew and still.step < SHOWN_AFTER):
             return
         assert tracker is not None and self.origin_ns is not None
-        begun, begins, moving = self.now(), not self.shown, tracker.moving
-        self.shown = True
-        shown = None
+        self._begun_anew = False
+        begun, moving, shown = self.now(), tracker.moving, None
         if moving.alive:
             shown = MovingSnapshot(
                 moving.cloud.params.copy(),
@@ -468,21 +455,19 @@ class LayeredField:
             moving=shown,
         )
         self.part_s.add("publication", begun)
-        if begins:
-            self.first.reset()
 
     def _static_gaussians(self) -> Gaussians:
-        """The static field at the cameras' present exposure; the arrays of the last publication, where
+        """The still field at the cameras' present exposure; the arrays of the last publication, where
         nothing has changed."""
         shown = self.static.shown
         assert shown is not None
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
         key = (shown.step, gain.tobytes())
-        if self._still is None or self._still[0] != key:
+        if self._exposed is None or self._exposed[0] != key:
             params = shown.gaussians.params.copy()
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
-            self._still = (key, gaussians(params, self.settings))
-        return self._still[1]
+            self._exposed = (key, gaussians(params, self.settings))
+        return self._exposed[1]
 
 
 def _cameras(views: Sequence[View]) -> list[str]:

@@ -23,8 +23,8 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 3
-COUNTERS = ("layered", "shown", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
+VERSION = 4
+COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds", "exposures_differ")  # of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 
@@ -61,7 +61,7 @@ def pack(field: Any) -> Arrays:
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
-    state |= _prefixed("first.", field.first.state()) | _prefixed("static.", field.static.field.state())
+    state |= _prefixed("still.", field.still.state()) | _prefixed("static.", field.static.state())
     refused = sorted(field.refused)
     counters = {name: _number(getattr(field, name)) for name in COUNTERS}
     tracked = None
@@ -84,10 +84,10 @@ def pack(field: Any) -> Arrays:
 def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
     meta = unpack_meta(field.settings, state, NAME, ("harmonics",), VERSION)
-    field.first = StillField(field.settings, field.pool)
-    field.static = StaticLayer(field.settings, field.pool)
-    field.first.load_state(_under("first.", state))
-    field.static.field.load_state(_under("static.", state))
+    field.still = StillField(field.settings, field.pool)
+    field.still.load_state(_under("still.", state))
+    field.static = StaticLayer(field.still)
+    field.static.load_state(_under("static.", state))
     field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
@@ -110,7 +110,7 @@ def unpack(field: Any, state: Arrays) -> None:
     _set(field, COUNTERS, meta)
     field.refused = set(meta["refused"])
     if meta["tracked"] is not None:
-        if field.static.field.view_store.box is None:
+        if field.still.view_store.box is None:
             raise ValueError("the state has a moving set but no scene box")
         field.make_tracker()
         field.tracker.moving.load_state(_under("moving.", state))

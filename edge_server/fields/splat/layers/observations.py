@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.splat.layers.motion import KNOTS_PER_S, ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
-from edge_server.fields.splat.layers.static_field import PlateImage
+from edge_server.fields.splat.layers.static_layer import PlateImage
 
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
 BACKGROUND_WEIGHT = 0.5  # weight of the other pixels

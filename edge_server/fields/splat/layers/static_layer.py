@@ -1,51 +1,158 @@
-"""The static field and what it shows: trained in the caller's budget, or in a thread beside the caller."""
+"""Training of the still field on background plates: in the caller's budget, or in a thread beside the caller.
+
+The first schedule is one descent of the learning rates, however many fits it is spread over. Afterwards the
+number of Gaussians stays and parameters are averaged, over rounds of steps; where plates change, rounds begin
+again.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.layers.static_field import ROUND, PlateImage, StaticField
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.fields.splat.still_field import StillField
 
-SHOWN_AFTER = 400  # steps, after which the static field is better than the first field
+Arrays = dict[str, NDArray]
+
+SCHEDULE = 1600  # steps of the first schedule, in which the field grows
+ROUND = 10  # steps of a round, over which rates fall; its parameters enter the mean
+ROUNDS_FIRST, RATE_FIRST = 60, 0.05  # after the schedule; least weight of a round in the mean
+ROUNDS_AGAIN, RATE_AGAIN = 20, 0.1  # where plates have changed
+CHANGED = 8.0  # of 255, after blurring: a plate that differs more from what was learned has changed
+CHANGED_PIXELS = 40  # a camera, above which the field is trained again
 RENDER_EVERY = 400  # steps of a thread of its own, between renderings of all cameras
 
 
+class PlateImage(NamedTuple):
+    """A background plate as it was at one moment.
+
+    view: the camera's first frame. color: float32 (H, W, 3), at the cameras' common exposure, steps of 255.
+    known: bool (H, W), where there is a plate.
+    """
+
+    view: View
+    color: NDArray[np.float32]
+    known: NDArray[np.bool_]
+
+
 class StaticLayer:
-    """A ``StaticField`` for one caller.
+    """What stands still. ``learn`` says from which plates; ``train`` spends steps on them.
 
     shown: the field as it was last published. rendered: camera -> step and rendering, for the caller to take.
     Nothing waits for the thread of ``train_beside`` but ``stop``.
     """
 
-    def __init__(self, settings: SplatSettings, pool: Pool) -> None:
-        self.field = StaticField(settings, pool)
-        self.shown: SplatSnapshot | None = None
-        self.rendered: dict[str, tuple[int, Rendering]] = {}
+    def __init__(self, field: StillField) -> None:
+        self.field = field
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._failure: BaseException | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the plates and the schedule; the field stays as it is."""
+        self.stop()
+        self.shown: SplatSnapshot | None = None
+        self.rendered: dict[str, tuple[int, Rendering]] = {}
+        self.grows_until = SCHEDULE  # step
+        self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
+        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+
+    def _begin_rounds(self, wanted: int, rate: float) -> None:
+        self.rounds, self._rounds_wanted, self._rate = 0, wanted, rate
+        self._round_step = 0  # steps of this round
+        self._mean: NDArray[np.float32] | None = None
 
     @property
-    def ready(self) -> bool:
-        """Whether the field is good enough to be shown."""
-        return self.shown is not None and self.shown.step >= SHOWN_AFTER
+    def finished(self) -> bool:
+        """Whether there is nothing more to learn from these plates."""
+        return self.rounds >= self._rounds_wanted
 
-    @property
-    def training(self) -> bool:
-        """Whether the thread is at work. Raises what ended it early."""
-        self._raise_failure()
-        return self._thread is not None and self._thread.is_alive()
+    # --- plates -------------------------------------------------------------------------------
+
+    def begin(self, plates: Sequence[PlateImage]) -> None:
+        """``learn`` the first plates, in a schedule that begins now."""
+        self.learn(plates)
+        self.grows_until = self.field.step + SCHEDULE
+        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+
+    def learn(self, plates: Sequence[PlateImage]) -> None:
+        """Take plates as what to learn. What is not known has no weight."""
+        views = []
+        for view, color, known in plates:
+            image = np.clip(color + 0.5, 0, 255).astype(np.uint8)
+            views.append(replace(view, image=image, weight=known.astype(np.float32)))
+            self._learned[view.camera] = (color, known)
+        self.field.take_in(views)
+
+    def learn_again(self, plates: Sequence[PlateImage]) -> bool:
+        """``learn`` if the plates have changed since, and begin rounds of training. Returns whether."""
+        if sum(self._changed_pixels(plate) for plate in plates) <= CHANGED_PIXELS * len(plates):
+            return False
+        self.learn(plates)
+        self._begin_rounds(ROUNDS_AGAIN, RATE_AGAIN)
+        return True
+
+    def refine(self, plates: Sequence[PlateImage]) -> None:
+        """``learn`` the same plates at a higher resolution, in what is left of the schedule, or in its second
+        half again."""
+        self.learn(plates)
+        self.grows_until = max(self.grows_until, self.field.step + SCHEDULE // 2)
+        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+
+    def _changed_pixels(self, plate: PlateImage) -> int:
+        if plate.view.camera not in self._learned:
+            return int(plate.known.sum())
+        before, was_known = self._learned[plate.view.camera]
+        if was_known.shape != plate.known.shape:
+            return int(plate.known.sum())
+        both = plate.known & was_known
+        differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > CHANGED
+        return int((plate.known & (differs | ~was_known)).sum())
+
+    # --- training -----------------------------------------------------------------------------
+
+    def train(self, pace: StepBudget) -> tuple[float, int, int]:
+        """Spend what is left of a budget, or less where all is learned. Returns mean loss of the last steps,
+        pixels, and pairs of a Gaussian and a tile."""
+        losses: list[float] = []
+        rays = samples = 0
+        while not self.finished and pace.begin_step(self.field.step_time) is not None:
+            left = self.grows_until - self.field.step
+            progress = 1.0 - left / SCHEDULE if left > 0 else self._round_step / ROUND
+            loss, seen, pairs = self.field.train_step(progress, grow=left > 0)
+            if left <= 0:
+                self._finish_round_step()
+            losses.append(loss)
+            rays, samples = rays + seen, samples + pairs
+            pace.end_step()
+        return float(np.mean(losses[-32:])) if losses else 0.0, rays, samples
+
+    def _finish_round_step(self) -> None:
+        self._round_step += 1
+        if self._round_step < ROUND:
+            return
+        self._round_step = 0
+        params = self.field.cloud.params
+        if self._mean is None:
+            self._mean = params.copy()
+        else:
+            self._mean += (params - self._mean) * np.float32(max(1.0 / (self.rounds + 1), self._rate))
+        self.rounds += 1
+        if self.finished:
+            self.field.set_params(self._mean)
+            self._mean = None
 
     def train_beside(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
         """Learn plates that have changed, in a thread, until nothing is left to learn, and render ``views``
@@ -53,6 +160,12 @@ class StaticLayer:
         self._stopping = False
         self._thread = threading.Thread(target=self._main, args=(plates, views), name="static-field", daemon=True)
         self._thread.start()
+
+    @property
+    def training(self) -> bool:
+        """Whether the thread is at work. Raises what ended it early."""
+        self._raise_failure()
+        return self._thread is not None and self._thread.is_alive()
 
     def stop(self) -> None:
         """End the thread after a few steps, and wait for it. Raises what ended it early."""
@@ -68,19 +181,30 @@ class StaticLayer:
             failure.add_note("The static field was being trained beside the updates.")
             raise failure
 
-    def reset(self) -> None:
-        """Forget the scene."""
-        self.stop()
-        self.field.reset()
-        self.shown = None
-        self.rendered = {}
+    def _main(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
+        try:
+            if self.finished:
+                self.learn_again(plates)
+            rendered_step = self.field.step
+            while not self.finished and not self._stopping:
+                self.train(StepBudget(Budget(steps=ROUND)))
+                self.publish()
+                if self.finished or self.field.step - rendered_step >= RENDER_EVERY:
+                    self.render(views)
+                    rendered_step = self.field.step
+        except BaseException as error:  # the caller raises it
+            self._failure = error
+
+    # --- what is shown ------------------------------------------------------------------------
 
     def publish(self) -> None:
-        """Show the field as it is now; call it from the thread that trains."""
-        if self.shown is not None and self.shown.step == self.field.step:
-            return
-        params = self.field.shown_params()
-        self.shown = replace(self.field._live(), gaussians=gaussians(params, self.field.settings))
+        """Show the field as it is now, or the mean of its parameters where there is one; call it from the thread
+        that trains."""
+        if self.shown is None or self.shown.step != self.field.step:
+            snapshot = self.field.snapshot()
+            if self._mean is not None:
+                snapshot = replace(snapshot, gaussians=gaussians(self._mean.copy(), self.field.settings))
+            self.shown = snapshot
 
     def render(self, views: Iterable[View]) -> None:
         """Render what is shown from the cameras of ``views``."""
@@ -89,22 +213,34 @@ class StaticLayer:
         for view in views:
             self.rendered[view.camera] = (shown.step, shown.render(view.camera_to_world, view.intrinsics))
 
-    def _main(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
-        try:
-            if self.field.finished:
-                self.field.learn_again(plates)
-            rendered_step = self.field.step
-            while not self.field.finished and not self._stopping:
-                self.field.train(StepBudget(Budget(steps=ROUND)))
-                self.publish()
-                due = self.field.finished or self.field.step - rendered_step >= RENDER_EVERY
-                if due and self.ready:
-                    self.render(views)
-                    rendered_step = self.field.step
-        except BaseException as error:  # the caller raises it
-            self._failure = error
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """What is needed, beside the field's own state, to resume bit for bit."""
+        again = int(self._rate == RATE_AGAIN)
+        counters = [self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until]
+        mine: Arrays = {"rounds": np.array(counters, np.int64)}
+        if self._mean is not None:
+            mine["mean"] = self._mean.copy()
+        for k, (camera, (plate, known)) in enumerate(self._learned.items()):
+            mine |= {f"learned_{k}.camera": np.array(camera), f"learned_{k}.plate": plate, f"learned_{k}.known": known}
+        return mine
+
+    def load_state(self, state: Arrays) -> None:
+        """Resume from ``state``, with a field that has resumed already. KeyError: it lacks something."""
+        self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until = (int(n) for n in state["rounds"])
+        self._rate = RATE_AGAIN if again else RATE_FIRST
+        self._mean = np.array(state["mean"]) if "mean" in state else None
+        self._learned = {}
+        while (key := f"learned_{len(self._learned)}") + ".camera" in state:
+            camera = str(state[f"{key}.camera"])
+            self._learned[camera] = (np.array(state[f"{key}.plate"]), np.array(state[f"{key}.known"]))
+        known = {camera: known.astype(np.float32) for camera, (_, known) in self._learned.items()}
+        if known:
+            views = self.field.view_store.views
+            self.field.take_in([replace(v, weight=known[v.camera]) for v in views if v.camera in known])
 
 
 def gaussians(params: NDArray[np.float32], settings: SplatSettings) -> Gaussians:
-    """Gaussians that do not move, of parameters float32 (N, P)."""
+    """The Gaussians of parameters float32 (N, P)."""
     return Gaussians(params, settings.harmonics)

@@ -17,7 +17,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
-from edge_server.fields.splat.layers import layered_field, static_field, static_layer
+from edge_server.fields.splat.layers import layered_field, static_layer
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.still_field import StillField
@@ -32,10 +32,10 @@ FRAME_S = 1.0 / 15.0
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plates of one second, and a short schedule."""
     monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
-    monkeypatch.setattr(static_layer, "SHOWN_AFTER", 60)
-    monkeypatch.setattr(static_field, "SCHEDULE", 200)
-    monkeypatch.setattr(static_field, "ROUNDS_FIRST", 5)
-    monkeypatch.setattr(static_field, "ROUNDS_AGAIN", 3)
+    monkeypatch.setattr(layered_field, "SHOWN_AFTER", 60)
+    monkeypatch.setattr(static_layer, "SCHEDULE", 200)
+    monkeypatch.setattr(static_layer, "ROUNDS_FIRST", 5)
+    monkeypatch.setattr(static_layer, "ROUNDS_AGAIN", 3)
 
 
 def _ball_m(instant_s: float, moves: bool) -> np.ndarray:
@@ -84,7 +84,6 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
             views = [_frame(k, frame, False) for k in range(len(CAMERAS))]
             images = [np.clip(v.image * g, 0, 255).astype(np.uint8) for v, g in zip(views, exposures)]
             field.fit([replace(v, image=i) for v, i in zip(views, images)], Budget(steps=30))
-        assert field.shown
         return field
 
     def score(field: LayeredField) -> float:
@@ -109,27 +108,56 @@ def test_the_option_makes_it() -> None:
     assert type(make_field("splat", {"threads": 1})) is StillField
 
 
-def test_it_is_the_plain_field_at_first_and_where_a_camera_moves() -> None:
+def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
     layered, plain = LayeredField(SMALL), StillField(SMALL)
     for field in (layered, plain):
         _run(field, range(4))
-    _same_state(layered.first, plain)
+    _same_state(layered.still, plain)
     turned = replace(_frame(0, 4, True), camera_to_world=CAMERAS[1].camera_to_world)
     for field in (layered, plain):
         field.fit([turned, _frame(2, 4, True)], Budget(steps=10))
     assert not layered.layered
     _run(layered, range(20, 40), steps=2)
     _run(plain, range(20, 40), steps=2)
-    _same_state(layered.first, plain)
+    _same_state(layered.still, plain)
     shown, expected = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (layered, plain))
     np.testing.assert_array_equal(shown, expected)
+
+
+def test_what_was_learned_before_the_plates_are_known_is_kept() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(15), moves=False, steps=10)
+    step, params = field.still.step, field.still.cloud.params.copy()
+    _run(field, range(15, 18), moves=False, steps=0)
+    assert field.moving is not None and field.still.step == step == 150
+    np.testing.assert_array_equal(field.still.cloud.params, params)
+    assert field.static.grows_until == step + 200, "its schedule begins with the plates"
+
+
+def test_rates_fall_once_over_the_first_schedule(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The progress of its steps goes from 0 to 1, in equal steps, and growth ends with it."""
+    field, asked = LayeredField(SMALL), list[tuple[float, bool]]()
+    _run(field, range(17), moves=False, steps=0)
+    step = StillField.train_step
+
+    def told(self: StillField, progress: float, grow: bool) -> tuple[float, int, int]:
+        asked.append((progress, grow))
+        return step(self, progress, grow)
+
+    monkeypatch.setattr(StillField, "train_step", told)
+    _run(field, range(17, 24), moves=False, steps=35)
+    first = [progress for progress, grow in asked if grow]
+    np.testing.assert_allclose(first, np.arange(200) / 200.0, atol=1e-9)
+    rounds = [progress for progress, grow in asked if not grow]
+    np.testing.assert_allclose(rounds, np.tile(np.arange(10) / 10.0, 5)[: len(rounds)], atol=1e-9)
+    assert len(rounds) == 45 and not any(grow for _, grow in asked[200:])
 
 
 def test_one_camera_alone_begins_no_layers() -> None:
     field = LayeredField(SMALL)
     for frame in range(20):
         field.fit([_frame(0, frame, True)], Budget(steps=1))
-    assert field.layered and field.moving is None and field.part_s["first field"] > 0.0
+    assert field.layered and field.moving is None and field.part_s["static field"] > 0.0
     for frame in range(20, 30):
         field.fit([_frame(k, frame, True) for k in range(2)], Budget(steps=1))
     assert field.moving is not None
@@ -138,8 +166,8 @@ def test_one_camera_alone_begins_no_layers() -> None:
 def test_nothing_moves_where_nothing_moves() -> None:
     field = LayeredField(SMALL)
     _run(field, range(36), moves=False)
-    assert field.shown and field.moving is not None and len(field.moving) == 0
-    assert field.static.field.finished
+    assert field.moving is not None and len(field.moving) == 0
+    assert field.static.finished
     report = field.fit([_frame(0, 40, False)], Budget(steps=30))
     assert report.steps == 0  # all is learned
     assert _score(field.snapshot(), 2.0, moves=False) > 22.0
@@ -221,7 +249,7 @@ def test_a_refused_state_changes_nothing() -> None:
         {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
         {k: v * np.nan if k == "moving.share" else v for k, v in _moving().state().items()},
         {
-            k: np.array(str(v).replace('"version": 3', '"version": 1')) if k == "meta" else v
+            k: np.array(str(v).replace('"version": 4', '"version": 1')) if k == "meta" else v
             for k, v in _moving().state().items()
         },
     ):
@@ -266,7 +294,7 @@ assert compiled() == before, (before, compiled())
 def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
     field = LayeredField(SMALL)
     _run(field, range(17))
-    assert 0 < field.static.field.step < 200 and field.tracker is not None
+    assert field.tracker is not None and not field.static.finished
     for frame in range(17, 50):
         views = [_frame(k, frame, True) for k in range(len(CAMERAS))]
         began = time.perf_counter()
@@ -274,7 +302,7 @@ def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
         assert report.seconds < 0.3
         time.sleep(max(0.1 - (time.perf_counter() - began), 0.0))
     assert field.moving is not None and field.moving.steps > 0
-    assert field.static.field.finished and field.shown
+    assert field.static.finished
     assert _score(field.snapshot(round(50 * FRAME_S * 1e9)), 50 * FRAME_S) > 20.0
 
 
@@ -304,11 +332,11 @@ def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing(wrong
 def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
     field = LayeredField(SMALL)
     field.load_state(_moving().state())
-    store, plates = field.static.field.view_store, {n: c.plate for n, c in field.cameras.items()}
+    store, plates = field.still.view_store, {n: c.plate for n, c in field.cameras.items()}
     store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
     _run(field, range(42, 43), steps=5)
-    assert field.moving is not None and field.moving.box is field.static.field.view_store.box
-    assert field.static.field.step == 5 and not field.shown
+    assert field.moving is not None and field.moving.box is field.still.view_store.box
+    assert field.still.step == 5
     assert {n: c.plate for n, c in field.cameras.items()} == plates
     assert all(camera.row is not None for camera in field.cameras.values())
 
@@ -349,13 +377,13 @@ def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkey
     def fail(pace: Any) -> None:
         raise FloatingPointError("of a test")
 
-    monkeypatch.setattr(field.static.field, "train", fail)
+    monkeypatch.setattr(field.static, "train", fail)
     with pytest.raises(FloatingPointError, match="of a test"):
         for frame in range(19, 40):
             field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
             time.sleep(0.01)
     field.load_state(state)
-    monkeypatch.setattr(field.static.field, "train", fail)
+    monkeypatch.setattr(field.static, "train", fail)
     field.fit([_frame(k, 19, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
     with pytest.raises(FloatingPointError, match="of a test") as raised:
         field.state()
@@ -367,7 +395,7 @@ def test_each_turn_of_the_layers_is_one_line_of_the_log(caplog: pytest.LogCaptur
     caplog.set_level("INFO", layered_field.__name__)
     field = LayeredField(SMALL)
     _run(field, range(18), moves=False, steps=1)
-    store = field.static.field.view_store
+    store = field.still.view_store
     store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)
     _run(field, range(18, 20), moves=False, steps=1)
     lens = replace(CAMERAS[1].intrinsics, fx=CAMERAS[1].intrinsics.fx + 1.0)
