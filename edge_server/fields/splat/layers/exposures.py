@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.observations import FixedCamera
+from edge_server.fields.splat.layers.settings import COVERED, EXPOSURE_RATE, EXPOSURES_AGREE
 from edge_server.fields.splat.layers.static_layer import gaussians
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
-
-EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
-EXPOSURE_RATE = 1.2  # factor on a correction: a camera's own seeds hide some of a difference from it
-COVERED = 0.2  # opacity from which a pixel shows the color of the seeds
 
 
 def equalize_exposures(settings: SplatSettings, pool: Pool, box: SceneBox, cameras: Sequence[FixedCamera]) -> bool:

@@ -32,6 +32,20 @@ from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
+from edge_server.fields.splat.layers.settings import (
+    EVIDENCE_S,
+    EXPOSURE_ROUNDS,
+    FINE_EVERY_S,
+    FINE_FRAMES,
+    LEAST_CAMERAS,
+    MOST_PIXELS,
+    PLATE_FRAMES,
+    PLATE_S,
+    PLATES_EVERY_S,
+    RENDERINGS_A_FIT,
+    SHOWN_AFTER,
+    STEP_PROGRESS,
+)
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer, gaussians
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
@@ -43,18 +57,6 @@ from freshfield.geometry import Pinhole
 log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
-
-LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
-PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are learned
-EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
-STEP_PROGRESS = 0.3  # progress at which the rates of the moving set are taken
-PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
-RENDERINGS_A_FIT = 2  # number of the still field's renderings that plates take over in a fit
-FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
-FINE_FRAMES = 6  # frames of each camera before the still field learns from fine plates
-EXPOSURE_ROUNDS = 6  # most fits in which cameras agree on an exposure
-SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
-MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 
 
 class LayeredField:
@@ -94,10 +96,9 @@ class LayeredField:
         self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
         self.fine = False  # whether the still field learns from fine plates
         self.exposure_rounds = 0  # number of rounds of ``_exposures_agree`` so far
-        self.exposures_differ = False  # whether one of them has corrected any
         self._published: SplatSnapshot | None = None
-        self._begun_anew = False  # whether the still field is young, and what it showed before is still shown
-        self._exposed: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_static_gaussians``
+        self._earlier: SplatSnapshot | None = None  # what the still field showed, while it is worse than before
+        self._exposed: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_at_present_exposure``
 
     @property
     def frame_s(self) -> float | None:
@@ -221,7 +222,7 @@ class LayeredField:
 
     def finish_loading(self) -> None:
         """What follows from the loaded parts."""
-        self._published, self._exposed, self._begun_anew = None, None, False
+        self._published = self._exposed = self._earlier = None
         if self.tracker is not None:
             self.static.publish()
             self._find_rows()
@@ -319,12 +320,9 @@ class LayeredField:
     # --- the still field ---------------------------------------------------------------------
 
     def _begin_layers(self) -> MotionTracker:
-        """Give the still field its first plates, and the moving set the scene's box."""
+        """Have the still field begin with its first plates, and the moving set in the scene's box."""
         begun = self.now()
-        if self.exposures_differ:  # and it has learned them
-            self._begin_anew()
-        else:
-            self.static.begin(self._plates())
+        self._begin_anew()
         self.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
@@ -336,7 +334,6 @@ class LayeredField:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
         measured. Plates stay."""
         log.info("layers begin again: another camera has changed the box of the scene")
-        self.static.forget()
         self._begin_anew()
         self.tracker = None
         self.exposure_rounds = 0
@@ -345,9 +342,11 @@ class LayeredField:
             camera.row, camera.depth_m, camera.rendered_step = None, None, -1
 
     def _begin_anew(self) -> None:
-        """Let the still field forget everything and begin with the plates; what it showed is shown until it is
-        better."""
-        self._published, self._begun_anew, self._exposed = self.snapshot(), True, None
+        """Have the still field forget what it has learned, and begin with the plates as they are; what it showed is
+        shown until it is better. Going on from frames in which things moved costs 0.8 dB in ``room``."""
+        self._earlier, self._exposed = self.still.snapshot(), None
+        self._published = self._published or self._earlier
+        self.static.forget()
         self.still.reset()
         self.static.begin(self._plates())
 
@@ -386,8 +385,6 @@ class LayeredField:
             self.exposure_rounds += 1
             if equalize_exposures(self.settings, self.pool, self._box(), list(self.cameras.values())):
                 self.exposure_rounds = EXPOSURE_ROUNDS
-            else:
-                self.exposures_differ = True
         self.part_s.add("exposures", begun)
         return self.exposure_rounds >= EXPOSURE_ROUNDS
 
@@ -426,12 +423,11 @@ class LayeredField:
     # --- what is shown ------------------------------------------------------------------------
 
     def _publish(self) -> None:
-        """Show the layers as they are now, but not yet a still field that has just begun anew."""
-        still, tracker = self.static.shown, self.tracker
-        if still is None or (self._begun_anew and still.step < SHOWN_AFTER):
+        """Show the layers as they are now."""
+        still, tracker = self._still_to_show(), self.tracker
+        if still is None:
             return
         assert tracker is not None and self.origin_ns is not None
-        self._begun_anew = False
         begun, moving, shown = self.now(), tracker.moving, None
         if moving.alive:
             shown = MovingSnapshot(
@@ -442,7 +438,7 @@ class LayeredField:
                 self.origin_ns,
                 self.observations.newest_s,
             )
-        exposed = self._static_gaussians()
+        exposed = self._at_present_exposure(still)
         self._published = LayeredSnapshot(
             still.box,
             exposed,
@@ -456,11 +452,19 @@ class LayeredField:
         )
         self.part_s.add("publication", begun)
 
-    def _static_gaussians(self) -> Gaussians:
-        """The still field at the cameras' present exposure; the arrays of the last publication, where
-        nothing has changed."""
-        shown = self.static.shown
-        assert shown is not None
+    def _still_to_show(self) -> SplatSnapshot | None:
+        """The still field, or what it showed before it began anew, until it is better; None if that is of another
+        box."""
+        shown, earlier = self.static.shown, self._earlier
+        if earlier is None or (shown is not None and shown.step >= SHOWN_AFTER):
+            if earlier is not None:
+                self._earlier = self._exposed = None
+            return shown
+        return earlier if earlier.box == self._box() else None
+
+    def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:
+        """The still field at the cameras' present exposure; the arrays of the last publication, where nothing has
+        changed."""
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
         key = (shown.step, gain.tobytes())
         if self._exposed is None or self._exposed[0] != key:

@@ -24,7 +24,7 @@ Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
 VERSION = 4
-COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds", "exposures_differ")  # of the field
+COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
 

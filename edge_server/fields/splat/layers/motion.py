@@ -26,16 +26,20 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
+from edge_server.fields.splat.layers.settings import (
+    ACCELERATION_M_PER_S2,
+    ATTACHED,
+    CLUSTER_ROUNDS,
+    FIXED,
+    FREE,
+    KNOTS_PER_S,
+    LEAST_REACH,
+    NEIGHBOR_M_PER_S,
+    NEIGHBORS,
+    PERSISTENCE,
+)
 
-KNOTS_PER_S = 15
-FREE, FIXED = 10, 3  # knots solved for, and older ones before them
 WINDOW = FREE + FIXED
-PERSISTENCE = 0.9  # of the acceleration, from knot to knot
-ACCELERATION_M_PER_S2 = 5.0
-NEIGHBORS, NEIGHBOR_M_PER_S = 4, 2.0
-ATTACHED = 3  # anchors of a Gaussian
-ROUNDS = 3  # of k-means
-LEAST_REACH = 1e-2  # scene units
 # x(k) = x(k-1) + v + r a as differences[0] x(k-3) + ... + differences[3] x(k) = 0
 DIFFERENCES = np.array([-PERSISTENCE, 1.0 + 2.0 * PERSISTENCE, -2.0 - PERSISTENCE, 1.0])
 
@@ -316,7 +320,7 @@ def _cluster(
         d2 = np.minimum(d2, ((points - centers[-1]) ** 2).sum(axis=1))
         centers.append(points[np.argmax(d2 * np.minimum(opacity, 0.5))])
     found = np.array(centers)
-    for _ in range(ROUNDS):
+    for _ in range(CLUSTER_ROUNDS):
         nearest = _square_distances(points, found).argmin(axis=1)
         size = np.bincount(nearest, minlength=count)
         total = np.stack([np.bincount(nearest, points[:, c], count) for c in range(3)], axis=-1)

@@ -18,30 +18,33 @@ from edge_server.fields.splat.kernels.project import BLOCK, Gaussians
 from edge_server.fields.splat.layers.kernels.align import align_view
 from edge_server.fields.splat.layers.kernels.train_over import train_over
 from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
-from edge_server.fields.splat.layers.motion import KNOTS_PER_S, Motion, ViewRow
+from edge_server.fields.splat.layers.motion import Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
+from edge_server.fields.splat.layers.settings import (
+    ANCHORS,
+    CAMERA_SHARES,
+    DENSIFY_EVERY,
+    FEW,
+    FOREGROUND_DECAY,
+    GAUSSIANS,
+    GAUSSIANS_AN_ANCHOR,
+    KEEP_DILATION_PX,
+    KEEP_INSIDE,
+    KNOTS_PER_S,
+    LEAST_ALIVE,
+    LOST_BELOW,
+    MISSING_ERROR,
+    MOST_FOREGROUND,
+    SEED_DILATION_PX,
+    SEED_INSIDE,
+    SEEDING_KNOTS,
+    SEEDS_A_PIXEL,
+    USUAL_SHARE,
+)
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 
 Arrays = dict[str, NDArray]
-
-GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels
-USUAL_SHARE = 0.062
-MOST_FOREGROUND, FOREGROUND_DECAY = 2.5, 0.998  # see ``follow_foreground``
-LEAST_ALIVE = 16  # Gaussians, below which nothing is aligned
-GAUSSIANS_AN_ANCHOR = 8  # at least
-GROW_EVERY = 80  # steps
-
-# Seeding, at an instant that most cameras have seen.
-CAMERA_SHARES = (0.58, 0.42)  # share of the cameras that must have seen it; the second if none has the first
-BIRTH_KNOTS = 7  # latest knots among which the instant is looked for
-LEAST_FOREGROUND = 0.001  # share of all pixels
-KEEP_INSIDE, KEEP_DILATION_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
-LOST_BELOW = 0.5  # share that lies inside, below which motion is lost
-SEED_INSIDE, SEED_DILATION_PX = 0.7, 3  # the same for a new one
-MISSING_ERROR = 0.12  # color error, in the worst channel, above which foreground needs new Gaussians
-SEEDS_A_PIXEL = 0.1
-FEW = 32  # Gaussians: all foreground needs new ones below this
 
 
 class MovingSet:
@@ -178,7 +181,7 @@ class MovingSet:
         cloud.params[:] = gaussians.params
         cloud.params[:, :3] = rest
         self.steps += 1
-        if self.steps - self._grown >= GROW_EVERY:
+        if self.steps - self._grown >= DENSIFY_EVERY:
             self._grow(camera.view.intrinsics.width)
         return int(raster.lists.needed[0])
 
@@ -194,7 +197,7 @@ class MovingSet:
         """The frames of the newest knot that most cameras have seen; none if there is no such knot."""
         last = observations.newest_knot
         for share in CAMERA_SHARES:
-            for knot in range(last, last - BIRTH_KNOTS, -1):
+            for knot in range(last, last - SEEDING_KNOTS, -1):
                 found = observations.of_knots(knot, knot)
                 if len(found) >= max(1, round(share * cameras)):
                     return found

@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
-from edge_server.fields.splat.layers.motion import KNOTS_PER_S, ViewRow
+from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
+from edge_server.fields.splat.layers.settings import (
+    BACKGROUND_WEIGHT,
+    FRAMES_KNOWN,
+    KNOTS_PER_S,
+    NEAR_FOREGROUND_PX,
+    OCCLUDED_M,
+)
 from edge_server.fields.splat.layers.static_layer import PlateImage
-
-NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
-BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
-OCCLUDED_M = 0.15  # pixels do not count where the static field is nearer than the moving set by this
-FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
 
 
 @dataclass

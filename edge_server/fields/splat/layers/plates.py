@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.kernels.plates import (
-    BRIGHT,
     CHANGING,
-    DARK,
     FOREGROUND,
     LIKE_STATIC,
     MODES,
@@ -27,18 +25,25 @@ from edge_server.fields.splat.layers.kernels.plates import (
     count_exposure,
     vote,
 )
+from edge_server.fields.splat.layers.settings import (
+    BRIGHT,
+    CLOSE,
+    COMMON_SHARE,
+    DARK,
+    FINE_KNOWN,
+    FINE_MEMORY,
+    GAIN_MOST,
+    GAIN_SHARE,
+    HELD_ERROR,
+    HELD_OPACITY,
+    HOLE,
+    LAGS,
+    REFUSED_SHARE,
+    SPECK,
+)
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
-
-LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
-GAIN_MOST = 3.0  # largest change of exposure between two frames
-GAIN_SHARE = 0.03  # share of the pixels that must be usable to estimate a change of exposure
-COMMON_SHARE = 0.25  # the same over other cameras: of overexposed areas only edges are usable, and these mislead
-CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``clean_mask``
-REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
-FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
-HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
 
 
 class Plate:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import Motion
+from edge_server.fields.splat.layers.settings import MAX_AHEAD_S
 from edge_server.fields.splat.snapshot import SplatSnapshot
-
-MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 
 @dataclass(frozen=True)

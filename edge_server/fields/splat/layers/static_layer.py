@@ -19,19 +19,22 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget, Rendering, View
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.layers.settings import (
+    CHANGED,
+    CHANGED_PIXELS,
+    RATE_AGAIN,
+    RATE_FIRST,
+    RENDER_EVERY,
+    ROUND,
+    ROUNDS_AGAIN,
+    ROUNDS_FIRST,
+    SCHEDULE,
+)
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.fields.splat.still_field import StillField
 
 Arrays = dict[str, NDArray]
-
-SCHEDULE = 1600  # steps of the first schedule, in which the field grows
-ROUND = 10  # steps of a round, over which rates fall; its parameters enter the mean
-ROUNDS_FIRST, RATE_FIRST = 60, 0.05  # after the schedule; least weight of a round in the mean
-ROUNDS_AGAIN, RATE_AGAIN = 20, 0.1  # where plates have changed
-CHANGED = 8.0  # of 255, after blurring: a plate that differs more from what was learned has changed
-CHANGED_PIXELS = 40  # a camera, above which the field is trained again
-RENDER_EVERY = 400  # steps of a thread of its own, between renderings of all cameras
 
 
 class PlateImage(NamedTuple):

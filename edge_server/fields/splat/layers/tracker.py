@@ -13,20 +13,22 @@ import numpy as np
 
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.layers.motion import KNOTS_PER_S
-from edge_server.fields.splat.layers.moving_set import LEAST_FOREGROUND, MovingSet
+from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
-
-# Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.
-PASSES, AGAIN_M = 3, 0.02
-ALIGNING_SHARE = 0.5  # largest share of a budget in seconds
-STRIDE_S = 0.08  # longest motion followed at once: more leads too far from where alignment begins
-LEAST_ALIGNED = 4  # frames in a pass, however short the budget is
-MOST_ALIGNED = 24  # frames in a pass, newest first
-STEPS = 10  # most steps of appearance for each stride
-SEED_EVERY_S = 0.2
-SEED_AT_LEAST_EVERY_S = 0.6  # even if budgets have no room for it
-ANCHORS_EVERY_S = 1.0
+from edge_server.fields.splat.layers.settings import (
+    AGAIN_M,
+    ALIGNING_SHARE,
+    ANCHORS_EVERY_S,
+    KNOTS_PER_S,
+    LEAST_ALIGNED,
+    LEAST_FOREGROUND,
+    MOST_ALIGNED,
+    PASSES,
+    SEED_AT_LEAST_EVERY_S,
+    SEED_EVERY_S,
+    STEPS,
+    STRIDE_S,
+)
 
 
 class PartTimes(dict[str, float]):

@@ -50,11 +50,8 @@ from edge_server.fields.splat.kernels.simd_vectors import (
     eight_lane_sums,
     require_contiguous,
 )
+from edge_server.fields.splat.layers.settings import ATTACHED, NOISE, ROBUST
 from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
-
-NOISE = 0.2  # of full scale: standard deviation of a pixel's error in the least squares
-ROBUST = 1.0  # scale of Cauchy's weights 1 / (1 + e^2 / ROBUST^2)
-ATTACHED = 3  # anchors of a Gaussian
 
 _COLUMN = 3 * PIXELS  # floats: red, green and blue of a tile
 _ANCHOR = 2 * _COLUMN

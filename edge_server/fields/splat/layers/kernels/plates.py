@@ -12,19 +12,24 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.fields.splat.layers.settings import (
+    BRIGHT,
+    DARK,
+    DEVIATION_RATE,
+    DEVIATIONS,
+    EARLY_SHARE,
+    GAIN_STEP,
+    KNOWN_SHARE,
+    KNOWN_VOTES,
+    LEAST_WEIGHT,
+    MEMORY,
+    RUN,
+    SLOWEST_RATE,
+    THRESHOLD,
+    THRESHOLD_UNKNOWN,
+)
 
 MODES = 3  # colors a pixel remembers
-THRESHOLD = 10.0  # colors this near are the same mode
-THRESHOLD_UNKNOWN = 20.0  # where no plate is known, foreground differs by more from the static field
-DEVIATIONS = 3.5  # foreground also differs from the plate by this many of the pixel's own mean deviations
-DEVIATION_RATE = 0.05
-MEMORY = 60  # arrivals over which votes decay
-SLOWEST_RATE = 1.0 / 24.0  # least weight of a new frame in a mode's running mean
-RUN = 12  # arrivals in a row that join another mode: it becomes the plate
-KNOWN_VOTES, KNOWN_SHARE, EARLY_SHARE = 8.0, 0.3, 0.9  # see ``_is_known``
-LEAST_WEIGHT = 0.05  # a mode of less is forgotten
-GAIN_STEP = 0.01  # smaller changes of exposure are left to the running mean
-DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exposure
 
 # Bits that ``compare_with_plate`` writes.
 FOREGROUND, CHANGING, LIKE_STATIC = 1, 2, 4

@@ -12,14 +12,11 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw
+from edge_server.fields.splat.layers.settings import MOST_ITERATIONS, TOLERANCE
 
 BAND = 4  # knots that one view bears on
 PAIRS = 10  # pairs i <= j of these knots
 MOST = 1e30  # bound of a view's numbers: their sums fit float32
-MOST_ITERATIONS = 60
-# The solution is found when the estimated distance to it, over all unknowns together, is this many of its
-# standard deviations.
-TOLERANCE = 0.02
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 

@@ -124,14 +124,16 @@ def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
     np.testing.assert_array_equal(shown, expected)
 
 
-def test_what_was_learned_before_the_plates_are_known_is_kept() -> None:
+def test_what_was_shown_before_the_plates_are_known_is_shown_until_the_still_field_is_better() -> None:
+    """It begins anew with the plates, and is shown after ``SHOWN_AFTER`` steps."""
     field = LayeredField(SMALL)
     _run(field, range(15), moves=False, steps=10)
-    step, params = field.still.step, field.still.cloud.params.copy()
-    _run(field, range(15, 18), moves=False, steps=0)
-    assert field.moving is not None and field.still.step == step == 150
-    np.testing.assert_array_equal(field.still.cloud.params, params)
-    assert field.static.grows_until == step + 200, "its schedule begins with the plates"
+    params = field.still.cloud.params.copy()
+    _run(field, range(15, 18), moves=False, steps=20)
+    assert field.moving is not None and field.still.step == 40
+    np.testing.assert_array_equal(field.snapshot().gaussians.params, params)
+    _run(field, range(18, 20), moves=False, steps=20)
+    np.testing.assert_array_equal(field.snapshot().gaussians.params, field.still.cloud.params)
 
 
 def test_rates_fall_once_over_the_first_schedule(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,105 @@
+"""Numbers of the layers, tuned once on our scenes. None is an option."""
+
+from __future__ import annotations
+
+# --- when what begins (layered_field, static_layer) ---
+LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
+PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are learned
+PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
+EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
+RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit
+SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
+MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
+FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
+MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
+
+# --- plates at full resolution, where frames are taken in at a lower one ---
+FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
+FINE_FRAMES = 6  # frames of each camera before the still field learns from fine plates
+FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
+
+# --- exposures ---
+EXPOSURE_ROUNDS = 6  # most fits in which cameras agree on an exposure
+EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
+EXPOSURE_RATE = 1.2  # factor on a correction: a camera's own seeds hide some of a difference from it
+COVERED = 0.2  # opacity from which a pixel shows the color of the seeds
+GAIN_STEP = 0.01  # smaller changes of exposure are left to the running mean
+GAIN_MOST = 3.0  # largest change of exposure between two frames
+GAIN_SHARE = 0.03  # share of the pixels that must be usable to estimate a change of exposure
+COMMON_SHARE = 0.25  # the same over other cameras: of overexposed areas only edges are usable, and these mislead
+DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exposure
+
+# --- the still field's training on plates ---
+SCHEDULE = 1600  # steps of the first schedule, in which the field grows
+ROUND = 10  # steps of a round, over which rates fall; its parameters enter the mean
+ROUNDS_FIRST, RATE_FIRST = 60, 0.05  # after the schedule; least weight of a round in the mean
+ROUNDS_AGAIN, RATE_AGAIN = 20, 0.1  # where plates have changed
+CHANGED = 8.0  # of 255, after blurring: a plate that differs more from what was learned has changed
+CHANGED_PIXELS = 40  # a camera, above which the field is trained again
+RENDER_EVERY = 400  # steps of a thread of its own, between renderings of all cameras
+
+# --- a pixel's plate: colors in steps of 255 ---
+THRESHOLD = 10.0  # colors this near are the same mode
+THRESHOLD_UNKNOWN = 20.0  # where no plate is known, foreground differs by more from the still field
+DEVIATIONS = 3.5  # foreground also differs from the plate by this many of the pixel's own mean deviations
+DEVIATION_RATE = 0.05
+LAGS = (2, 5)  # frames back with which a frame is compared: a pixel that changes does not vote
+MEMORY = 60  # arrivals over which votes decay
+SLOWEST_RATE = 1.0 / 24.0  # least weight of a new frame in a mode's running mean
+RUN = 12  # arrivals in a row that join another mode: it becomes the plate
+KNOWN_VOTES, KNOWN_SHARE, EARLY_SHARE = 8.0, 0.3, 0.9  # see ``kernels.plates``
+LEAST_WEIGHT = 0.05  # a mode of less is forgotten
+CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``plates.clean_mask``
+REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
+HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
+
+# --- how much a pixel counts ---
+NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
+BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
+OCCLUDED_M = 0.15  # pixels do not count where the still field is nearer than the moving set by this
+
+# --- the moving set ---
+GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels
+USUAL_SHARE = 0.062
+MOST_FOREGROUND, FOREGROUND_DECAY = 2.5, 0.998  # see ``MovingSet.follow_foreground``
+LEAST_ALIVE = 16  # Gaussians, below which nothing is aligned
+GAUSSIANS_AN_ANCHOR = 8  # at least
+DENSIFY_EVERY = 80  # steps; of the still field: the option ``densify_every``
+STEP_PROGRESS = 0.3  # progress of a fit at which its learning rates are taken
+# Seeding, at an instant that most cameras have seen: share of the cameras that must have seen it (the second if
+# none has the first), and the latest knots among which it is looked for.
+CAMERA_SHARES, SEEDING_KNOTS = (0.58, 0.42), 7
+LEAST_FOREGROUND = 0.001  # share of all pixels
+KEEP_INSIDE, KEEP_DILATION_PX = 0.6, 5  # share of the foregrounds, grown, in which a Gaussian must lie
+LOST_BELOW = 0.5  # share that lies inside, below which motion is lost
+SEED_INSIDE, SEED_DILATION_PX = 0.7, 3  # as KEEP_INSIDE, for a new Gaussian
+MISSING_ERROR = 0.12  # color error, in the worst channel, above which foreground needs new Gaussians
+SEEDS_A_PIXEL = 0.1
+FEW = 32  # Gaussians: all foreground needs new ones below this
+
+# --- following motion (tracker) ---
+# Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.
+PASSES, AGAIN_M = 3, 0.02
+ALIGNING_SHARE = 0.5  # largest share of a budget in seconds
+STRIDE_S = 0.08  # longest motion followed at once: more leads too far from where alignment begins
+LEAST_ALIGNED, MOST_ALIGNED = 4, 24  # frames in a pass, newest first; the first however short the budget is
+STEPS = 10  # most steps of appearance for each stride
+SEED_EVERY_S = 0.2
+SEED_AT_LEAST_EVERY_S = 0.6  # even if budgets have no room for it
+ANCHORS_EVERY_S = 1.0
+
+# --- motion and its least squares ---
+KNOTS_PER_S = 15
+FREE, FIXED = 10, 3  # knots solved for, and older ones before them
+PERSISTENCE = 0.9  # of the acceleration, from knot to knot
+ACCELERATION_M_PER_S2 = 5.0
+NEIGHBORS, NEIGHBOR_M_PER_S = 4, 2.0
+ATTACHED = 3  # anchors of a Gaussian
+CLUSTER_ROUNDS = 3  # of k-means
+LEAST_REACH = 1e-2  # scene units
+NOISE = 0.2  # of full scale: standard deviation of a pixel's error in the least squares
+ROBUST = 1.0  # scale of Cauchy's weights 1 / (1 + e^2 / ROBUST^2)
+MOST_ITERATIONS = 60  # of conjugate gradients
+# The solution is found when the estimated distance to it, over all unknowns together, is this many of its
+# standard deviations.
+TOLERANCE = 0.02
