@@ -12,8 +12,9 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
-from edge_server.fields.splat.kernels.project import FOOTPRINT, PROJECTED, TILE, Gaussians, project
-from edge_server.fields.splat.kernels.rasterize import ROWS
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
+from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, Gaussians, project
+from edge_server.fields.splat.kernels.rasterize import ROWS, Targets, train_tiles
 
 MAX_PAIRS = 1 << 22  # pairs a camera: further Gaussians are left out, so that memory is bounded
 
@@ -30,8 +31,6 @@ class RasterBuffers:
         self.sums = np.zeros((0, 0, SUMS), np.float32)
         self.columns = self.rows = np.zeros(0, np.int64)
         self._lists: TileLists | None = None
-        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # cached tasks of whole images
-        self._all_wanted = False
 
     @property
     def lists(self) -> TileLists:
@@ -59,7 +58,6 @@ class RasterBuffers:
         tiles = int((self.columns * self.rows).max())
         self._allocate(slots, count, tiles)
         masks = wanted if wanted is not None else [None] * slots
-        self._all_wanted = all(mask is None for mask in masks)
         for b, mask in enumerate(masks):
             total = int(self.columns[b] * self.rows[b])
             self.lists.wanted[b, :total] = 1 if mask is None else mask
@@ -81,17 +79,47 @@ class RasterBuffers:
         if differentiate and self.sums.shape[:2] != self.lists.pair.shape:
             self.sums = np.zeros((*self.lists.pair.shape, SUMS), np.float32)
 
-    def tasks(self) -> NDArray[np.int32]:
-        """Camera slot and tile, int32 (M, 2), of all tiles wanted by the last ``project_and_bin``."""
-        totals = (self.columns * self.rows).tolist()
-        if self._all_wanted and self._whole is not None and self._whole[0] == totals:
-            return self._whole[1]
-        found = [np.flatnonzero(self.lists.wanted[b, :total]) for b, total in enumerate(totals)]
-        slots = np.repeat(np.arange(len(totals)), [len(tiles) for tiles in found])
-        tasks = np.stack([slots, np.concatenate(found)], axis=-1).astype(np.int32)
-        if self._all_wanted:
-            self._whole = (totals, tasks)
-        return tasks
+    def train(self, targets: Targets, view: int) -> NDArray[np.float64]:
+        """Compare the first camera of the last ``project_and_bin`` with image ``view`` of the targets, and write the
+        gradients of its pairs to ``sums``. Returns ``losses``, see ``train_tiles``."""
+        columns, rows = int(self.columns[0]), int(self.rows[0])
+        losses = np.zeros((columns * rows, 2))
+        self.pool.run(
+            train_tiles,
+            targets,
+            view,
+            columns,
+            rows,
+            self.projected,
+            self.lists,
+            self.memory,
+            self.saved,
+            self.sums,
+            losses,
+        )
+        return losses
+
+    def step(
+        self, cams: NDArray[np.float32], gaussians: Gaussians, moments: OptimizerState, rule: AdamParameters
+    ) -> int:
+        """An optimizer step from the gradients in ``sums``: changes the Gaussians and their moments. Returns how many
+        gradients were not finite. cams: as given to the last ``project_and_bin``."""
+        count = len(gaussians.params)
+        dropped = np.zeros(-(-count // BLOCK) + 1, np.int64)
+        self.pool.run(
+            adam_step,
+            cams,
+            gaussians,
+            count,
+            self.projected,
+            self.lists.own_first,
+            self.lists.own_count,
+            self.sums,
+            moments,
+            rule,
+            dropped,
+        )
+        return int(dropped.sum())
 
     def _bin(self, count: int) -> None:
         bands = max(self.pool.threads // len(self.columns), 1)

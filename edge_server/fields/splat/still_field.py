@@ -27,9 +27,9 @@ from edge_server.fields.common.training_schedule import StepBudget, StepTimer, s
 from edge_server.fields.common.view_store import Arrays, same_views
 from edge_server.fields.splat.buffers import RasterBuffers, unweighted_tiles
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
-from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, adam_step, age_corrections, clamp_gaussians
-from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE, TILE
-from edge_server.fields.splat.kernels.rasterize import Background, train_tiles
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, TILE
+from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import (
     ALIGN_EVERY,
@@ -150,6 +150,16 @@ class StillField(SteppedField[SplatSnapshot]):
             )
             self._data: Views = intake.data
             # All of them, where every weight is 0.
+            self._targets = Targets(
+                self._data.first,
+                self._data.size,
+                self._data.pixels,
+                self._data.weight,
+                np.zeros((0, 3), np.float32),
+                self.view_store.background(),
+                self.settings.background == "random",
+                np.uint64(0),
+            )
             self._asked = supervising_views(self._data) or list(range(len(views)))
             self._views, self._epoch = tuple(views), -1
         if len(self.cloud) == 0:
@@ -175,37 +185,8 @@ class StillField(SteppedField[SplatSnapshot]):
         camera, cloud, raster = self._cams[[view]], self.cloud, self._raster
         gaussians = cloud.gaussians()
         raster.project_and_bin(camera, gaussians)
-        tasks = raster.tasks()
-        losses = np.zeros((len(tasks), 2))
-        background = Background(self.view_store.background(), self.settings.background == "random", key)
-        self.pool.run(
-            train_tiles,
-            self._data,
-            np.array([view]),
-            tasks,
-            raster.columns,
-            raster.projected,
-            raster.lists,
-            background,
-            raster.memory,
-            raster.saved,
-            raster.sums,
-            losses,
-        )
-        dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
-        self.pool.run(
-            adam_step,
-            camera,
-            gaussians,
-            len(cloud),
-            raster.projected,
-            raster.lists.own_first,
-            raster.lists.own_count,
-            raster.sums,
-            cloud.optimizer_state(),
-            self.adam_parameters(progress),
-            dropped,
-        )
+        losses = raster.train(self._targets._replace(key=key), view)
+        dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress))
         if self.settings.planar:
             self._planar_step(view)
         square, broken = losses.sum(axis=0).tolist()
@@ -215,9 +196,9 @@ class StillField(SteppedField[SplatSnapshot]):
         # Not before every view has had a step.
         if grow and self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
             self._grow()
-        pixels = TILE * TILE * len(tasks)
+        pixels = TILE * TILE * len(losses)
         pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
-        return square / (3 * pixels), pixels, pairs, int(broken) + int(dropped.sum())
+        return square / (3 * pixels), pixels, pairs, int(broken) + dropped
 
     def _planar_step(self, view: int) -> None:
         """Flatten the Gaussians, and align them with the normals that ``view`` shows."""

@@ -241,3 +241,22 @@ def composite_backward(
 
     f32, i64 = types.float32, types.int64
     return types.void(pairs, i64, owner, projected, f32, f32, slopes, i64, saved, sums), codegen
+
+
+@part
+def composite_strips(strip_pairs, count, lists, b, projected, x0, y0, tile, store, size, composited):
+    """``composite`` all strips of a tile of camera slot b whose first pixel is (x0, y0). tile: rows of PIXELS from
+    light on. store: float32, of which each strip gets ``size``. composited: int64 (STRIPS,), written."""
+    for n in range(STRIPS):
+        composited[n] = composite(
+            strip_pairs[n],
+            count[n],
+            lists.owner[b],
+            projected[b],
+            np.float32(x0),
+            np.float32(y0 + 2 * n),
+            tile,
+            n * STRIP,
+            store[n * size : (n + 1) * size],
+            SAVED,
+        )

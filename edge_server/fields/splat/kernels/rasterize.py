@@ -23,27 +23,37 @@ from edge_server.fields.splat.kernels.composite import (
     bin_strips,
     composite,
     composite_backward,
+    composite_strips,
 )
 from edge_server.fields.splat.kernels.project import TILE
 
 # Rows of a tile's memory: light, color and depth, in the order of ``composite``; the loss's gradient by each
 # color, and the background's term, in the order of ``composite_backward``.
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
-_ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
+_ER, _BEHIND = 5 * PIXELS, 8 * PIXELS
 ROWS = 9
 
 _F0, _F1, _F2 = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _BYTE = np.float32(1.0 / 255.0)
 
 
-class Background(NamedTuple):
-    """The color behind everything.
+class Targets(NamedTuple):
+    """The images that training compares with, the pixels of one after those of the other.
 
-    color: float32 (3,).
-    random: use a random color for each tile, from stream ``key``, instead.
+    first: int64 (V + 1,), where each image begins. size: int64 (V, 2), width and height.
+    pixels: uint8 (P, 3 or 4).
+    weight: float32 (P,), how much each pixel counts; (0,) where all count in full.
+    behind: float32 (P, 3), steps of 255, what is behind the Gaussians in each pixel; (0, 3): ``background``.
+    background: float32 (3,), in [0, 1].
+    random: use a random background for each tile, from stream ``key``, instead.
     """
 
-    color: NDArray[np.float32]
+    first: NDArray[np.int64]
+    size: NDArray[np.int64]
+    pixels: NDArray[np.uint8]
+    weight: NDArray[np.float32]
+    behind: NDArray[np.float32]
+    background: NDArray[np.float32]
     random: bool
     key: np.uint64
 
@@ -67,155 +77,90 @@ def strip_scratch(lists):
 
 
 @part
-def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store):
-    """Composite tile t of camera slot b into the tile memory ``s``, forward only."""
-    clear_tile(s)
-    bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
-    for n in range(STRIPS):
-        composite(
-            strip_pairs[n],
-            count[n],
-            lists.owner[b],
-            projected[b],
-            np.float32(x0),
-            np.float32(y0 + 2 * n),
-            s,
-            _T + n * STRIP,
-            store,
-            0,
-        )
-
-
-@part
-def _load_target(views, view, x0, y0, background, task, target, back):
-    """Fill target (3, PIXELS), -1 outside the image, and the background, back (3,). Returns how many pixels
-    are inside."""
-    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
+def _load_tile(targets, view, x0, y0, t, target, behind, share):
+    """Fill target and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
+    whether any pixel counts."""
+    width, height, first = targets.size[view, 0], targets.size[view, 1], targets.first[view]
+    own, weighed = targets.behind.shape[0] > 0, targets.weight.size > 0
+    transparent, some = targets.pixels.shape[1] == 4, False
     for c in range(3):
-        back[c] = background.color[c]
-        if background.random:
-            back[c] = uniform(background.key, np.uint64(3 * task + c))
-    count = 0
-    transparent = views.pixels.shape[1] == 4
-    for k in range(PIXELS):
-        x, y = x0 + k % TILE, y0 + k // TILE
-        if x >= width or y >= height:
-            target[0, k] = target[1, k] = target[2, k] = -_F1
-            continue
-        count += 1
-        pixel = first + y * width + x
-        opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
-        for c in range(3):
-            target[c, k] = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + back[c] * (_F1 - opaque)
-    return count
-
-
-@part
-def _load_weights(views, view, x0, y0, target, share):
-    """Fill share (PIXELS,) with the pixels' weights, and treat pixels of weight 0 as outside the image: -1 in
-    target. Returns how many pixels are left."""
-    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
-    count = 0
-    for k in range(PIXELS):
-        x, y = x0 + k % TILE, y0 + k // TILE
-        inside = x < width and y < height
-        share[k] = views.weight[first + y * width + x] if inside else _F0
-        if share[k] > _F0:
-            count += 1
-        else:
-            target[0, k] = target[1, k] = target[2, k] = -_F1
-    return count
-
-
-@part
-def _apply_weights(s, target, share):
-    """Multiply the error rows of ``s`` by the pixels' weights; returns the weighted squared error."""
-    square = _F0
-    for c in range(3):
+        color = uniform(targets.key, np.uint64(3 * t + c)) if targets.random else targets.background[c]
         for k in range(PIXELS):
-            e = s[_R + c * PIXELS + k] - target[c, k] if share[k] > _F0 else _F0
-            square += share[k] * (e * e)
-            s[_ER + c * PIXELS + k] *= share[k]
-    return square
+            behind[c, k] = color
+    for k in range(PIXELS):
+        x, y = x0 + k % TILE, y0 + k // TILE
+        share[k] = _F0
+        if x < width and y < height:
+            pixel = first + y * width + x
+            share[k] = targets.weight[pixel] if weighed else _F1
+            opaque = np.float32(targets.pixels[pixel, 3]) * _BYTE if transparent else _F1
+            for c in range(3):
+                if own:
+                    behind[c, k] = targets.behind[pixel, c] * _BYTE
+                color = np.float32(targets.pixels[pixel, c]) * _BYTE
+                target[c, k] = color * opaque + behind[c, k] * (_F1 - opaque)
+        else:
+            target[0, k] = target[1, k] = target[2, k] = _F0
+        some |= share[k] > _F0
+    return some
 
 
 @kernel
-def train_tiles(
-    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, sums, losses
-):
-    """Render tiles, compare them with the views, and backpropagate to the pairs. The loss is the squared color
-    error, times the pixel's weight where there are ``views.weight``, summed over pixels.
+def train_tiles(counter, worker, targets, view, columns, rows, projected, lists, memory, saved, sums, losses):
+    """Render camera slot 0, compare it with image ``view`` of the targets, and backpropagate to the pairs. Tasks are
+    tiles. The loss is the squared color error times the pixel's weight, summed over pixels.
 
-    views: ``rays.Views``.
-    picked: int64 (B,), the view of each camera slot.
-    tasks: int32 (M, 2), slot and tile.
     memory, saved: float32 (W, ROWS * PIXELS) and (W, longest * STRIPS * SAVED), scratch of each worker.
-    sums: float32 (B, P, SUMS), written for the pairs of the tasks' tiles.
-    background: ``Background``.
-    losses: float64 (M, 2), written: the loss, and 1 if the tile is left out as not finite.
+    sums: float32 (B, P, SUMS), written for the pairs of slot 0.
+    losses: float64 (tiles, 2), written: the loss, and 1 if the tile is left out as not finite.
     """
-    s, store = memory[worker], saved[worker]
-    weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
-    target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
+    s, store, share = memory[worker], saved[worker], np.empty(PIXELS, np.float32)
+    target, behind = np.empty((3, PIXELS), np.float32), np.empty((3, PIXELS), np.float32)
     (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     while True:
-        task = draw(counter, worker, tasks.shape[0])
-        if task >= tasks.shape[0]:
+        t = draw(counter, worker, columns * rows)
+        if t >= columns * rows:
             return
-        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
-        x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        inside = _load_target(views, picked[b], x0, y0, background, task, target, back)
-        if weighed:
-            inside = _load_weights(views, picked[b], x0, y0, target, share)
+        x0, y0 = TILE * (t % columns), TILE * (t // columns)
+        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
+        if (begin == end) & (targets.behind.shape[0] > 0):  # nothing to learn, and most tiles are such
+            losses[t, 0] = losses[t, 1] = 0.0
+            continue
+        some = _load_tile(targets, view, x0, y0, t, target, behind, share)
         clear_tile(s)
-        begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
         size = (end - begin) * SAVED
-        bin_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, strip_pairs, count)
-        for n in range(STRIPS):
-            composited[n] = composite(
-                strip_pairs[n],
-                count[n],
-                lists.owner[b],
-                projected[b],
-                np.float32(x0),
-                np.float32(y0 + 2 * n),
-                s,
-                _T + n * STRIP,
-                store[n * size : (n + 1) * size],
-                SAVED,
-            )
+        bin_strips(lists, 0, begin, end if some else begin, projected, y0, strip_pairs, count)
+        composite_strips(strip_pairs, count, lists, 0, projected, x0, y0, s, store, size, composited)
         square = _F0
+        for k in range(PIXELS):
+            s[_BEHIND + k] = _F0
         for c in range(3):
             for k in range(PIXELS):
-                s[_R + c * PIXELS + k] += s[_T + k] * back[c]
-                known = target[c, k] >= _F0
-                e = s[_R + c * PIXELS + k] - target[c, k] if known else _F0
-                square += e * e
-                s[_ER + c * PIXELS + k] = _F2 * e
-        if weighed:
-            square = _apply_weights(s, target, share)
+                e = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k] - target[c, k]
+                slope = _F2 * (share[k] * e)
+                square += share[k] * (e * e)
+                s[_ER + c * PIXELS + k] = slope
+                s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
         finite = is_finite(square)
-        losses[task, 0], losses[task, 1] = square if finite else 0.0, 0.0 if finite else 1.0
+        losses[t, 0], losses[t, 1] = square if finite else 0.0, 0.0 if finite else 1.0
         for j in range(begin, end):
-            rest = sums[b, lists.pair[b, j]]
+            rest = sums[0, lists.pair[0, j]]
             for k in range(SUMS):
                 rest[k] = _F0
         if not finite:
             continue
-        for k in range(PIXELS):
-            s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
         for n in range(STRIPS):
             composite_backward(
                 strip_pairs[n],
                 composited[n],
-                lists.owner[b],
-                projected[b],
+                lists.owner[0],
+                projected[0],
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 s,
                 _ER + n * STRIP,
                 store[n * size : (n + 1) * size],
-                sums[b],
+                sums[0],
             )
 
 
@@ -232,7 +177,22 @@ def render_tiles(
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        composite_tile(s, lists, 0, t, x0, y0, projected, strip_pairs, count, store)
+        clear_tile(s)
+        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
+        bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
+        for n in range(STRIPS):  # what the forward pass saves is of no use: all at the same place
+            composite(
+                strip_pairs[n],
+                count[n],
+                lists.owner[0],
+                projected[0],
+                np.float32(x0),
+                np.float32(y0 + 2 * n),
+                s,
+                n * STRIP,
+                store,
+                0,
+            )
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:

@@ -13,10 +13,10 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune, opacity
-from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, adam_step
-from edge_server.fields.splat.kernels.project import BLOCK, Gaussians
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
+from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.layers.kernels.align import align_view
-from edge_server.fields.splat.layers.kernels.train_over import train_over
 from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
 from edge_server.fields.splat.layers.motion import Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
@@ -148,35 +148,8 @@ class MovingSet:
         gaussians = self.gaussians(observation.instant_s)
         before = gaussians.params[:, :3].copy()
         raster.project_and_bin(camera.row, gaussians)
-        tasks = raster.tasks()
-        self.pool.run(
-            train_over,
-            observation.view.image,
-            camera.plate.picture,
-            observation.weight,
-            tasks,
-            raster.columns,
-            raster.projected,
-            raster.lists,
-            raster.memory,
-            raster.saved,
-            raster.sums,
-            np.zeros(len(tasks)),
-        )
-        dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
-        self.pool.run(
-            adam_step,
-            camera.row,
-            gaussians,
-            len(cloud),
-            raster.projected,
-            raster.lists.own_first,
-            raster.lists.own_count,
-            raster.sums,
-            cloud.optimizer_state(),
-            parameters,
-            dropped,
-        )
+        raster.train(_over_plate(observation, camera), 0)
+        raster.step(camera.row, gaussians, cloud.optimizer_state(), parameters)
         rest = cloud.params[:, :3] + (gaussians.params[:, :3] - before)
         cloud.params[:] = gaussians.params
         cloud.params[:, :3] = rest
@@ -309,6 +282,24 @@ class MovingSet:
     def _rng(self, purpose: int) -> np.random.Generator:
         self._draws += 1
         return np.random.default_rng(np.random.SeedSequence([self.seed, self._draws, purpose, 6]))
+
+
+def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
+    """A frame as what to learn, over the camera's plate, so that errors of the still field do not reach the moving
+    set."""
+    image, weight = observation.view.image, observation.weight
+    assert weight is not None
+    height, width = weight.shape
+    return Targets(
+        np.array([0, height * width]),
+        np.array([[width, height]]),
+        image.reshape(-1, 3),
+        weight.reshape(-1),
+        camera.plate.picture.reshape(-1, 3),
+        np.zeros(3, np.float32),
+        False,
+        np.uint64(0),
+    )
 
 
 def _is_wrong(observation: Observation) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ from edge_server.fields.splat.kernels.composite import (
     STRIPS,
     _StripBuilder,
     bin_strips,
-    composite,
+    composite_strips,
 )
 from edge_server.fields.splat.kernels.project import (
     CONIC_A,
@@ -330,19 +330,7 @@ def add_view(
             continue
         clear_tile(s)
         bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
-        for n in range(STRIPS):
-            composited[n] = composite(
-                strip_pairs[n],
-                count[n],
-                lists.owner[0],
-                projected[0],
-                np.float32(x0),
-                np.float32(y0 + 2 * n),
-                s,
-                _T + n * STRIP,
-                store[n * size : (n + 1) * size],
-                SAVED,
-            )
+        composite_strips(strip_pairs, count, lists, 0, projected, x0, y0, s, store, size, composited)
         _compare(s, image, weight, x0, y0, behind, rest, shown, opacity)
         many = 0
         for j in range(begin, end):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
-from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step, clamp_gaussians
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
@@ -55,21 +55,8 @@ def _update(
     pool: Pool | None = None,
 ) -> int:
     """How many gradients were dropped; params and moments are changed."""
-    dropped = np.zeros(-(-COUNT // BLOCK), np.int64)
-    (pool or CallerPool()).run(
-        adam_step,
-        cams,
-        as_gaussians(params),
-        COUNT,
-        raster.projected,
-        raster.lists.own_first,
-        raster.lists.own_count,
-        raster.sums,
-        moments,
-        rule,
-        dropped,
-    )
-    return int(dropped.sum())
+    raster.pool = pool or CallerPool()
+    return raster.step(cams, as_gaussians(params), moments, rule)
 
 
 def _gradient(params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]) -> NDArray[np.float32]:

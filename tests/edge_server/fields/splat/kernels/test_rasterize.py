@@ -9,13 +9,11 @@ import pytest
 import torch
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat import buffers
-from edge_server.fields.splat.buffers import RasterBuffers
-from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, TILE
-from edge_server.fields.splat.kernels.rasterize import Background, render_tiles, train_tiles
+from edge_server.fields.splat.kernels.rasterize import Targets, render_tiles
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
@@ -79,70 +77,37 @@ def test_a_ball_appears_where_the_lens_puts_it() -> None:
     assert depth[opacity > 0.3] == pytest.approx(local[2], abs=1e-3)
 
 
-def _views(target: np.ndarray, weight: np.ndarray | None = None) -> Views:
-    h, w = target.shape[:2]
-    return Views(
-        first=np.array([0, h * w]),
-        size=np.array([[w, h]]),
-        lens=np.zeros((1, 8)),
-        rotation=np.zeros((1, 3, 3)),
-        origin=np.zeros((1, 3)),
-        pixels=target.reshape(h * w, -1),
-        changed=np.zeros(0, np.int64),
-        weight=np.zeros(0, np.float32) if weight is None else weight.reshape(-1),
+def _targets(image: np.ndarray, weight: np.ndarray | None = None, behind: np.ndarray | None = None) -> Targets:
+    h, w = image.shape[:2]
+    return Targets(
+        np.array([0, h * w]),
+        np.array([[w, h]]),
+        image.reshape(h * w, -1),
+        np.zeros(0, np.float32) if weight is None else weight.reshape(-1),
+        np.zeros((0, 3), np.float32) if behind is None else behind.reshape(-1, 3),
+        BACK,
+        False,
+        np.uint64(1),
     )
-
-
-def _train(
-    params: np.ndarray, cam: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None
-) -> tuple[RasterBuffers, float]:
-    """Buffers with the pairs' sums, and the loss."""
-    raster = binned(cam, params)
-    tasks = raster.tasks()
-    losses = np.zeros((len(tasks), 2))
-    raster.pool.run(
-        train_tiles,
-        _views(target, weight),
-        np.zeros(1, np.int64),
-        tasks,
-        raster.columns,
-        raster.projected,
-        raster.lists,
-        Background(BACK, False, np.uint64(1)),
-        raster.memory,
-        raster.saved,
-        raster.sums,
-        losses,
-    )
-    assert losses[:, 1].sum() == 0
-    return raster, float(losses[:, 0].sum())
 
 
 def _gradient(
-    params: np.ndarray, cam: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None
+    params: np.ndarray,
+    cam: np.ndarray,
+    image: np.ndarray,
+    weight: np.ndarray | None = None,
+    behind: np.ndarray | None = None,
+    pool: Pool | None = None,
 ) -> tuple[float, np.ndarray]:
     """Loss and its gradient: ten times Adam's first moment after one step from 0."""
-    raster, loss = _train(params, cam, target, weight)
-    n = len(params)
+    raster, n = binned(cam, params, pool=pool), len(params)
+    losses = raster.train(_targets(image, weight, behind), 0)
+    assert losses[:, 1].sum() == 0
     flat = [np.zeros(n, np.float32) for _ in range(3)]
     moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
     rule = AdamParameters(np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32), np.float32(1e-8))
-    dropped = np.zeros(n, np.int64)
-    raster.pool.run(
-        adam_step,
-        cam,
-        as_gaussians(params.copy()),
-        n,
-        raster.projected,
-        raster.lists.own_first,
-        raster.lists.own_count,
-        raster.sums,
-        moments,
-        rule,
-        dropped,
-    )
-    assert dropped.sum() == 0
-    return loss, 10.0 * moments.m
+    assert raster.step(cam, as_gaussians(params.copy()), moments, rule) == 0
+    return float(losses[:, 0].sum()), 10.0 * moments.m
 
 
 def _target(channels: int = 3) -> np.ndarray:
@@ -189,6 +154,30 @@ def test_weighed_gradients_equal_the_oracle() -> None:
     expected = theirs.grad.numpy()
     scale = np.abs(expected).max(axis=0, keepdims=True)
     np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+def test_gradients_over_a_plate_equal_the_oracle() -> None:
+    """What is behind the Gaussians has a color of its own in every pixel; any number of threads does the same."""
+    params, cam, image, weight = random_params(seed=3), _camera(BENT), _target(), _weights()
+    plate = np.random.default_rng(9).uniform(0, 255, image.shape).astype(np.float32)
+    value, gradient = _gradient(params, cam, image, weight, plate)
+    theirs = torch.as_tensor(params, dtype=torch.float64).requires_grad_(True)
+    flat = torch_oracle.flatten(torch.as_tensor(cam[0], dtype=torch.float64), theirs, 1)
+    color, _, _ = torch_oracle.composite(flat, LENS.width, LENS.height, torch.as_tensor(plate / 255.0))
+    error = color - torch.as_tensor(image / 255.0)
+    # Tiles without a Gaussian have nothing to learn, and no loss.
+    lists = binned(cam, params).lists
+    columns = -(-LENS.width // TILE)
+    y, x = np.mgrid[0 : LENS.height, 0 : LENS.width] // TILE
+    filled = (np.diff(lists.first[0]) > 0)[y * columns + x]
+    share = torch.as_tensor(weight * filled, dtype=torch.float64)
+    loss = (share[..., None] * error.square()).sum()
+    loss.backward()
+    assert theirs.grad is not None and value == pytest.approx(loss.item(), rel=1e-4)
+    expected = theirs.grad.numpy()
+    scale = np.abs(expected).max(axis=0, keepdims=True)
+    np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+    np.testing.assert_array_equal(_gradient(params, cam, image, weight, plate, Pool(3, 0))[1], gradient)
 
 
 def test_pixels_without_weight_do_not_matter() -> None:

@@ -272,12 +272,12 @@ def test_warming_up_compiles_every_kernel() -> None:
     """Nothing is left to compile when a body moves: in a process of its own."""
     code = """
 from numba.core.dispatcher import Dispatcher
-from edge_server.fields.splat.layers.kernels import align, plates, solve, train_over, visual_hull
+from edge_server.fields.splat.layers.kernels import align, plates, solve, visual_hull
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.splat.layers.test_layered_field import SMALL, _run
 def compiled():
     found = {}
-    for module in (align, plates, solve, train_over, visual_hull):
+    for module in (align, plates, solve, visual_hull):
         kernels = {k for k in vars(module).values() if isinstance(k, Dispatcher)}
         found |= {(module.__name__, k.py_func.__name__): len(k.signatures) for k in kernels}
     return found
