@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.layers import layered_field, static_field, static_layer
+from edge_server.fields.splat.layers import layered_field, static_layer
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.settings import SplatSettings
@@ -226,9 +226,9 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Plates of one second, and a short schedule."""
     monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
     monkeypatch.setattr(static_layer, "SHOWN_AFTER", 60)
-    monkeypatch.setattr(static_field, "SCHEDULE", 200)
-    monkeypatch.setattr(static_field, "ROUNDS_FIRST", 5)
-    monkeypatch.setattr(static_field, "ROUNDS_AGAIN", 3)
+    monkeypatch.setattr(static_layer, "SCHEDULE", 200)
+    monkeypatch.setattr(static_layer, "ROUNDS_FIRST", 5)
+    monkeypatch.setattr(static_layer, "ROUNDS_AGAIN", 3)
     yield
 
 

@@ -43,7 +43,6 @@ from edge_server.fields.splat.layers.settings import (
     PLATE_S,
     PLATES_EVERY_S,
     RENDERINGS_A_FIT,
-    SHOWN_AFTER,
     STEP_PROGRESS,
 )
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
@@ -406,7 +405,7 @@ class LayeredField:
         """Give cameras depth and color of the still field, as far as it has learned since. Where no thread
         has rendered them, they are rendered here: all at first, then one a fit."""
         begun, shown, cameras = self.now(), self.static.shown, self.cameras
-        if not beside and shown is not None:
+        if not beside and shown is not None and self.static.ready:
             stale = sorted((c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step)
             never = [c for c in stale if c.rendered_step < 0]
             self.static.render([c.view for c in never or stale[:1]])
@@ -455,11 +454,11 @@ class LayeredField:
     def _still_to_show(self) -> SplatSnapshot | None:
         """The still field, or what it showed before it began anew, until it is better; None if that is of another
         box."""
-        shown, earlier = self.static.shown, self._earlier
-        if earlier is None or (shown is not None and shown.step >= SHOWN_AFTER):
+        earlier = self._earlier
+        if earlier is None or self.static.ready:
             if earlier is not None:
                 self._earlier = self._exposed = None
-            return shown
+            return self.static.shown
         return earlier if earlier.box == self._box() else None
 
     def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:

@@ -29,6 +29,7 @@ from edge_server.fields.splat.layers.settings import (
     ROUNDS_AGAIN,
     ROUNDS_FIRST,
     SCHEDULE,
+    SHOWN_AFTER,
 )
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -81,6 +82,11 @@ class StaticLayer:
     def finished(self) -> bool:
         """Whether there is nothing more to learn from these plates."""
         return self.rounds >= self._rounds_wanted
+
+    @property
+    def ready(self) -> bool:
+        """Whether the field is good enough to be shown, and to say what lies where plates are unknown."""
+        return self.shown is not None and self.shown.step >= SHOWN_AFTER
 
     # --- plates -------------------------------------------------------------------------------
 
@@ -192,7 +198,8 @@ class StaticLayer:
             while not self.finished and not self._stopping:
                 self.train(StepBudget(Budget(steps=ROUND)))
                 self.publish()
-                if self.finished or self.field.step - rendered_step >= RENDER_EVERY:
+                due = self.finished or self.field.step - rendered_step >= RENDER_EVERY
+                if due and self.ready:
                     self.render(views)
                     rendered_step = self.field.step
         except BaseException as error:  # the caller raises it

@@ -32,7 +32,7 @@ FRAME_S = 1.0 / 15.0
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plates of one second, and a short schedule."""
     monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
-    monkeypatch.setattr(layered_field, "SHOWN_AFTER", 60)
+    monkeypatch.setattr(static_layer, "SHOWN_AFTER", 60)
     monkeypatch.setattr(static_layer, "SCHEDULE", 200)
     monkeypatch.setattr(static_layer, "ROUNDS_FIRST", 5)
     monkeypatch.setattr(static_layer, "ROUNDS_AGAIN", 3)
