@@ -11,7 +11,7 @@ last. The last FREE knots are solved for together by least squares, the FIXED on
   ACCELERATION_M_PER_S2 dt^2;
 - neighboring anchors move alike: their X_k - X_k-1 differ by NEIGHBOR_M_PER_S dt.
 
-A late view needs no special case: it bears on older knots. The inverse of the same matrix is the covariance.
+A late view needs no special case: it bears on older knots.
 """
 
 from __future__ import annotations
@@ -242,44 +242,6 @@ class Motion:
         dt = 1.0 / KNOTS_PER_S
         steady, alike = ACCELERATION_M_PER_S2 * dt**2, NEIGHBOR_M_PER_S * dt
         return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
-
-    def deviation(self, anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float) -> NDArray[np.float32]:
-        """Standard deviation (N,) of places at an instant, scene units, the root of the mean over three axes,
-        from the covariance of the last solution. It grows past the last view. anchor, share: see
-        ``attach``."""
-        assert self.anchors is not None
-        count = len(self.anchors)
-        base, w = self.weights(instant_s)
-        knots = np.zeros(WINDOW)
-        knots[base : base + 4] = w
-        by = np.kron(knots[FIXED:], np.eye(3 * count))
-        covariance = by @ np.linalg.solve(self._precision(), by.T)
-        traces = np.einsum("iaib->ab", covariance.reshape(3, count, 3, count)) / 3.0
-        pairs = traces[anchor[:, :, None], anchor[:, None, :]]
-        # Where views are surer by 1e15 than the prior, rounding leaves variances around 0.
-        variance = np.maximum(np.einsum("ni,nj,nij->n", share, share, pairs), 0.0)
-        return np.sqrt(variance).astype(np.float32)
-
-    def _precision(self) -> NDArray[np.float64]:
-        """Inverse of the covariance of the free knots of the last solution, (FREE * 3K, FREE * 3K), by axis,
-        then anchor."""
-        n = self._band.shape[2]
-        a, (steady, alike) = np.zeros((WINDOW, WINDOW, n, n)), self._prior_weights()
-        for k in range(WINDOW):
-            for q in range(min(BAND, WINDOW - k)):
-                a[k, k + q] = self._band[k, q]
-                a[k + q, k] = self._band[k, q].T
-        for k in range(3, WINDOW):
-            for i in range(4):
-                for j in range(4):
-                    a[k - 3 + i, k - 3 + j] += steady * DIFFERENCES[i] * DIFFERENCES[j] * np.eye(n)
-        laplacian = alike * np.kron(np.eye(3), self._laplacian)
-        for k in range(1, WINDOW):
-            a[k, k] += laplacian
-            a[k - 1, k - 1] += laplacian
-            a[k, k - 1] -= laplacian
-            a[k - 1, k] -= laplacian
-        return a[FIXED:, FIXED:].transpose(0, 2, 1, 3).reshape(FREE * n, FREE * n)
 
     def copy(self) -> Motion:
         """A copy that later changes of this one do not reach."""

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.splat.layers.plates import CLOSE, HOLE, SPECK, Plate, clean_mask
+from edge_server.fields.splat.layers.plates import CLOSE, HOLE, SPECK, FinePlate, Plate, clean_mask
+from tests.edge_server.fields.scenes import ring
 
 SIZE = 48
 WALL = cv2.resize(np.random.default_rng(0).integers(60, 180, (12, 12, 3), np.uint8), (SIZE, SIZE))
@@ -89,6 +90,18 @@ def test_a_state_continues_bit_for_bit() -> None:
         np.testing.assert_array_equal(plate.take(_frame(at)), other.take(_frame(at)))
     for name, array in plate.state().items():
         np.testing.assert_array_equal(array, other.state()[name], err_msg=name)
+
+
+def test_a_fine_plate_is_at_the_common_exposure_and_leaves_out_what_moves() -> None:
+    """The mean of frames divided by their exposures: with twice the light, half the color."""
+    whole = ring(2, size=2 * SIZE)[0]
+    fine, away = FinePlate(whole), np.zeros((SIZE, SIZE), bool)
+    away[:8] = True
+    for color, gain in ((100, 1.0), (160, 2.0), (80, 1.0)):
+        fine.take(np.full(whole.image.shape, color, np.uint8), away, np.full(3, gain, np.float32))
+    assert fine.known[20:].all() and not fine.known[:16].any() and fine.count == 3
+    np.testing.assert_allclose(fine.color[20:], (100 + 80 + 80) / 3, rtol=1e-5)
+    assert not fine.color[:16].any()
 
 
 def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
