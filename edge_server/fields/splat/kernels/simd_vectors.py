@@ -94,13 +94,6 @@ class Vector:
         """The maximum of this and ``bound``; ``bound`` for NaN."""
         return self.where(self.greater_equal(bound), bound)
 
-    def is_finite(self) -> Any:
-        """A mask of the lanes that are neither NaN nor infinite."""
-        return self.builder.fcmp_ordered("<=", self._llvm("fabs", self.value), constant(3.4e38))
-
-    def sqrt(self) -> Vector:
-        return Vector(self.builder, self._llvm("sqrt", self.value))
-
     def _llvm(self, name: str, value: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         called = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{LANES}f32")

@@ -92,17 +92,6 @@ def test_minimum_and_maximum_replace_nan():
     np.testing.assert_array_equal(_run(lambda x, y: x.maximum(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
 
 
-def test_is_finite():
-    a = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, 1e-40, -1.0] * 2, np.float32)
-    got = _run(lambda x, y: (x - x + 1.0).where(x.is_finite(), y), a, np.full(LANES, 5.0, np.float32))
-    np.testing.assert_array_equal(got, [5, 5, 5, 1, 1, 1, 1, 1] * 2)
-
-
-def test_sqrt(pair):
-    got = _run(lambda x, y: (x * x).sqrt() + y, *pair)
-    np.testing.assert_allclose(got, np.abs(pair[0]) + pair[1], rtol=1e-6)
-
-
 def test_exp2_is_exact_to_the_last_bits():
     for given in np.linspace(-63.99, 0.0, 160).astype(np.float32).reshape(-1, LANES):
         got = _run(lambda x, y: x.exp2(), given, given)

@@ -17,7 +17,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
-from edge_server.fields.splat.layers import layered_field, static_layer
+from edge_server.fields.splat.layers import layered_field
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.still_field import StillField
@@ -26,16 +26,6 @@ from tests.edge_server.fields.scenes import picture, psnr, ring
 SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
 CAMERAS, HELD = ring(12)[:11], ring(12)[11]
 FRAME_S = 1.0 / 15.0
-
-
-@pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plates of one second, and a short schedule."""
-    monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
-    monkeypatch.setattr(static_layer, "SHOWN_AFTER", 60)
-    monkeypatch.setattr(static_layer, "SCHEDULE", 200)
-    monkeypatch.setattr(static_layer, "ROUNDS_FIRST", 5)
-    monkeypatch.setattr(static_layer, "ROUNDS_AGAIN", 3)
 
 
 def _ball_m(instant_s: float, moves: bool) -> np.ndarray:

@@ -194,3 +194,35 @@ def test_anchors_attach_what_is_near():
     np.testing.assert_allclose(share.sum(axis=1), 1.0, rtol=1e-6)
     with pytest.raises(ValueError, match="at least one point"):
         motion.choose_anchors(np.full((3, 3), np.nan), np.ones(3), 2, 10.0)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("strength", [0.0, 1e-12, 1e18])
+def test_views_of_one_instant_that_say_nothing_or_far_too_much(strength):
+    """Of one direction only: the normal matrix is singular."""
+    motion, rng = moving(), np.random.default_rng(1)
+    motion.solve([row(motion, 10.0, walk(10.0, 6), rng, rank=1, strength=s) for s in (1e-12, 1e12, strength)])
+    assert np.abs(motion.at(10.0)).max() < 3.0
+
+
+@pytest.mark.stability
+def test_a_second_of_silence_stays_bounded():
+    motion, rng = moving(), np.random.default_rng(2)
+    for k in range(20):
+        at_s = 10.0 + k / 15
+        motion.slide(at_s)
+        motion.solve([row(motion, at_s, walk(at_s, 6), rng, rank=3)])
+    motion.slide(at_s + 1.0)
+    motion.solve([])
+    assert np.abs(motion.at(at_s + 1.0)).max() < 2.5
+
+
+@pytest.mark.stability
+def test_anchors_that_coincide():
+    motion = Motion(3.0, np.random.default_rng(0))
+    for instant_s in (10.0, 12.0):
+        motion.choose_anchors(np.zeros((5, 3)), np.zeros(5), 4, instant_s)
+        motion.slide(instant_s + 1.0)
+        motion.solve([])
+        _, share = motion.attach(np.zeros((2, 3)), instant_s)
+        np.testing.assert_allclose(share.sum(axis=1), 1.0, rtol=1e-6)

@@ -8,15 +8,9 @@ from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers.kernels import plates as kernels
 from edge_server.fields.splat.layers.kernels.plates import (
     CHANGING,
-    DEVIATIONS,
     FOREGROUND,
     LIKE_STATIC,
-    MEMORY,
     MODES,
-    RUN,
-    SLOWEST_RATE,
-    THRESHOLD,
-    THRESHOLD_UNKNOWN,
     PlateArrays,
     compare_with_plate,
     count_exposure,
@@ -24,6 +18,9 @@ from edge_server.fields.splat.layers.kernels.plates import (
 )
 
 H, W = 37, 11  # more rows than a task has
+# In numbers, so that a change of them is seen.
+THRESHOLD, THRESHOLD_UNKNOWN, DEVIATIONS = 10.0, 20.0, 3.5
+MEMORY, RUN, SLOWEST_RATE = 60, 12, 1.0 / 24.0
 
 
 def _plate(seed: int) -> PlateArrays:

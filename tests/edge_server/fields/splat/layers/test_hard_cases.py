@@ -1,15 +1,14 @@
 """The whole layered field in hard cases: nothing diverges, and half a second after the first fresh views what
 moves is shown as well as before.
 
-Six cameras see balls that go about on a table. Ten minutes of ``room`` at twice the load:
-``edge-server bench shown --scene room --scene "room, a quarter of the speed, ten minutes"``.
+Six cameras see balls that go about on a table.
 """
 
 from __future__ import annotations
 
 import copy
 import tracemalloc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -19,12 +18,13 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.layers import layered_field, static_layer
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import look_at, world_rays
 from tests.edge_server.fields.scenes import psnr, ring, seen
+
+pytestmark = pytest.mark.stability
 
 SETTINGS = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=1)
 CAMERAS, HELD = ring(7, 64)[:6], ring(7, 64)[6]
@@ -219,17 +219,6 @@ CASES = {
     "singular": Case(sent=_without_weight, fresh_s=AGAIN_S),
     "equal times": Case(sent=_clocks_that_stick, fresh_s=0.2 + NETWORK_S),
 }
-
-
-@pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Plates of one second, and a short schedule."""
-    monkeypatch.setattr(layered_field, "PLATE_S", 1.0)
-    monkeypatch.setattr(static_layer, "SHOWN_AFTER", 60)
-    monkeypatch.setattr(static_layer, "SCHEDULE", 200)
-    monkeypatch.setattr(static_layer, "ROUNDS_FIRST", 5)
-    monkeypatch.setattr(static_layer, "ROUNDS_AGAIN", 3)
-    yield
 
 
 @cache

@@ -10,13 +10,13 @@ import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import mean_psnr, ring
 from tests.edge_server.fields.small import healthy
-from tests.edge_server.fields.splat.layers.test_motion import moving, row, walk
 from tests.edge_server.fields.splat.small import TINY
+
+pytestmark = pytest.mark.stability
 
 VIEWS = ring(9, size=24)
 
@@ -98,7 +98,7 @@ def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.Fixture
 from dataclasses import replace
 import numpy as np
 from edge_server.fields import Budget
-from tests.stability.test_field_splat import TINY, VIEWS, StillField
+from tests.edge_server.fields.splat.test_hard_cases import TINY, VIEWS, StillField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
 for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True}, bent),
                      ({"flatten": 0.1, "align": 0.05}, bent)):
@@ -112,39 +112,3 @@ field.fit(moved, Budget(steps=20))
 print("kept")
 """
     run_with_bounds_checks(code, tmp_path, request)
-
-
-SEEN_RIGHT = np.array([[0, 0, 0]]), np.array([[1, 0, 0]], np.float32)  # a Gaussian that is all of anchor 0
-
-
-@pytest.mark.parametrize("strength", [0.0, 1e-12, 1e18])
-def test_motion_from_views_of_one_instant_that_say_nothing_or_far_too_much(strength: float) -> None:
-    """Of one direction only: the normal matrix is singular, the covariance near that."""
-    motion, rng = moving(), np.random.default_rng(1)
-    rows = [row(motion, 10.0, walk(10.0, 6), rng, rank=1, strength=s) for s in (1e-12, 1e12, strength)]
-    motion.solve(rows)
-    deviation = motion.deviation(*SEEN_RIGHT, 10.0)
-    assert np.abs(motion.at(10.0)).max() < 3.0 and 0.0 <= deviation < 1.0
-
-
-def test_motion_after_a_second_of_silence_is_bounded_and_unsure() -> None:
-    motion, rng = moving(), np.random.default_rng(2)
-    for k in range(20):
-        at_s = 10.0 + k / 15
-        motion.slide(at_s)
-        motion.solve([row(motion, at_s, walk(at_s, 6), rng, rank=3)])
-    sure = motion.deviation(*SEEN_RIGHT, at_s)
-    motion.slide(at_s + 1.0)
-    motion.solve([])
-    assert np.abs(motion.at(at_s + 1.0)).max() < 2.5
-    assert motion.deviation(*SEEN_RIGHT, at_s + 1.0) > 3.0 * sure
-
-
-def test_anchors_that_coincide() -> None:
-    motion = Motion(3.0, np.random.default_rng(0))
-    for instant_s in (10.0, 12.0):
-        motion.choose_anchors(np.zeros((5, 3)), np.zeros(5), 4, instant_s)
-        motion.slide(instant_s + 1.0)
-        motion.solve([])
-        _, share = motion.attach(np.zeros((2, 3)), instant_s)
-        np.testing.assert_allclose(share.sum(axis=1), 1.0, rtol=1e-6)
