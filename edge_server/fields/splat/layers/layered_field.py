@@ -35,6 +35,7 @@ from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.settings import (
     EVIDENCE_S,
     EXPOSURE_ROUNDS,
+    EXPOSURE_STEPS,
     FINE_EVERY_S,
     FINE_FRAMES,
     LEAST_CAMERAS,
@@ -133,8 +134,10 @@ class LayeredField:
             self._begin_again()
         taken = self._take_in(views)
         if self.tracker is None:
-            if not self._plates_are_known() or not self._exposures_agree():
+            if not self._plates_are_known():
                 return self._fit_still(views, budget, pace)
+            if not self._exposures_agree():
+                return FitReport(0, pace.elapsed_s(), 0.0, 0, 0, note="the cameras' exposures are equalized")
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
@@ -202,6 +205,7 @@ class LayeredField:
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
         field._take_in(views)
+        field.static.begin(field._plates())
         moving = field._begin_layers().moving
         field._find_rows()
         moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
@@ -319,21 +323,18 @@ class LayeredField:
     # --- the still field ---------------------------------------------------------------------
 
     def _begin_layers(self) -> MotionTracker:
-        """Have the still field begin with its first plates, and the moving set in the scene's box."""
-        begun = self.now()
-        self._begin_anew()
+        """Begin to follow what moves, in the scene's box."""
         self.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
         self.tracker.anchors_s = self.plates_s
-        self.part_s.add("static field", begun)
         return self.tracker
 
     def _begin_again(self) -> None:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
         measured. Plates stay."""
         log.info("layers begin again: another camera has changed the box of the scene")
-        self._begin_anew()
+        self.static.forget()
         self.tracker = None
         self.exposure_rounds = 0
         self.observations = Observations()
@@ -342,8 +343,8 @@ class LayeredField:
 
     def _begin_anew(self) -> None:
         """Have the still field forget what it has learned, and begin with the plates as they are; what it showed is
-        shown until it is better. Going on from frames in which things moved costs 0.8 dB in ``room``."""
-        self._earlier, self._exposed = self.still.snapshot(), None
+        shown until it is better."""
+        self._earlier, self._exposed = self._earlier or self.still.snapshot(), None
         self._published = self._published or self._earlier
         self.static.forget()
         self.still.reset()
@@ -378,14 +379,23 @@ class LayeredField:
         self.part_s.add("static field", begun)
 
     def _exposures_agree(self) -> bool:
-        """Correct the cameras' exposures, one round a call. Returns whether it was the last."""
-        begun = self.now()
-        if self.exposure_rounds < EXPOSURE_ROUNDS:
+        """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
+        agree goes on. One round a call. Returns whether it was the last."""
+        begun, views = self.now(), [camera.view for camera in self.cameras.values()]
+        agree = self.exposure_rounds >= EXPOSURE_ROUNDS
+        self._begin_anew()
+        if not agree:
             self.exposure_rounds += 1
-            if equalize_exposures(self.settings, self.pool, self._box(), list(self.cameras.values())):
+            self.static.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
+            self.static.publish()
+            self.static.render(views)
+            renderings = {name: rendering for name, (_, rendering) in self.static.rendered.items()}
+            self.static.rendered = {}
+            agree = equalize_exposures(self.cameras, renderings)
+            if agree:
                 self.exposure_rounds = EXPOSURE_ROUNDS
         self.part_s.add("exposures", begun)
-        return self.exposure_rounds >= EXPOSURE_ROUNDS
+        return agree
 
     def _plates(self) -> list[PlateImage]:
         return [camera.plate_image(self.fine) for camera in self.cameras.values()]

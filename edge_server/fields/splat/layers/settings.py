@@ -19,10 +19,9 @@ FINE_FRAMES = 6  # frames of each camera before the still field learns from fine
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
 
 # --- exposures ---
-EXPOSURE_ROUNDS = 6  # most fits in which cameras agree on an exposure
+EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # fits in which cameras agree on an exposure, and steps of each
 EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras
-EXPOSURE_RATE = 1.2  # factor on a correction: a camera's own seeds hide some of a difference from it
-COVERED = 0.2  # opacity from which a pixel shows the color of the seeds
+EXPOSURE_RATE = 1.6  # factor on a correction: after so few steps some six tenths of a difference show
 GAIN_STEP = 0.01  # smaller changes of exposure are left to the running mean
 GAIN_MOST = 3.0  # largest change of exposure between two frames
 GAIN_SHARE = 0.03  # share of the pixels that must be usable to estimate a change of exposure
