@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.fields import Budget, View
+from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.project import BASE
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.fields.splat.still_field import StillField
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.fisher import FisherRF, information
 from edge_server.viewpoints.registry import CaptureState
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, random_params
-from tests.edge_server.fields.splat.small import TINY
 
 LENS = Pinhole(9, 7, 9.0, 9.5, 4.3, 3.6)
 BENT = replace(LENS, distortion=(-0.12, 0.03, 0.01, -0.015))
@@ -84,17 +82,3 @@ def test_fisher_prefers_what_was_not_seen():
     state.open[:] = True
     values = FisherRF().values(state)
     assert values[1] > 2.0 * values[0] > 0.0 and params.shape[1] == BASE
-
-
-def test_fisher_works_on_a_field_that_is_being_captured():
-    lens = Pinhole.from_fov(32, 32, 50.0)
-    candidates = half_hemisphere((0, 0, 0), 2.0, lens, 6)
-    rng = np.random.default_rng(0)
-    views = [View(f"v{k}", rng.integers(0, 255, (32, 32, 3), np.uint8), candidates.poses[k], lens) for k in (0, 3)]
-    field = StillField(TINY)
-    field.fit(views, Budget(steps=5))
-    state = CaptureState(candidates, 4, rng, lambda given: field, [0, 3], views)
-    values = FisherRF().values(state)
-    assert values.shape == (6,) and np.isfinite(values).all() and (values[state.open] > 0).all()
-    with pytest.raises(ViewpointError, match="needs a field"):
-        FisherRF().values(CaptureState(candidates, 4, rng))

@@ -52,13 +52,6 @@ def test_after_sixty_answers_with_one_in_ten_wrong_it_agrees_as_the_expert_does(
     assert np.mean(found) >= 0.9
 
 
-def test_of_a_careful_expert_it_says_that_it_knows():
-    for seed in range(4):
-        features, scores, rng = pool(seed)
-        model = ask(SimulatedExpert("edges", scores, rng), features, 60)
-        assert model.knows and "likelier than by a coin" in model.says()
-
-
 @pytest.mark.parametrize("habit", [{"contradicts": True}, {"lazy": 1.0}])
 def test_from_contradictions_it_knows_nothing_and_says_so(habit):
     known = 0
@@ -69,12 +62,6 @@ def test_from_contradictions_it_knows_nothing_and_says_so(habit):
             assert "it does not know" in model.says() and "contradict" in model.says()
         known += model.knows
     assert known <= 1
-
-
-def test_one_pair_answered_both_ways_says_nothing():
-    features, _, _ = pool(0)
-    model = fit_reward(features, [Answer(0, 1, k % 2 == 0) for k in range(20)])
-    assert not model.knows and abs(model.probability(features, np.array([0]), np.array([1]))[0] - 0.5) < 0.05
 
 
 def test_one_answer_only():

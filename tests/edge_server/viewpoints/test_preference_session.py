@@ -53,14 +53,6 @@ def test_agreement_is_of_the_pair_and_not_of_the_side():
         assert not session.model.knows and "it does not know" in session.model.says()
 
 
-def test_sides_are_random():
-    """Nobody can tell the earlier drawn, or the better one, by its side."""
-    session = by_taste(PreferenceSession("tile", ORDERS, FEATURES, 200), 200)
-    left = np.mean([a.choice == "left" for a in session.answers])
-    assert 0.4 < left < 0.6
-    assert 0.4 < np.mean([a.left < a.right for a in session.answers]) < 0.6
-
-
 def test_undo_takes_back_one_answer_and_asks_the_same_again():
     seven = by_taste(NEW, 7)
     assert seven.undone() == by_taste(NEW, 6) and NEW.undone().answers == ()
@@ -125,11 +117,6 @@ def test_bad_files_are_refused_in_one_sentence(change, said):
 def test_what_is_no_file_of_answers_is_refused(data):
     with pytest.raises(ViewpointError, match="not a file of answers"):
         NEW.imported(data)
-
-
-def test_one_answer_only():
-    one = NEW.answered("right")
-    assert not one.model.knows and one.agreement == (0, 0) and one.question is not None
 
 
 def test_no_pair_to_ask():

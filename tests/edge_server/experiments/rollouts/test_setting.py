@@ -10,7 +10,6 @@ import pytest
 from camera_node.synthetic import make_scene
 from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.studies.learning import room
 from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, reported, scenario, setting
 
 
@@ -65,16 +64,6 @@ def test_motions_are_drawn_where_something_moves_and_nowhere_else():
     assert EpisodeFactory(setting(motions=True), NOTHING).scenario(3).source["motion_seed"] == 3
 
 
-def test_an_outcome_with_a_drawn_motion_is_the_same_whoever_asks():
-    what = setting(motions=True)
-    factory = EpisodeFactory(what, NOTHING)
-    for seed in (1, 2):
-        factory.episode(seed)
-    moment = factory.episode(5).moments[0]
-    choice = Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns)
-    assert factory.episode(5).evaluate(0, choice) == {"cam00": one_of(what)}
-
-
 def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
     """Frames of two episodes have the same numbers."""
     what = setting(motions=True, parts=("semantics", "age"), decisions=1)
@@ -82,11 +71,6 @@ def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
     after_others = [factory.episode(seed).moments[0].state.embeddings for seed in (1, 2)][1]
     alone = EpisodeFactory(what, NOTHING).episode(2).moments[0].state.embeddings
     assert after_others.any() and np.array_equal(after_others, alone)
-
-
-def test_decisions_start_from_a_warm_field_unless_the_thesis_is_asked_for():
-    assert not Setting(scenario()).scratch
-    assert not room().scratch and room(scratch=True).scratch
 
 
 def test_the_scenarios_seed_and_the_repeat_decide_the_fields_luck_and_so_does_the_episode():

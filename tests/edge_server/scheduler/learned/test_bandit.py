@@ -53,11 +53,6 @@ def test_waiting_is_carried_out_as_by_omega_wait():
     assert p.select(later, plan) == fixed.select(later, plan) == ("b",)
 
 
-def test_not_waiting_uses_the_buffer_as_it_is():
-    p = policy("wait", favourite=0)
-    assert p.select(AT, p.plan(AT)) == ("a", "b", "c")
-
-
 def test_a_threshold_is_carried_out_as_by_omega_threshold():
     p = policy("threshold", favourite=2)
     plan = p.plan(AT)
@@ -81,16 +76,6 @@ def test_nothing_is_selected_while_nothing_is_there():
     for action in ("select", "wait", "threshold"):
         p = policy(action)
         assert p.select(epoch(100), p.plan(epoch(100))) == ()
-
-
-def test_exploring_draws_and_repeats_with_its_seed():
-    def drawn(seed):
-        p = policy("select")
-        p = BanditPolicy(p.actor, p.name, np.random.default_rng(seed), explore=True)
-        return [p.select(AT, p.plan(AT)) for _ in range(20)]
-
-    assert drawn(1) == drawn(1) != drawn(2)
-    assert len(set(drawn(1))) > 2
 
 
 def test_it_is_made_by_name(tmp_path):
@@ -176,9 +161,3 @@ def test_a_policy_that_was_taught_with_other_embeddings_is_refused():
     with pytest.raises(ValueError, match="trained with color"):
         updates(other, Brightness())
     updates(policy("select", parts=("semantics",), dim=1, embedding="brightness"), Brightness())
-
-
-def test_a_policy_says_where_it_is_not_shown_a_state():
-    p = policy("threshold")
-    with pytest.raises(ValueError, match="more than ages"):
-        p.plan(replace(AT, state=None))

@@ -47,13 +47,6 @@ def test_a_decision_comes_back_as_it_was(tmp_path):
     assert found.images["cam00"].shape == (24, 32, 3)
 
 
-def test_the_newest_is_found_without_its_number(tmp_path):
-    record = DecisionWriter(tmp_path)
-    for number in (9, 10, 11):
-        record.write(a_decision(number))
-    assert read_decision(tmp_path).decision.number == 11
-
-
 def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path):
     record = DecisionWriter(tmp_path, max_decisions=3)
     for number in range(6):
@@ -77,13 +70,6 @@ def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_p
     newest, other = read_decision(tmp_path).decision, a_decision(1, seed=1)
     assert newest.number == 1
     np.testing.assert_array_equal(newest.actor.weights["in"], other.actor.weights["in"])
-
-
-def test_bytes_are_bounded_but_the_newest_always_stays(tmp_path):
-    record = DecisionWriter(tmp_path, max_bytes=1)
-    for number in range(3):
-        record.write(a_decision(number))
-    assert names(tmp_path / FOLDER, "0*") == ["000002.npz"]
 
 
 def test_what_cannot_be_written_is_counted(tmp_path):
@@ -124,10 +110,3 @@ def test_damage_is_named(tmp_path):
     next((tmp_path / FOLDER).glob("policy-*")).write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"damaged: .*policy-"):
         read_decision(tmp_path, 0)
-
-
-def test_a_frame_that_was_damaged_on_the_way_has_no_picture(tmp_path):
-    given = a_decision(0)
-    broken = {**given.state.frames, "cam01": frame("cam01", payload=b"\xff\xd8 nothing")}
-    DecisionWriter(tmp_path).write(replace(given, state=replace(given.state, frames=broken)))
-    assert list(read_decision(tmp_path, 0).images) == ["cam00"]

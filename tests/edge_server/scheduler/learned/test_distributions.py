@@ -12,7 +12,6 @@ from edge_server.scheduler.learned.distributions import (
     most_probable_set,
     omega_entropy,
     omega_log_probabilities,
-    sample_omegas,
     sample_sets,
     set_entropy,
     set_log_probability,
@@ -53,15 +52,6 @@ def test_they_sum_to_one_wherever_the_logits_are(logits):
     logps = every_set(np.array(logits))
     assert np.isfinite(logps).all()
     np.testing.assert_allclose(np.exp(logps).sum(), 1.0, rtol=1e-9)
-
-
-def test_where_all_probabilities_vanish_one_camera_is_used_in_proportion_to_its_odds():
-    logits = np.array([-800.0, -801.0, -802.0, -805.0])
-    single = ALL.sum(axis=1) == 1
-    found = np.exp(every_set(logits))
-    assert found[~single].max() < 1e-200
-    odds = np.exp(logits + 800.0)
-    np.testing.assert_allclose(found[single][::-1], odds / odds.sum(), rtol=1e-9)
 
 
 def test_cameras_that_never_reported_are_no_part_of_it():
@@ -133,16 +123,6 @@ def test_entropy_of_sets_and_of_omegas():
     certain = np.array([[0.0, -1e4, -900.0]])
     assert omega_entropy(np, certain)[0] == 0.0
     assert np.isfinite(omega_log_probabilities(np, certain)).all()
-
-
-def test_omegas_are_drawn_as_often_as_their_probability_says():
-    logits = np.array([0.0, 1.0, -2.0])
-    drawn = sample_omegas(np.tile(logits, (20_000, 1)), np.random.default_rng(7))
-    p = np.exp(omega_log_probabilities(np, logits[None]))[0]
-    seen = np.bincount(drawn, minlength=3) / len(drawn)
-    assert (np.abs(seen - p) < 4.5 * np.sqrt(p * (1 - p) / len(drawn))).all()
-    certain = sample_omegas(np.tile([-1e4, 0.0, -1e4], (100, 1)), np.random.default_rng(8))
-    assert (certain == 1).all()
 
 
 def test_numpy_and_torch_agree():

@@ -77,23 +77,6 @@ def test_where_only_ages_decide_the_age_is_named():
     assert shares["age"] > shares["pose"]
 
 
-def test_a_camera_that_is_much_older_is_the_one_that_spoke_against_itself():
-    learner = Learner(Spec("select", FreshOnes.layout), 0)
-    teach(learner, FreshOnes(), 8)
-    s = state(6, np.random.default_rng(0))
-    s.ages_ms[:] = [60.0, 60.0, 60.0, 2000.0, 60.0, 60.0]
-    found = explain(learner.actor, s, learner.actor.act([s])[0][0])
-    assert np.argmax(np.abs(found.cameras)) == 3
-    assert found.action == "5 of 6 views"
-
-
-def test_the_same_state_has_the_same_explanation():
-    actor, s = untaught("select"), state(9, np.random.default_rng(2), d=3)
-    a, b = (explain(actor, s, actor.act([s])[0][0]) for _ in range(2))
-    np.testing.assert_array_equal(a.cameras, b.cameras)
-    assert a.parts == b.parts
-
-
 # --- regions ----------------------------------------------------------------------------------------
 
 
@@ -112,12 +95,6 @@ def test_the_region_that_differs_is_the_one_that_moved_it():
     found = occlusion_map(actor, s, actor.act([s])[0][0], 1, image, brightness)
     assert np.unravel_index(np.abs(found).argmax(), found.shape) == (5, 2)
     assert np.abs(np.delete(found.ravel(), 5 * 8 + 2)).max() == 0.0
-
-
-def test_a_picture_smaller_than_the_grid_is_no_problem():
-    actor, s = untaught("wait"), state(2, np.random.default_rng(4), d=3)
-    tiny = np.zeros((3, 5, 3), np.uint8)
-    assert np.isfinite(occlusion_map(actor, s, 0, 0, tiny, brightness)).all()
 
 
 def test_a_policy_that_looks_at_no_pictures_says_so():

@@ -45,19 +45,6 @@ def test_omegas_are_learned_in_512_decisions(seed):
     assert regret(learner, Waits()) < 0.02
 
 
-def test_no_fixed_omega_is_as_good_as_what_was_learned():
-    drawn = [Waits().draw(10**6 + i) for i in range(300)]
-    fixed = min(np.mean([d.regret(k) for d in drawn]) for k in range(len(OMEGAS_MS)))
-    assert fixed > 0.04
-
-
-def test_what_cameras_see_is_learned_from_embeddings():
-    problem = Waits(semantic=True)
-    learner = Learner(Spec("threshold", problem.layout, OMEGAS_MS), 0)
-    teach(learner, problem, 8)
-    assert regret(learner, problem) < 0.02
-
-
 def test_a_batch_of_one_decision_learns_against_the_value():
     """Algorithms 1 and 2 update after every slot: centred by its batch, an advantage would be zero."""
     learner = Learner(Spec("wait", Waits().layout, OMEGAS_MS), 0)
@@ -75,21 +62,6 @@ def test_a_flat_network_learns_as_the_thesis_has_it():
     learner = Learner(select(network="flat", cameras=6), 0)
     teach(learner, FreshOnes(), 16)
     assert regret(learner, FreshOnes()) < 0.05
-
-
-def test_what_was_learned_with_six_cameras_holds_for_eleven_and_with_silent_ones():
-    learner = Learner(select(), 0)
-    teach(learner, FreshOnes(), 8)
-    assert regret(learner, FreshOnes(cameras=11)) < 0.03
-    assert regret(learner, FreshOnes(cameras=11, silent=4)) < 0.03
-
-
-def test_the_value_learns_what_a_state_is_worth():
-    learner, problem = Learner(select(), 0), FreshOnes()
-    teach(learner, problem, 12)
-    drawn = [problem.draw(10**6 + i) for i in range(200)]
-    worth = np.array([d.gain(d.best) for d in drawn])
-    assert np.corrcoef(learner.value([d.state for d in drawn]), worth)[0, 1] > 0.8
 
 
 def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not():
@@ -120,14 +92,6 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
 def save(learner, path):
     learner.save(path)
     return path
-
-
-def test_the_actor_of_a_checkpoint_decides_as_its_learner(tmp_path):
-    learner = Learner(select(), 2)
-    teach(learner, FreshOnes(), 2)
-    actor = Actor.load(save(learner, tmp_path / "policy.npz"))
-    s = state(9, np.random.default_rng(3), silent=2)
-    np.testing.assert_array_equal(actor.act([s])[0][0], learner.actor.act([s])[0][0])
 
 
 def test_deciding_needs_no_torch(tmp_path):
@@ -277,22 +241,6 @@ def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
         Actor.load(path)
 
 
-def test_what_only_decides_says_so_to_who_wants_it_to_learn(tmp_path):
-    Learner(select(), 0).actor.save(tmp_path / "policy.npz")
-    with pytest.raises(checkpoint.CheckpointError, match="learning cannot resume from it") as refused:
-        Learner.load(tmp_path / "policy.npz")
-    assert "damaged" not in str(refused.value)
-
-
-def test_diagnostics_say_what_an_update_did():
-    learner, problem = Learner(select(), 0), FreshOnes()
-    diagnostics = learner.update(collect(learner, problem, range(64)))
-    assert diagnostics.reward is not None and diagnostics.dropped == diagnostics.skipped == 0
-    assert diagnostics.steps >= 1 and diagnostics.gradient > 0
-    assert 0.0 <= diagnostics.clipped <= 1.0 and diagnostics.moved >= 0.0
-    assert diagnostics.entropy == pytest.approx(6 * np.log(2), rel=0.1)
-
-
 @pytest.mark.parametrize("spec", [select(start=0.9), Spec("wait", Waits().layout, OMEGAS_MS)], ids=lambda s: s.action)
 def test_the_entropy_bonus_raises_the_entropy(spec):
     """Of equal rewards only the entropy's gradient is left in the policy: its sign decides where it moves."""
@@ -343,12 +291,3 @@ def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
     assert found.policy_loss == pytest.approx(-(1.2 - 2.0) / 2) and found.value_loss == pytest.approx((9 + 1) / 2)
     assert found.moved == pytest.approx(2.0 - 1.0 - np.log(2.0)) and found.clipped == 1.0
     assert (found.steps, found.skipped) == (1, 0)
-
-
-def test_deciding_with_exploring_uses_the_learners_own_stream():
-    a, b = Learner(select(), 4), Learner(select(), 4)
-    states = [state(6, np.random.default_rng(i)) for i in range(20)]
-    b.act(states, explore=False)
-    for x, y in zip(a.act(states), b.act(states)):
-        np.testing.assert_array_equal(x, y)
-    assert not np.array_equal(a.act(states)[0], b.act(states, explore=False)[0])

@@ -30,12 +30,6 @@ def test_the_columns_are_semantics_age_pose_and_the_bit_of_who_reported():
     assert not found[2].any()
 
 
-def test_what_is_not_a_part_has_no_columns():
-    s = state(2, np.random.default_rng(0))
-    assert StateLayout(("age",)).features(s).shape == (2, 2)
-    assert StateLayout(("pose",)).features(s).shape == (2, 7)
-
-
 def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_that_reported():
     rng = np.random.default_rng(1)
     states = []
@@ -83,18 +77,6 @@ def test_a_batch_pads_with_cameras_that_never_reported():
 def test_a_wrong_layout_is_refused_by_name(values, says):
     with pytest.raises(ValueError, match=says):
         StateLayout(**values)
-
-
-def test_a_state_of_the_wrong_shape_is_refused():
-    s = state(3, np.random.default_rng(0), d=4)
-    for wrong in ({"poses": s.poses[:2]}, {"reported": s.reported[:1]}, {"cameras": ("a",)}):
-        with pytest.raises(ValueError, match="state"):
-            replace(s, **wrong)
-    layout = StateLayout(("semantics",), dim=5)
-    with pytest.raises(ValueError, match="width 4, expected 5"):
-        layout.features(s)
-    with pytest.raises(ValueError, match="nothing computes embeddings"):
-        layout.features(replace(s, embeddings=None))
 
 
 # --- observe ----------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ HARD = {
     "only one": from_poses(SAME[:1], LENS),
 }
 hard = pytest.mark.parametrize("candidates", HARD.values(), ids=HARD)
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [pytest.mark.stability, pytest.mark.filterwarnings("error::RuntimeWarning")]
 DOME = half_hemisphere((0, 0, 0), 1.0, LENS, 12)
 
 
