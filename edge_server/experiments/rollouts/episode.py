@@ -273,7 +273,7 @@ class Episode:
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
         self._embeddings = factory.embeddings()
-        self.moments = tuple(self._moment(number) for number in range(setting.decisions))
+        self.points = tuple(self._point(number) for number in range(setting.decisions))
         self._scored: dict[tuple[int, Choice, tuple[str, ...]], dict[str, Outcome]] = {}
 
     def _recorded(self, flush_ns: int | None = None) -> tuple[VirtualDeployment, list[Arrival]]:
@@ -312,12 +312,12 @@ class Episode:
         return self._scored[asked]
 
     def _carried_out(self, number: int, choice: Choice, cameras: tuple[str, ...]) -> dict[str, Outcome]:
-        setting, moment = self._factory.setting, self.moments[number]
-        newest = moment.newest(choice.at_ns)
+        setting, point = self._factory.setting, self.points[number]
+        newest = point.newest(choice.at_ns)
         chosen = [newest[c] for c in choice.cameras]
         views = self._decoded(chosen)
         if not views:
-            waited_ms = (choice.at_ns - moment.now_ns) / 1e6
+            waited_ms = (choice.at_ns - point.now_ns) / 1e6
             nothing = Outcome(**dict.fromkeys(SCORES), aaoi_ms=None, views=0.0, wait_ms=waited_ms)
             return dict.fromkeys(cameras, nothing)
         published_ns = choice.at_ns + setting.compute.charge_ns(setting.steps)
@@ -330,7 +330,7 @@ class Episode:
         field.fit(views, Budget(steps=setting.steps))
         snapshot, truths = field.snapshot(published_ns), self._factory.stage(self.seed).truths
         aaoi_ms = float(np.mean([(published_ns - view.generated_ns) / 1e6 for view in views]))
-        wait_ms = (published_ns - moment.now_ns) / 1e6
+        wait_ms = (published_ns - point.now_ns) / 1e6
         found = {}
         for camera in cameras:
             score = truths[camera].score(snapshot, published_ns)
@@ -338,7 +338,7 @@ class Episode:
             found[camera] = Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
         return found
 
-    def _moment(self, number: int) -> DecisionPoint:
+    def _point(self, number: int) -> DecisionPoint:
         setting, now_ns = self._factory.setting, self.instants_ns[number]
         record = self._recorded(now_ns)[1] if setting.flush else self._record
         cameras = setting.scenario.training
@@ -371,15 +371,15 @@ class Episode:
         """Field state before a decision, independent of all choices."""
         setting, field = self._factory.setting, self._factory.field(self.seed)
         while len(self._warm) <= number:
-            moment = self.moments[len(self._warm)]
+            point = self.points[len(self._warm)]
             # The record has every delivery by then; a decision keeps only each camera's youngest.
-            then_ns = moment.now_ns - round(setting.refresh_ms * 1e6)
+            then_ns = point.now_ns - round(setting.refresh_ms * 1e6)
             if self._warm:
                 field.load_state(self._warm[-1])
             else:
                 field.reset()
             steps = setting.steps if self._warm else setting.warm_steps
-            views = self._decoded(list(_newest(self._record, then_ns, moment.cameras).values()))
+            views = self._decoded(list(_newest(self._record, then_ns, point.cameras).values()))
             if views:
                 field.fit(views, Budget(steps=steps))
             self._warm.append(field.state())

@@ -100,7 +100,7 @@ def rollout(
 def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple[str, ...] | None) -> Run:
     episode = factory.episode(seed)
     decided = []
-    for number in range(len(episode.moments)):
+    for number in range(len(episode.points)):
         outcomes = episode.evaluate(number, choose(policy, episode, number), cameras)
         decided.append(Decided.of_policy(number, outcomes, policy.last_decision))
     return Run(decided)
@@ -109,25 +109,25 @@ def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, camera
 def choose(policy: Policy, episode: Episode, number: int) -> Choice:
     """Plan, wait and select with ``policy`` at a decision, as in the live loop. A policy that would wait past the
     channel's record uses all newest frames at its end."""
-    moment = episode.moments[number]
+    point = episode.points[number]
 
     def epoch(at_ns: int) -> Epoch:
-        newest = moment.newest(at_ns)
+        newest = point.newest(at_ns)
         generated = {c: arrival.generated_ns for c, arrival in newest.items()}
         received = {c: arrival.received_ns for c, arrival in newest.items()}
-        known = at_ns == moment.now_ns
+        known = at_ns == point.now_ns
         return Epoch(
-            at_ns, number, generated, lambda parts=(): moment.state if known else episode.state(newest, at_ns), received
+            at_ns, number, generated, lambda parts=(): point.state if known else episode.state(newest, at_ns), received
         )
 
-    plan = policy.plan(epoch(moment.now_ns))
-    at_ns = min(max(moment.now_ns, plan.wait_until_ns), moment.until_ns)
+    plan = policy.plan(epoch(point.now_ns))
+    at_ns = min(max(point.now_ns, plan.wait_until_ns), point.until_ns)
     cameras = policy.select(epoch(at_ns), plan)
     while not cameras:
-        arrives_ns = moment.next_arrival_ns(at_ns)
+        arrives_ns = point.next_arrival_ns(at_ns)
         if arrives_ns is None:
-            at_ns = moment.until_ns
-            cameras = tuple(moment.newest(at_ns))
+            at_ns = point.until_ns
+            cameras = tuple(point.newest(at_ns))
             break
         at_ns = arrives_ns
         cameras = policy.select(epoch(at_ns), plan)
@@ -213,13 +213,13 @@ def _make_learned(actor: Actor, explore: bool, rng: np.random.Generator) -> Poli
 def choice_of_action(spec: Spec, action: Any, episode: Episode, number: int) -> Choice:
     """The choice of a learner's action: (N,) bool, or an index into the specification's omegas. An empty set uses the
     first frame that arrives."""
-    moment = episode.moments[number]
+    point = episode.points[number]
     if spec.action != "select":
         policy = make_policy(spec.action, spec.omegas_ms[int(action)], np.random.default_rng(0))
         return choose(policy, episode, number)
-    cameras = tuple(c for c, chosen in zip(moment.cameras, action) if chosen)
+    cameras = tuple(c for c, chosen in zip(point.cameras, action) if chosen)
     use_all = make_policy("all", None, np.random.default_rng(0))
-    return Choice(cameras, moment.now_ns) if cameras else choose(use_all, episode, number)
+    return Choice(cameras, point.now_ns) if cameras else choose(use_all, episode, number)
 
 
 # --- on the engine -----------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def _carry_out(job: Job, *, setting: Setting, folders: Folders, makers: Mapping[
 
 def embeddings_seen(seed: int, *, setting: Setting, folders: Folders) -> list[list[float]]:
     """The embeddings of all frames that are newest at the decisions of an episode."""
-    states = [moment.state for moment in _factory(setting, folders).episode(seed).moments]
+    states = [point.state for point in _factory(setting, folders).episode(seed).points]
     return [row for s in states if s.embeddings is not None for row in s.embeddings[s.reported].tolist()]
 
 

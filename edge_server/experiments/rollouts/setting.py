@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from edge_server.config import ComputeConfig, open_embedder, read_config
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -118,7 +119,7 @@ class Setting:
         """Hash of everything that determines an evaluation, except the episode's seed."""
         s = self.scenario
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "scenario"}
-        own["compute"] = dataclasses.astuple(self.compute)
+        own["compute"] = structs.astuple(self.compute)
         parts: list[Any] = [s.seed, s.cameras, s.held_out, s.source, s.channel, s.edge, own]
         return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:24]
 

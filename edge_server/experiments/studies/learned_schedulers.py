@@ -104,13 +104,13 @@ PPO_SELECT = Study(
                 where=where,
             ),
             Claim(
-                "most of what could be won is won: more than half of the way from random to hindsight.",
-                half_way(LEARNED, RANDOM, {"policy": "hindsight"}),
+                "most of what could be won is won: more than half of the way from random to the oracle.",
+                half_way(LEARNED, RANDOM, {"policy": "oracle"}),
                 where=where,
             ),
             Claim(
                 "the best threshold differs between decisions: who knew it beforehand would win.",
-                better({"policy": "hindsight threshold"}, THRESHOLD),
+                better({"policy": "oracle threshold"}, THRESHOLD),
                 where=where,
             ),
         )
@@ -176,7 +176,7 @@ PPO_WAIT = Study(
                 ),
                 Claim(
                     f"{kind}: the best omega differs between decisions: who knew it beforehand would win.",
-                    better({"policy": f"hindsight {kind}"}, best),
+                    better({"policy": f"oracle {kind}"}, best),
                     where=ELSEWHERE,
                 ),
             )

@@ -152,7 +152,7 @@ def _evaluate(
     print(f"  reward {_text(kept['reward'])} on {kept['seeds']} unseen seeds{more}")
     print(f"  over random {_text(kept['over_random'])}")
     print(f"  over the best fixed {kind} ({kept['best_fixed']}) {_text(kept['over_best_fixed'])}")
-    print(f"  share of the way from random to hindsight: {_text(kept['share'])}")
+    print(f"  share of the way from random to the oracle: {_text(kept['share'])}")
     print(f"  {args.out / 'policy.npz'}: edge-server run SCENARIO --policy {BANDIT}{args.out / 'policy.npz'}")
 
 

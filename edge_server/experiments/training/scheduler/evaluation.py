@@ -37,7 +37,7 @@ BASELINE_POLICIES = (
     "freshest-k:12",
     "age-driven",
 )
-LEARNED, HINDSIGHT = "learned", "hindsight"
+LEARNED, ORACLE = "learned", "oracle"
 # Fits of every choice: the choice that is best in one is measured by the other, because the maximum of noisy
 # fits is biased upwards.
 FITS = 2
@@ -74,8 +74,8 @@ class Evaluation:
         """A row for each candidate and seed: the mean ``reward`` of its decisions as ``cameras`` see them, and the
         means of the outcomes; None if a decision lacks a term.
 
-        ``hindsight`` is the best choice of all candidates at each decision, chosen by one fit and measured by
-        another; ``hindsight KIND`` that among the values of a kind. Decisions at which nobody has a reward (nothing
+        ``oracle`` is the best choice of all candidates at each decision, chosen by one fit and measured by
+        another; ``oracle KIND`` that among the values of a kind. Decisions at which nobody has a reward (nothing
         moves in the images that score) are left out for all.
 
         labels: further labels of every row.
@@ -95,8 +95,8 @@ class Evaluation:
         kinds = dict.fromkeys(c.labels["policy"] for c in self.candidates if "value" in c.labels)
         for kind in (None, *kinds):
             of_kind = [v for c, v in zip(self.candidates, values) if kind in (None, c.labels["policy"])]
-            best = _by_seed({at: _hindsight([v[at] for v in of_kind]) for at in values[0]}, scored)
-            found += _rows({**labels, "policy": f"{HINDSIGHT} {kind}" if kind else HINDSIGHT}, {"reward": best})
+            best = _by_seed({at: _oracle([v[at] for v in of_kind]) for at in values[0]}, scored)
+            found += _rows({**labels, "policy": f"{ORACLE} {kind}" if kind else ORACLE}, {"reward": best})
         return found
 
 
@@ -134,7 +134,7 @@ def summary(table: SeedTable, kind: str) -> dict[str, Any]:
     """
     mine, random = (table.runs("reward", policy=name) for name in (LEARNED, "random"))
     best = table.best_runs("reward", False, "value", policy=kind)
-    limit = table.values("reward", policy=HINDSIGHT)
+    limit = table.values("reward", policy=ORACLE)
     curve = table.curve("value", "reward", policy=kind)
     means = {x: interval(values.values()).mean for x, values in curve.items()}
     return {
@@ -145,7 +145,7 @@ def summary(table: SeedTable, kind: str) -> dict[str, Any]:
         "over_best_fixed": difference(mine, best).rounded(6),
         "best_fixed": f"{kind}:{max(means, key=lambda x: means[x]):g}" if means else None,
         "share": share_closed(mine[0], random[0], limit).rounded(6),
-        "knowing_the_best_is_worth": difference(table.runs("reward", policy=f"{HINDSIGHT} {kind}"), best).rounded(6),
+        "knowing_the_best_is_worth": difference(table.runs("reward", policy=f"{ORACLE} {kind}"), best).rounded(6),
         "rewards": {
             " ".join(str(v) for v in values): interval(
                 table.values("reward", **dict(zip(("policy", "value"), values))).values()
@@ -166,7 +166,7 @@ def _rows(labels: Row, values: Mapping[str, PerSeed]) -> list[Row]:
     return [{**labels, "seed": seed, **{name: of.get(seed) for name, of in values.items()}} for seed in seeds]
 
 
-def _hindsight(fits: Sequence[Sequence[float | None]]) -> float | None:
+def _oracle(fits: Sequence[Sequence[float | None]]) -> float | None:
     """Reward of the best of several choices, each of which was fitted twice: the best is chosen by each fit and
     measured by the other, among the choices that have both; None if none has."""
     known = [of for of in fits if len(of) == 2 and None not in of]

@@ -56,7 +56,7 @@ class FitDecision:
     @property
     def state(self) -> State:
         """The state that the decision is made from."""
-        return self.episode.moments[self.number].state
+        return self.episode.points[self.number].state
 
     def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
         """Reward of a real fit, NaN if a term is missing, and its terms."""

@@ -42,14 +42,14 @@ def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) ->
 @pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
 def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
     factory = EpisodeFactory(setting(channel), NOTHING)
-    for moment in factory.episode(11).moments:
+    for point in factory.episode(11).points:
         for wait_ms in (0, 35, 180):
-            at_ns = moment.now_ns + wait_ms * 10**6
+            at_ns = point.now_ns + wait_ms * 10**6
             live = deployed("all", None, 11, 10**13, channel=channel)
             live.run(at_ns / 1e9)
             newest = live.updates.buffer.newest()
             assert newest
-            assert {c: (a.generated_ns, a.received_ns) for c, a in moment.newest(at_ns).items()} == {
+            assert {c: (a.generated_ns, a.received_ns) for c, a in point.newest(at_ns).items()} == {
                 c: (b.generated_ns, b.received_ns) for c, b in newest.items()
             }
 
@@ -66,12 +66,12 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     flush = policy.startswith("wait-flush")
     factory = EpisodeFactory(setting(compute=Compute(5.0), flush=flush), NOTHING)
     episode = factory.episode(5)
-    moment = episode.moments[0]
+    point = episode.points[0]
     choice = choose(named(policy)(np.random.default_rng(0)), episode, 0)
     found = episode.evaluate(0, choice)["cam00"]
     name, _, value = (policy, "", "") if policy.startswith("bandit:") else policy.partition(":")
-    live = deployed(name, float(value) if value else None, 5, moment.now_ns)
-    live.run(moment.now_ns / 1e9 + 1.0)
+    live = deployed(name, float(value) if value else None, 5, point.now_ns)
+    live.run(point.now_ns / 1e9 + 1.0)
     expected = live.publications[0]
     assert set(expected.selected) == set(choice.cameras)
     assert (found.psnr_db, found.psnr_moving_db, found.ssim) == (
@@ -80,16 +80,14 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
         expected.ssim,
     )
     assert found.aaoi_ms == expected.aaoi_ms and found.views == len(expected.selected)
-    assert moment.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
+    assert point.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
 
 
 @pytest.mark.parametrize("scratch", [True, False])
 def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
     factory = EpisodeFactory(setting(scratch=scratch), NOTHING)
     episode = factory.episode(2)
-    asked = [
-        (k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments) for n in (1, 2, 4)
-    ]
+    asked = [(k, Choice(point.cameras[:n], point.now_ns)) for k, point in enumerate(episode.points) for n in (1, 2, 4)]
     forwards = [episode.evaluate(*a) for a in asked]
     fresh = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
     backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
@@ -103,9 +101,9 @@ def test_a_warm_field_remembers_what_a_new_one_cannot_know():
     for scratch in (True, False):
         factory = EpisodeFactory(setting(scratch=scratch, warm_steps=60, steps=2), NOTHING)
         for seed in range(3):
-            for moment in factory.episode(seed).moments:
-                choice = dataclasses.replace(one, at_ns=moment.now_ns)
-                outcome = factory.episode(seed).evaluate(moment.number, choice)
+            for point in factory.episode(seed).points:
+                choice = dataclasses.replace(one, at_ns=point.now_ns)
+                outcome = factory.episode(seed).evaluate(point.number, choice)
                 found.setdefault(scratch, []).append(outcome["cam00"].psnr_db)
     assert np.mean(found[False]) > np.mean(found[True]) + 1.0
 
@@ -119,33 +117,33 @@ def test_instants_lie_on_the_grid_within_the_span_and_differ_between_seeds(facto
 
 
 def test_a_state_has_ages_and_poses_of_who_reported(factory):
-    moment = factory.episode(0).moments[1]
-    newest = moment.newest(moment.now_ns)
-    assert list(moment.state.reported) == [c in newest for c in moment.cameras]
-    for row, camera in enumerate(moment.cameras):
+    point = factory.episode(0).points[1]
+    newest = point.newest(point.now_ns)
+    assert list(point.state.reported) == [c in newest for c in point.cameras]
+    for row, camera in enumerate(point.cameras):
         if camera in newest:
-            assert moment.state.ages_ms[row] == (moment.now_ns - newest[camera].generated_ns) / 1e6
-    poses = moment.state.poses[moment.state.reported]
+            assert point.state.ages_ms[row] == (point.now_ns - newest[camera].generated_ns) / 1e6
+    poses = point.state.poses[point.state.reported]
     assert np.isfinite(poses).all() and len(np.unique(poses, axis=0)) == len(poses)
-    assert moment.state.embeddings is None
+    assert point.state.embeddings is None
 
 
 def test_actions_of_a_learner_mean_what_the_live_policies_do(factory):
     episode = factory.episode(4)
-    moment = episode.moments[0]
+    point = episode.points[0]
     spec = Spec("threshold", omegas_ms=(40.0, 90.0))
     live = choose(named("threshold:90")(np.random.default_rng(0)), episode, 0)
     assert choice_of_action(spec, 1, episode, 0) == live
     wait = choice_of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, episode, 0)
-    assert wait.at_ns >= moment.now_ns + 50 * 10**6
+    assert wait.at_ns >= point.now_ns + 50 * 10**6
     picked = choice_of_action(Spec("select"), np.array([True, False, True, False]), episode, 0)
-    assert picked.cameras == (moment.cameras[0], moment.cameras[2]) and picked.at_ns == moment.now_ns
+    assert picked.cameras == (point.cameras[0], point.cameras[2]) and picked.at_ns == point.now_ns
 
 
 def test_where_nothing_arrives_all_there_is_is_used_at_the_end(factory):
     episode = factory.episode(4)
     late = choose(make_policy("wait", 1e6, np.random.default_rng(0)), episode, 0)
-    assert late.at_ns == episode.moments[0].until_ns and late.cameras
+    assert late.at_ns == episode.points[0].until_ns and late.cameras
 
 
 def test_a_learned_policy_that_waits_for_a_first_frame_sees_the_state_of_that_instant():
@@ -153,9 +151,9 @@ def test_a_learned_policy_that_waits_for_a_first_frame_sees_the_state_of_that_in
     learner = Learner(Spec("select", StateLayout(("age",)), hidden=8), seed=4)
     policy = BanditPolicy(learner.actor, "learned", np.random.default_rng(0))
     episode = factory.episode(2)
-    assert not episode.moments[0].state.reported.any()
+    assert not episode.points[0].state.reported.any()
     choice = choose(policy, episode, 0)
-    assert choice.cameras and choice.at_ns > episode.moments[0].now_ns
+    assert choice.cameras and choice.at_ns > episode.points[0].now_ns
     assert policy.last_decision is not None and policy.last_decision.state.reported.sum() == len(choice.cameras)
 
 

@@ -36,7 +36,7 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
     assert runs == rollout(EpisodeFactory(setting(), NOTHING), 3, learned(actor, explore=True), 3)
     assert len({str([d.action for d in run.decided]) for run in runs}) > 1
     assert len({str([d.features for d in run.decided]) for run in runs}) == 1
-    state = factory.episode(3).moments[1].state
+    state = factory.episode(3).points[1].state
     one = runs[0].decided[1]
     assert one.features == SELECT.layout.features(state).tolist() and one.slot == 1
     greedy = rollout(factory, 3, learned(actor), 2)

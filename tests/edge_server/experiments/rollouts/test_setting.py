@@ -16,15 +16,15 @@ from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, reported,
 def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
     """What using everything comes to at the first decision of an episode."""
     episode = EpisodeFactory(what, NOTHING).episode(seed)
-    moment = episode.moments[0]
-    return episode.evaluate(0, Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns), (camera,))[camera]
+    point = episode.points[0]
+    return episode.evaluate(0, Choice(tuple(point.newest(point.now_ns)), point.now_ns), (camera,))[camera]
 
 
 def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
     what = reported()
     assert what.rewarding == ("cam00",) and what.judging == ("cam04",)
-    moment = EpisodeFactory(what, NOTHING).episode(5).moments[0]
-    assert moment.cameras == ("cam01", "cam02", "cam03")
+    point = EpisodeFactory(what, NOTHING).episode(5).points[0]
+    assert point.cameras == ("cam01", "cam02", "cam03")
     rewarded, judged = one_of(what), one_of(what, camera="cam04")
     turned = dataclasses.replace(what, report=("cam00",))
     assert one_of(turned, camera="cam04") == judged and one_of(turned) == rewarded
@@ -68,8 +68,8 @@ def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
     """Frames of two episodes have the same numbers."""
     what = setting(motions=True, parts=("semantics", "age"), decisions=1)
     factory = EpisodeFactory(what, NOTHING)
-    after_others = [factory.episode(seed).moments[0].state.embeddings for seed in (1, 2)][1]
-    alone = EpisodeFactory(what, NOTHING).episode(2).moments[0].state.embeddings
+    after_others = [factory.episode(seed).points[0].state.embeddings for seed in (1, 2)][1]
+    alone = EpisodeFactory(what, NOTHING).episode(2).points[0].state.embeddings
     assert after_others.any() and np.array_equal(after_others, alone)
 
 
@@ -88,10 +88,10 @@ def test_a_silent_camera_never_reports_and_is_another_setting():
     assert what.key != setting().key
     factory = EpisodeFactory(what, NOTHING)
     for seed in range(3):
-        for moment in factory.episode(seed).moments:
-            assert moment.cameras == ("cam01", "cam02", "cam03", "cam04")
-            assert not any(a.camera == "cam02" for a in moment.arrivals)
-            assert not moment.state.reported[1] and np.isnan(moment.state.ages_ms[1])
-            assert moment.state.reported[[0, 2, 3]].all()
+        for point in factory.episode(seed).points:
+            assert point.cameras == ("cam01", "cam02", "cam03", "cam04")
+            assert not any(a.camera == "cam02" for a in point.arrivals)
+            assert not point.state.reported[1] and np.isnan(point.state.ages_ms[1])
+            assert point.state.reported[[0, 2, 3]].all()
     with pytest.raises(ValueError, match="not a training camera"):
         setting(silent=("cam00",))

@@ -65,7 +65,7 @@ def test_figure_5_9_holds_if_and_only_if_what_was_learned_is_better(level, said)
     baselines = dict.fromkeys(BASELINE_POLICIES, 0.2)
     found = judge(
         make_study("ppo-select"),
-        table_of({**baselines, **FIXED, "learned": level, "hindsight": 1.0, "hindsight threshold": 0.6}),
+        table_of({**baselines, **FIXED, "learned": level, "oracle": 1.0, "oracle threshold": 0.6}),
     )
     assert answers([v for v in found if "differs between decisions" not in v.claim]) == {said}
     assert "holds" not in answers(found, "differs between decisions")
@@ -74,13 +74,13 @@ def test_figure_5_9_holds_if_and_only_if_what_was_learned_is_better(level, said)
 
 @pytest.mark.parametrize(("level", "said"), [(3.0, "holds"), (-3.0, "does not hold")])
 def test_figure_6_8_holds_if_and_only_if_what_was_learned_is_better(level, said):
-    hindsight = {"hindsight wait": 0.6, "hindsight threshold": 0.6}
+    oracle = {"oracle wait": 0.6, "oracle threshold": 0.6}
     both = {"learned wait": level + 0.2, "learned threshold": level}
-    found = judge(make_study("ppo-wait"), table_of({**FIXED, **hindsight, **both}))
+    found = judge(make_study("ppo-wait"), table_of({**FIXED, **oracle, **both}))
     assert answers(found, "best fixed omega") == answers(found, "uniformly random") == {said}
     assert answers(found, "waiting beats thresholds") == {"holds"}
     turned = {"learned wait": level, "learned threshold": level + 0.2}
-    found = judge(make_study("ppo-wait"), table_of({**FIXED, **hindsight, **turned}))
+    found = judge(make_study("ppo-wait"), table_of({**FIXED, **oracle, **turned}))
     assert answers(found, "waiting beats thresholds") == {"does not hold"}
 
 

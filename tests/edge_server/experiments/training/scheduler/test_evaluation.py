@@ -1,4 +1,4 @@
-"""Hindsight does not mistake luck for something to be won, and seeds without a value are not counted."""
+"""The oracle does not mistake luck for something to be won, and seeds without a value are not counted."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def table_of(found: Evaluation) -> SeedTable:
 def gain(table: SeedTable) -> Interval:
     """What it would be worth to know the best threshold of each decision."""
     best = table.best_runs("reward", False, "value", policy="threshold")
-    return difference(table.runs("reward", policy="hindsight threshold"), best)
+    return difference(table.runs("reward", policy="oracle threshold"), best)
 
 
 def test_luck_is_not_something_to_be_won_and_a_real_difference_is():
@@ -79,7 +79,7 @@ def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
         )
     )
     # The first fit prefers a, which the second has at 0.5; the second prefers b, which the first has at 1.
-    assert found.values("reward", policy="hindsight") == {0: pytest.approx(0.75)}
+    assert found.values("reward", policy="oracle") == {0: pytest.approx(0.75)}
     assert found.values("reward", policy="a") == {0: 1.75} and found.values("reward", policy="c") == {0: None}
 
 
@@ -123,7 +123,7 @@ def test_every_fit_is_scored_once_by_all_held_out_cameras(tmp_path):
     assert levels[0] != levels[1] and None not in {*levels[0].values(), *levels[1].values()}
     kept = summary(tables["cam04"], "threshold")
     assert kept["seeds"] == 3 and kept["best_fixed"].startswith("threshold:")
-    assert {"random", "all", "threshold 40.0", "learned", "hindsight"} <= kept["rewards"].keys()
+    assert {"random", "all", "threshold 40.0", "learned", "oracle"} <= kept["rewards"].keys()
     before = (tmp_path / "known.jsonl").read_bytes()
     again = Engine(tmp_path / "known.jsonl", threads=1, say=lambda line: None)
     assert evaluate(reported(), NOTHING, again, seeds(0, "test", 3), candidates) == found

@@ -220,9 +220,9 @@ def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Pa
 
 def test_other_learners_see_the_same_decisions_as_a_problem_and_none_that_policies_are_tested_on(monkeypatch):
     problem = FitProblem(setting(), CONFIG.spec, REWARD)
-    moments = EpisodeFactory(setting(), NOTHING).episode(seeds(0, "train", 1, 4)[0]).moments
+    points = EpisodeFactory(setting(), NOTHING).episode(seeds(0, "train", 1, 4)[0]).points
     decision = problem.draw(4 * setting().decisions + 1)
-    assert np.array_equal(decision.state.ages_ms, moments[1].state.ages_ms)
+    assert np.array_equal(decision.state.ages_ms, points[1].state.ages_ms)
     reward, terms = decision.reward(np.array([True, False, True, True]))
     assert reward == pytest.approx(sum(terms.values())) and set(terms) == {"psnr", "ssim"}
     batch = collect(Learner(CONFIG.spec, 0), problem, range(6))
@@ -251,7 +251,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     learner = Learner.load(out / "policy.npz")
     assert learner.reward_fields["name"] == "corrected" and learner.reward_fields["distance"] == 0.0
     found = {row["policy"] for row in csv.DictReader((out / "evaluation.csv").open())}
-    assert {"random", "all", "threshold", "learned", "hindsight"} <= found
+    assert {"random", "all", "threshold", "learned", "oracle"} <= found
     make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
     before = (out / "evaluations.jsonl").read_text()
     assert main(words) == 0  # finished: nothing is left to be evaluated
