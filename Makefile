@@ -135,7 +135,7 @@ lock: .venv/.ok-venv  ## resolve the images' packages anew into deploy/locks; th
 	cd deploy/locks && \
 	  $(LOCK) ../../pyproject.toml --extra edge --extra embed --override ../../.venv/without-torch.txt -o edge.txt && \
 	  $(LOCK) ../../pyproject.toml -c edge.txt -o camera.txt && \
-	  echo "$(TORCH)" | $(LOCK) - -c edge.txt -o torch-cuda.txt && \
+	  echo "$(subst ==,===,$(TORCH))" | $(LOCK) - -c edge.txt -o torch-cuda.txt && \
 	  echo "$(subst ==,===,$(TORCH))+cpu" | $(LOCK) - -c edge.txt -o torch-cpu.txt && \
 	  ../../$(PY) -c 'import tomllib; print(*tomllib.load(open("../../pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
 	  $(LOCK) - -o build.txt

@@ -32,7 +32,7 @@ def pixels(camera_to_world: np.ndarray, lens: Pinhole, points: np.ndarray = sets
     return lens.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
 
-@pytest.mark.parametrize("form", ["colmap text", "colmap binary", "transforms"])
+@pytest.mark.parametrize("form", ["colmap", "transforms"])
 def test_exports_read_back_to_the_pixel(tmp_path, form):
     of = shots()
     write_images(tmp_path / "images", of)
@@ -40,7 +40,7 @@ def test_exports_read_back_to_the_pixel(tmp_path, form):
         write_transforms(tmp_path, of)
     else:
         cloud = Cloud(sets.POINTS, np.zeros((200, 3), np.uint8), np.ones((200, len(of)), np.bool_))
-        write_model(tmp_path / "sparse/0", of, cloud, binary=form.endswith("binary"))
+        write_model(tmp_path / "sparse/0", of, cloud)
     _, dataset = open_dataset(tmp_path)
     assert len(dataset) == len(of)
     for shot, record in zip(of, dataset):
