@@ -110,7 +110,7 @@ def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) 
     assert mean_psnr(field, VIEWS) > 15.0
 
 
-@pytest.mark.parametrize(("kind", "damage"), product(KINDS, (_overflow, _saturate)))
+@pytest.mark.parametrize(("kind", "damage"), [*product(KINDS, (_overflow, _saturate))])
 def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[Any], None]) -> None:
     """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
     field = tiny(kind)
