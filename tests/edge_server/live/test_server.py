@@ -16,6 +16,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
+from edge_server.fields.registry import make_field
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import frame as wire
@@ -198,6 +199,8 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
 
 def test_a_camera_that_moves_begins_the_field_anew_with_keyframes_and_a_resumed_run_knows_it(serve, tmp_path):
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
+    for layers in (True, False):  # compiling may take longer than the test waits for anything
+        make_field("splat", {**small, "layers": layers}).warm_up()
     made = tiny_scenario(tmp_path, field="splat", field_options=small)
     server, port, thread = serve(made)
     assert server.state.chosen == (
