@@ -63,7 +63,6 @@ _SIDE_BY_SIDE = (
     "edge_server/viewpoints",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
     "fuzz",
-    "stability",
     "test_architecture.py",
     "test_lazy_imports.py",
 )
