@@ -48,7 +48,7 @@ def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeplo
 def test_what_a_crashed_process_held_is_gone_and_accounted_for(tmp_path: Path) -> None:
     deployment = run(tmp_path, CRASHES)
     assert deployment.restarts == {"node": 1, "emulator": 1, "edge": 1}
-    sessions = {f.frame.session for f in deployment.updates.buffer.newest().values()}
+    sessions = {f.session for f in deployment.updates.buffer.newest().values()}
     assert sessions == {"restart-1"}
     assert deployment.really["broken"] > 0, "the edge was away"
     assert deployment.updates.start_ns > 10**9 > deployment.publications[0].published_ns

@@ -63,7 +63,7 @@ def _render(
         snapshot.encoding,
         snapshot.levels,
         snapshot.net,
-        snapshot.harmonics,
+        snapshot.settings.harmonics,
         snapshot.background,
         np.empty((1, int(snapshot.net.widths.sum()), SAMPLE_BATCH), np.float32),
         x,
