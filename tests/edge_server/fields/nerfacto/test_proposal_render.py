@@ -86,7 +86,7 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: NerfactoSnapshot) ->
         way /= np.linalg.norm(way, axis=-1, keepdims=True)
         at, d = torch.as_tensor(places, dtype=torch.float64), torch.as_tensor(way, dtype=torch.float64)
         raw = mlp(snapshot.net.widths.tolist(), params, encode(grid, snapshot.levels, at))
-        sigma, color = shade(raw, snapshot.harmonics, d)
+        sigma, color = shade(raw, snapshot.settings.harmonics, d)
         weight, left = ray_weights(sigma[None], torch.as_tensor(delta, dtype=torch.float64)[None])
         back = torch.as_tensor(snapshot.background, dtype=torch.float64)
         expected = (weight[0, :, None] * color).sum(dim=0) + left[0] * back
