@@ -72,11 +72,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--seeds", default="2,4,7,11,23,89", metavar="A..B", help="seeds of -m chaos, or numbers [%(default)s]"
     )
+    parser.addoption(
+        "--slow-part",
+        default="1/1",
+        metavar="K/N",
+        help="of the tests marked slow, every N-th from the K-th [%(default)s]",
+    )
     parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     tests = ROOT / "tests"
+    part, parts = map(int, config.getoption("--slow-part").split("/"))
+    slow = sorted(item.nodeid for item in items if item.get_closest_marker("slow") is not None)
+    left_out = set(slow) - set(slow[part - 1 :: parts])
+    if left_out:
+        config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left_out])
+        items[:] = [item for item in items if item.nodeid not in left_out]
     for item in items:
         apart = any(item.path.is_relative_to(tests / place) for place in _SIDE_BY_SIDE)
         if apart and item.get_closest_marker("alone") is None:
