@@ -73,10 +73,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--seeds", default="2,4,7,11,23,89", metavar="A..B", help="seeds of -m chaos, or numbers [%(default)s]"
     )
     parser.addoption(
-        "--slow-part",
-        default="1/1",
-        metavar="K/N",
-        help="of the tests marked slow, every N-th from the K-th [%(default)s]",
+        "--slow-part", default="1/1", metavar="K/N", help="of the slow tests, every N-th from the K-th [%(default)s]"
     )
     parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
