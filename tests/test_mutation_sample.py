@@ -25,9 +25,9 @@ def test_an_edit_changes_one_line_of_what_is_computed(monkeypatch, tmp_path):
     monkeypatch.setattr(mutation_sample, "ROOT", tmp_path)
     texts = {edit.text() for edits in places("some.py").values() for edit in edits}
     assert texts == {
-        "some.py:5: return a + b  ->  return a - b",
-        "some.py:2: if not a:  ->  if  a:",
-        "some.py:2: if not a:  ->  if not not a:",
+        "some.py:8: return a + b  ->  return a - b",
+        "some.py:5: if not a:  ->  if  a:",
+        "some.py:5: if not a:  ->  if not not a:",
     }
 
 

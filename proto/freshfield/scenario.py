@@ -141,6 +141,8 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     data: the value of the YAML document. file: named in errors. seed: replaces that of ``data``.
     Raises ScenarioError.
     """
+    if seed is not None and isinstance(data, dict):
+        data = {**data, "seed": seed}
     file_settings = read_settings(_File, data, f"{file}: ")
     found = file_settings.cameras
     if bool(found.ids) == bool(found.count):
@@ -159,7 +161,7 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     return Scenario(
         path=file,
         name=file_settings.name or file.stem,
-        seed=file_settings.seed if seed is None else seed,
+        seed=file_settings.seed,
         cameras=ids,
         held_out=tuple(dict.fromkeys(found.held_out)),
         description=file_settings.description,

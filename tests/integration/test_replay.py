@@ -38,7 +38,7 @@ pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 from freshfield.session.reader import Session
 from freshfield.session.writer import SessionWriter
 
-EDGE = {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
+EDGE = {"field": "ngp", "field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
 
 
 CAMERAS = {"count": 3, "held_out": ["cam00"]}
