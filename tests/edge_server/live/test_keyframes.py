@@ -150,9 +150,3 @@ def _update(u, k):
     views, report = u.fit(u.select(u.plan(k * 10**9), k * 10**9), Budget(steps=1))
     assert report.refused == ("hand",)  # without "hand#0", an earlier viewpoint
     return views
-
-
-@pytest.mark.parametrize("wrong", [{"most": 0}, {"apart_m": -1.0}, {"apart_deg": -1.0}])
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"most|negative"):
-        KeyframesConfig(**wrong)
