@@ -18,7 +18,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,7 +111,6 @@ class ArmStream:
     interpolate: interpolate between two samples; otherwise take the nearest one.
     max_gap_ms: largest distance of an instant from a sample.
     stale_s: reconnect after so many seconds without a new state.
-    on_sample: called from the stream's thread with the stamp (ns) and joints (6,) of every sample.
     """
 
     def __init__(
@@ -123,12 +121,11 @@ class ArmStream:
         interpolate: bool = True,
         max_gap_ms: float = 20.0,
         stale_s: float = STALE_S,
-        on_sample: Callable[[int, Joints], None] | None = None,
     ) -> None:
         self.host, self.stale_s = host, stale_s
         self.trouble = "not connected yet"
         self.connections = 0
-        self._clock, self._on_sample = clock, on_sample
+        self._clock = clock
         self._frequency_hz, self._interpolate = frequency_hz, interpolate
         self._samples = SampleBuffer[Joints](interpolate_joints if interpolate else None, round(max_gap_ms * 1e6))
         self._first_sample = threading.Event()
@@ -227,10 +224,7 @@ class ArmStream:
                     if stamp_s < last_s:
                         clock = ArrivalClock()  # the controller was restarted
                     last_s = stamp_s
-                    t_ns, angles = clock.host_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
-                    self._samples.add(t_ns, angles)
-                    if self._on_sample is not None:
-                        self._on_sample(t_ns, angles)
+                    self._samples.add(clock.host_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints))
                     self._check_modes(mode, safety)
                 if whole and not received:
                     received, patience_s = True, self.stale_s

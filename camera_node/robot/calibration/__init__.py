@@ -5,10 +5,7 @@ A node that streams runs none of this. It loads the files that these commands wr
 
 from __future__ import annotations
 
-# Defaults of the hand-eye calibration, here because the command line shows them without scipy.
-DEFAULT_METHOD = "refined"
-MAX_GAP_S = 0.05  # between a target pose and the nearest flange pose that it is paired with
-WANT_MM = 0.5  # a guided session ends when the standard deviation of the translation is below this
+DEFAULT_METHOD = "refined"  # here because the command line shows it without scipy
 
 
 class CalibrationError(ValueError):

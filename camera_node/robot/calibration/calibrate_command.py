@@ -7,12 +7,9 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, WANT_MM, CalibrationError
-
-if TYPE_CHECKING:
-    from camera_node.robot.calibration.hand_eye.calibrate import Calibration
+from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
 
 EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
@@ -20,7 +17,6 @@ EXAMPLES = """examples:
   camera-node calibrate intrinsics --live bench.yaml --camera hand --board charuco:7x5:30mm:22mm
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
   camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [flange, target] pairs
-  camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
 """
 
@@ -32,7 +28,6 @@ input, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the flange's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], meters and radians)
   --pairs FILE   JSON list of [flange in base, target in camera], 4 x 4 each
-  --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, meters); the time offset is estimated too
   --live SCENARIO --camera ID   guided session: move the arm, hold still; it says which poses are missing and
                  when there are enough. Flange poses come from the camera's source (without hand_eye)
 """
@@ -51,10 +46,9 @@ BOARD = (
 _GOES_WITH = {
     "board": ("folder", "live"),
     "lens": ("folder", "live"),
-    "max_gap_ms": ("hand", "live"),
-    **dict.fromkeys(("camera", "data", "want_mm", "moving", "samples", "preview", "seconds"), ("live",)),
+    **dict.fromkeys(("camera", "data", "seconds"), ("live",)),
 }
-_INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
+_INPUT_NAMES = {"folder": "FOLDER", "live": "--live SCENARIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,58 +74,37 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and flange poses, see above")
     add("--pairs", type=Path, metavar="FILE", help="pairs of poses, JSON")
-    add("--hand", type=Path, metavar="CSV", help="stream of flange poses")
-    add("--target", type=Path, metavar="CSV", help="stream of target poses in the camera")
-    add("--live", metavar="SCENARIO", help="guided session with a camera of this scenario")
     add("--board", metavar="SPEC", help=BOARD)
     lens = "intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]"
     add("--lens", type=Path, metavar="FILE", help=lens)
     add("--eye-to-hand", action="store_true", help="the camera stands still, the flange holds the target")
     methods = "tsai, park, horaud, andreff, daniilidis or refined [%(default)s]"
     add("--method", default=DEFAULT_METHOD, metavar="NAME", help=methods)
-    gap = f"largest time from a target pose to a flange pose of a stream [{MAX_GAP_S * 1e3:g}]"
-    add("--max-gap-ms", type=float, metavar="MS", help=gap)
-    printed = "print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}"
-    add("--json", action="store_true", help=printed)
+    add("--json", action="store_true", help="print {transform, residual_mm, residual_deg, method, std_mm, std_deg}")
     out = "file to write, for source.arm.cameras or source.trajectory.hand_eye"
     add("--out", type=Path, metavar="FILE.yaml", help=out)
-    figure = "figure to write: residuals, rotation axes, scatter of the target"
-    add("--plot", type=Path, metavar="FILE.png", help=figure)
-    live = _add_live_options(parser)
-    live.add_argument("--camera", metavar="ID", help="camera of the scenario")
-    want = f"end when the standard deviation of the position is below this [{WANT_MM:g}]"
-    live.add_argument("--want-mm", type=float, metavar="MM", help=want)
-    moving = (
-        "also take pictures while the arm moves; with an arm, the time offset between its stamps and the "
-        "camera's is estimated from the motion"
-    )
-    live.add_argument("--moving", action="store_true", help=moving)
-    samples = "write each sample, as --pairs reads it; continues from those of an earlier session"
-    live.add_argument("--samples", type=Path, metavar="FILE", help=samples)
+    _add_live(parser)
+    add("--camera", metavar="ID", help="camera of the scenario --live")
 
 
 def _add_intrinsics(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures of the target")
-    add("--live", metavar="SCENARIO", help="guided session with a camera of this scenario")
     add("--board", required=True, metavar="SPEC", help=BOARD)
     camera = "camera of --live, and its name in the file [%(default)s]"
     add("--camera", dest="name", default="cam00", metavar="ID", help=camera)
     out = "calibration JSON to write, as source kinds camera and video read it"
     add("--out", type=Path, metavar="FILE", help=out)
     add("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
-    moving = "also take pictures while the target moves; needs short exposures"
-    _add_live_options(parser).add_argument("--moving", action="store_true", help=moving)
+    _add_live(parser)
 
 
-def _add_live_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Add the options of every guided session. Returns their group."""
-    live = parser.add_argument_group("with --live")
-    live.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    preview = "keep the newest picture, with the corners found, in this file"
-    live.add_argument("--preview", type=Path, metavar="FILE.png", help=preview)
-    live.add_argument("--seconds", type=float, metavar="S", help="end the session after S seconds")
-    return live
+def _add_live(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a guided session."""
+    add = parser.add_argument_group("guided session").add_argument
+    add("--live", metavar="SCENARIO", help="take pictures with a camera of this scenario")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seconds", type=float, metavar="S", help="end the session after S seconds")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -149,84 +122,73 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
+def _require_one_input(args: argparse.Namespace, *inputs: str) -> None:
+    """Raise CalibrationError unless one of ``inputs`` is given, with options that go with it."""
+    given = [name for name in inputs if getattr(args, name) is not None]
+    if len(given) != 1:
+        names = {**_INPUT_NAMES, "pairs": "--pairs FILE"}
+        raise CalibrationError(f"expected one of {', '.join(names[name] for name in inputs)}")
+    for option, goes_with in _GOES_WITH.items():
+        if getattr(args, option, None) is not None and given[0] not in goes_with:
+            places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
+            raise CalibrationError(f"--{option}: goes with {places}")
+
+
 def _hand_eye(args: argparse.Namespace) -> int:
-    given = {name for name in ("folder", "pairs", "hand", "target", "live") if getattr(args, name) is not None}
-    if given not in ({"folder"}, {"pairs"}, {"hand", "target"}, {"live"}):
-        raise CalibrationError("expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO")
-    _check_options(args, given)
-    args.max_gap_ms = MAX_GAP_S * 1e3 if args.max_gap_ms is None else args.max_gap_ms
-    args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
-    from camera_node.robot.calibration.hand_eye import report
-    from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS
+    _require_one_input(args, "folder", "pairs", "live")
+    from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 
     if args.method not in ALL_METHODS:
         raise CalibrationError(f"--method: expected one of {', '.join(ALL_METHODS)}")
-    found = _calibrate(args)
+    found = calibrate(_samples(args), args.method)
     if args.json:
         for warning in found.warnings:
             print(f"note: {warning}", file=sys.stderr)
     # Print first: the result is not lost if a file cannot be written.
-    print(json.dumps(found.to_dict()) if args.json else report.show(found), flush=True)
+    print(json.dumps(found.to_dict()) if args.json else found.show(), flush=True)
     if args.out is not None:
-        report.write_yaml(found, args.out)
-    if args.plot is not None:
-        report.plot(found, args.plot)
+        found.write(args.out)
     return 0
 
 
-def _check_options(args: argparse.Namespace, given: set[str]) -> None:
-    """Raise CalibrationError for an option that goes with none of the inputs ``given``."""
-    for option, goes_with in _GOES_WITH.items():
-        if getattr(args, option, None) not in (None, False) and not given & set(goes_with):
-            places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
-            raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
-
-
-def _calibrate(args: argparse.Namespace) -> Calibration:
-    from camera_node.config import MAX_GAP_MS
+def _samples(args: argparse.Namespace) -> Any:
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
     from camera_node.robot.calibration import inputs
-    from camera_node.robot.calibration.hand_eye.calibrate import calibrate, calibrate_tracks
-    from camera_node.robot.calibration.hand_eye.session import calibrate_live
     from camera_node.robot.calibration.targets import parse_target
 
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
-        return calibrate(inputs.read_pairs(args.pairs, setup), args.method)
-    if not 0 < args.max_gap_ms <= MAX_GAP_MS:
-        raise CalibrationError(f"--max-gap-ms: expected a positive number up to {MAX_GAP_MS:.0f}")
-    if args.hand is not None:
-        flange, target = inputs.read_track(args.hand), inputs.read_track(args.target)
-        return calibrate_tracks(flange, target, setup, args.method, args.max_gap_ms / 1e3)
+        return inputs.read_pairs(args.pairs, setup)
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")
     board = parse_target(args.board)
     lens = None if args.lens is None else inputs.read_lens(args.lens)
     if args.live is not None:
+        from camera_node.robot.calibration.guided import live_samples
+
         if args.camera is None:
             raise CalibrationError("--camera ID: say which of the scenario's cameras")
-        return calibrate_live(args, board, lens, setup)
+        return live_samples(args, board, lens, setup)
     samples, unused = inputs.read_visp_folder(args.folder, board, lens, setup, _print_progress)
     for name, why in unused.items():
         print(f"{name}: {why}", file=sys.stderr)
-    return calibrate(samples, args.method)
+    return samples
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
-    if (args.folder is None) == (args.live is None):
-        raise CalibrationError("expected one of FOLDER, --live SCENARIO")
+    _require_one_input(args, "folder", "live")
     from camera_node.robot.calibration import inputs
     from camera_node.robot.calibration.lens_calibration import calibrate_lens
-    from camera_node.robot.calibration.lens_session import calibrate_live
     from camera_node.robot.calibration.targets import parse_target
     from freshfield import files
 
     board = parse_target(args.board)
     if args.live is not None:
+        from camera_node.robot.calibration.guided import live_lens
+
         args.camera = args.name
-        lens = calibrate_live(args, board)
+        lens = live_lens(args, board)
     else:
-        _check_options(args, {"folder"})
         found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, _print_progress)
         lens = calibrate_lens(found, size, unused)
     data = lens.to_json(args.name)

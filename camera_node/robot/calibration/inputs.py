@@ -1,18 +1,15 @@
-"""Input of a calibration: images with a target, ViSP's folders, pose pairs as JSON, stamped poses as CSV, lenses."""
+"""Input of a calibration: images with a target, ViSP's folders, pose pairs as JSON, lenses."""
 
 from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from camera_node.pose.providers import read_samples
 from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
@@ -24,30 +21,6 @@ from freshfield.geometry import Pinhole, se3, so3_exp
 from freshfield.untrusted import read_yaml
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-
-
-@dataclass(frozen=True)
-class Track:
-    """A stream of poses. times_ns: (N,), increasing. poses: (N, 4, 4)."""
-
-    times_ns: NDArray[np.int64]
-    poses: Array
-
-
-def sorted_track(times_ns: Sequence[int], poses: Sequence[Array], what: str) -> Track:
-    """Sort poses (4, 4) by stamp into a track; of equal stamps the first counts. what: name of the poses in
-    messages. Raises CalibrationError for fewer than two."""
-    times, first = np.unique(np.array(times_ns, dtype=np.int64), return_index=True)
-    if len(times) < 2:
-        raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving arm")
-    return Track(times, np.array(poses)[first])
-
-
-def read_track(file: Path) -> Track:
-    """Read poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, meters), with or without a header, and sort them by stamp.
-    Raises TrajectoryError and CalibrationError."""
-    times, poses = read_samples(file)
-    return sorted_track(times, [pose.matrix() for pose in poses], f"poses in {file}")
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
@@ -67,11 +40,6 @@ def read_pairs(file: Path, setup: str) -> Samples:
                 f"{file}: pair {k + 1}: expected [flange in base, target in camera]: {error}"
             ) from None
     return Samples(np.reshape(flanges, (-1, 4, 4)), np.reshape(targets, (-1, 4, 4)), setup)
-
-
-def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
-    """The JSON that ``read_pairs`` reads."""
-    return [[flange.tolist(), target.tolist()] for flange, target in zip(samples.flange, samples.target)]
 
 
 def read_visp_pose(file: Path) -> Array:

@@ -1,19 +1,29 @@
-"""Hand-eye calibration from samples or streams by every method, with uncertainty and warnings."""
+"""Hand-eye calibration by every method, with uncertainty and warnings, and the YAML that the node loads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
-from camera_node.robot.arm.hand_eye_mount import MAX_OFFSET_S
-from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, CalibrationError
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
+from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
 from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
-from camera_node.robot.calibration.hand_eye.samples import Array, Diversity, Samples, require_diversity
-from camera_node.robot.calibration.hand_eye.time_offset import StreamCalibration, calibrate_streams
-from camera_node.robot.calibration.inputs import Track
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Diversity,
+    Samples,
+    angle_deg,
+    distance_mm,
+    require_diversity,
+    rotation_vectors,
+)
+from freshfield import files
+from freshfield.untrusted import YamlWriter
 
 REFINED = DEFAULT_METHOD
 ALL_METHODS = (*METHODS, REFINED)
@@ -33,7 +43,6 @@ class Calibration:
 
     method: the one asked for; transform, residuals: its X (4, 4) and residuals.
     results: X (4, 4) by every method, or why it found none.
-    timed: the time offset, for two streams.
     warnings: one line each.
     """
 
@@ -44,19 +53,13 @@ class Calibration:
     results: dict[str, Array | str]
     refined: Refinement
     diversity: Diversity
-    timed: StreamCalibration | None
     warnings: tuple[str, ...]
-
-    @property
-    def time_offset_s(self) -> float:
-        return 0.0 if self.timed is None else self.timed.offset_s
 
     def to_dict(self) -> dict[str, Any]:
         """The result as JSON, as ``--json`` prints it."""
         residual_mm, residual_deg = self.residuals.rms
         return {
             "transform": self.transform.tolist(),
-            "time_offset_s": self.time_offset_s,
             "residual_mm": residual_mm,
             "residual_deg": residual_deg,
             "method": self.method,
@@ -65,23 +68,56 @@ class Calibration:
             "warnings": list(self.warnings),
         }
 
+    def show(self) -> str:
+        """Format all methods' residuals, the result, its uncertainty and the warnings."""
+        what = "camera in flange" if self.samples.setup == EYE_IN_HAND else "camera in base"
+        x, y, z = self.transform[:3, 3]
+        turn = ", ".join(f"{v:.5f}" for v in rotation_vectors(self.transform[:3, :3]))
+        lines = [
+            f"{len(self.samples)} poses, {self.samples.setup}; turns up to {self.diversity.largest_turn_deg:.0f} "
+            f"degrees, axes spread by {self.diversity.axis_spread_deg:.0f} degrees "
+            "(35 where they point everywhere alike)",
+            "",
+            f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
+            *(self._row(name, x) for name, x in self.results.items()),
+            "",
+            f"{what} ({self.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned ({turn}) rad",
+            f"  standard deviation {self.refined.std_mm:.3f} mm, {self.refined.std_deg:.4f} degrees",
+            f"  the arm's noise, estimated: {self.refined.arm_noise_m * 1e3:.3f} mm, "
+            f"{np.degrees(self.refined.arm_noise_rad):.4f} degrees an axis",
+        ]
+        return "\n".join([*lines, *(f"note: {warning}" for warning in self.warnings)])
+
+    def _row(self, method: str, x: Array | str) -> str:
+        if isinstance(x, str):
+            return f"{method:12} {x}"
+        mm, deg = Residuals.of(self.samples, x).rms
+        away_mm, away_deg = distance_mm(self.refined.x, x), angle_deg(self.refined.x, x)
+        return f"{method:12} {mm:12.3f} {deg:9.4f}   {away_mm:16.3f} {away_deg:9.4f}"
+
+    def write(self, path: Path) -> None:
+        """Write the file that ``hand_eye_mount.read_hand_eye`` reads. Raises CalibrationError."""
+        answer = self.to_dict()
+        data = {
+            "setup": self.samples.setup,
+            "transform": [[round(v, 9) for v in row] for row in answer.pop("transform")],
+            "time_offset_s": 0.0,
+            **answer,
+            "poses": len(self.samples),
+            "arm_noise_mm": self.refined.arm_noise_m * 1e3,
+            "arm_noise_deg": float(np.degrees(self.refined.arm_noise_rad)),
+        }
+        text = yaml.dump(data, Dumper=YamlWriter, sort_keys=False, default_flow_style=None, width=200)
+        try:
+            files.write_text(path, text)
+        except OSError as error:
+            raise CalibrationError(f"--out: {path}: {error.strerror}") from None
+
 
 def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
     """Calibrate with every method; ``method`` names the one that gives the result. Raises CalibrationError if
     the samples do not determine X."""
-    require_diversity(samples)
-    return _calibration(samples, method, refine(samples), None)
-
-
-def calibrate_tracks(
-    flange: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float = MAX_GAP_S
-) -> Calibration:
-    """Calibrate from two streams with an unknown time offset; see ``calibrate``. Raises CalibrationError."""
-    timed = calibrate_streams(flange, target, setup, max_gap_s)
-    return _calibration(timed.samples, method, timed.refined, timed)
-
-
-def _calibration(samples: Samples, method: str, refined: Refinement, timed: StreamCalibration | None) -> Calibration:
+    spread, refined = require_diversity(samples), refine(samples)
     results: dict[str, Array | str] = {}
     for name in METHODS:
         try:
@@ -92,10 +128,10 @@ def _calibration(samples: Samples, method: str, refined: Refinement, timed: Stre
     chosen = results[method]
     if isinstance(chosen, str):
         raise CalibrationError(chosen)
-    off, spread = Residuals.of(samples, chosen), require_diversity(samples)
+    off = Residuals.of(samples, chosen)
     _require_plausible(chosen, off)
-    warnings = tuple(_warnings(samples, refined, off, spread, timed))
-    return Calibration(samples, method, chosen, off, results, refined, spread, timed, warnings)
+    warnings = tuple(_warnings(samples, refined, off, spread))
+    return Calibration(samples, method, chosen, off, results, refined, spread, warnings)
 
 
 def _require_plausible(transform: Array, off: Residuals) -> None:
@@ -111,9 +147,7 @@ def _require_plausible(transform: Array, off: Residuals) -> None:
         raise CalibrationError(f"the camera would be {distance_m:.1f} m away: {_ADVICE}")
 
 
-def _warnings(
-    samples: Samples, refined: Refinement, off: Residuals, spread: Diversity, timed: StreamCalibration | None
-) -> list[str]:
+def _warnings(samples: Samples, refined: Refinement, off: Residuals, spread: Diversity) -> list[str]:
     out = []
     if len(samples) < _GOOD_POSES:
         out.append(f"{len(samples)} poses: {_GOOD_POSES} to 20 well spread ones are worth their time")
@@ -130,11 +164,4 @@ def _warnings(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {refined.weights[i]:.2f}"
         )
-    if timed is not None and abs(timed.offset_s) >= MAX_OFFSET_S:
-        out.append(
-            f"the time offset is {timed.offset_s:.0f} s: the two streams count from different beginnings, "
-            "and no node can use it: give both on the clocks that it will meet"
-        )
-    if timed is not None and timed.unpaired:
-        out.append(f"{timed.unpaired} target poses have no flange pose near enough in time and are not used")
     return out

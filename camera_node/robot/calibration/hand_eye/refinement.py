@@ -40,7 +40,6 @@ class Refinement:
     std_deg, std_mm: standard deviations of x, each the root of the sum of three variances.
     arm_noise_rad, arm_noise_m: the arm's noise.
     weights: (N,), about 1 for a good sample.
-    offset_s, offset_std_s: time offset and its deviation, if it was refined.
     """
 
     x: Array
@@ -50,59 +49,38 @@ class Refinement:
     arm_noise_rad: float
     arm_noise_m: float
     weights: Array
-    offset_s: float = 0.0
-    offset_std_s: float = 0.0
 
     @property
     def outliers(self) -> list[int]:
         return [int(i) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
-def refine(samples: Samples, velocity: Array | None = None, start: tuple[Array, Array] | None = None) -> Refinement:
-    """Maximize the likelihood of X and Y.
-
-    velocity: (N, 6) of the flange in its own axes (rad/s, m/s), to refine the time offset too, from 0 on; None:
-        ``samples`` are exact in time.
-    start: X and Y (4, 4) to begin with; None: those of ``robust_start``.
-    Raises CalibrationError.
-    """
-    x, y = robust_start(samples) if start is None else start
-    offset_s = 0.0
+def refine(samples: Samples) -> Refinement:
+    """Maximize the likelihood of X and Y. Raises CalibrationError."""
+    x, y = robust_start(samples)
 
     def residuals(step: Array) -> Array:
-        e = flange_residuals(samples, _retract(x, step[:6]), _retract(y, step[6:12]))
-        return e if velocity is None else e - velocity * (offset_s + step[12])
+        return flange_residuals(samples, _retract(x, step[:6]), _retract(y, step[6:]))
 
-    count = 12 if velocity is None else 13
-    noise = _robust_scale(residuals(np.zeros(count)))
+    noise = _robust_scale(residuals(np.zeros(12)))
     for _ in range(_ROUNDS):
         scale = np.repeat(noise, 3)
         solved = least_squares(
             lambda step, scale=scale: (residuals(step) / scale).ravel(),
-            np.zeros(count),
+            np.zeros(12),
             x_scale="jac",
             loss=_student_t,
             ftol=1e-10,
         )
         e = residuals(solved.x)
-        x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:12])
-        offset_s += float(solved.x[12]) if velocity is not None else 0.0
+        x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:])
         before, noise = noise, _noise(e, noise)
         if np.abs(noise / before - 1.0).max() < _SETTLED:
             break
     covariance = np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)
     turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
-    return Refinement(
-        x,
-        y,
-        float(np.degrees(turn)),
-        shift * 1e3,
-        float(noise[0]),
-        float(noise[1]),
-        _weights(e, noise),
-        offset_s,
-        float(np.sqrt(covariance[12, 12])) if velocity is not None else 0.0,
-    )
+    deg, mm = float(np.degrees(turn)), shift * 1e3
+    return Refinement(x, y, deg, mm, float(noise[0]), float(noise[1]), _weights(e, noise))
 
 
 def flange_residuals(samples: Samples, x: Array, y: Array) -> Array:

@@ -72,12 +72,8 @@ class Samples:
 
     def subsample(self, most: int) -> Samples:
         """At most ``most`` samples, evenly spaced over the recording."""
-        return self if len(self) <= most else self.take(evenly_spaced(len(self), most))
-
-
-def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
-    """At most ``most`` of ``count`` indices, evenly spaced."""
-    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+        at = np.linspace(0, len(self) - 1, most).round().astype(np.intp)
+        return self if len(self) <= most else self.take(at)
 
 
 def rotation_vectors(rotations: Array) -> Array:

@@ -1,17 +1,12 @@
-"""Input of calibrations with known truth: rendered images of a ChArUco board, samples, pose files."""
+"""Input of calibrations with known truth: rendered images of a ChArUco board, and samples."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
@@ -22,7 +17,7 @@ from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Quad
 from camera_node.synthetic.textures import Plain
-from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, se3, se3_inverse, so3_exp
+from freshfield.geometry import Pinhole, se3, se3_inverse, so3_exp
 from tests.camera_node.robot.calibration import known_truth
 
 BOARD = "charuco:7x5:24mm:18mm"
@@ -36,32 +31,6 @@ def taken(count: int = 12) -> tuple[list[np.ndarray], np.ndarray]:
     flanges = known_truth.random_flanges(count, np.random.default_rng(3))
     board = parse_target(BOARD)
     return [render(board, LENS, camera_in_target(h), 2) for h in flanges], flanges
-
-
-def write_scenario(
-    folder: Path, lens: Pinhole, pictures: Sequence[NDArray[np.uint8]], poses: Sequence[NDArray[np.float64]]
-) -> Path:
-    """A scenario in ``folder`` whose one camera, eye, plays pictures with their poses (4, 4)."""
-    frames = []
-    for k, (picture, pose) in enumerate(zip(pictures, poses)):
-        cv2.imwrite(str(folder / f"{k}.png"), picture)
-        frames.append({"file_path": f"{k}.png", "transform_matrix": (pose @ OPENGL_TO_OPENCV).tolist()})
-    about = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    (folder / "transforms.json").write_text(json.dumps({**about, "frames": frames}))
-    file = folder / "bench.yaml"
-    source = {"kind": "transforms", "data": str(folder / "transforms.json"), "fps": 500, "codec": "png"}
-    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
-    return file
-
-
-def write_poses(file: Path, times_ns: NDArray[np.int64], poses: Array) -> None:
-    """Poses (N, 4, 4) with their stamps (N,) as ``--hand`` and ``--target`` read them."""
-    lines = ["t,x,y,z,qx,qy,qz,qw"]
-    for t_ns, matrix in zip(times_ns, poses):
-        pose = Pose.from_matrix(matrix)
-        w, x, y, z = pose.quaternion
-        lines.append(",".join(map(repr, [int(t_ns) / 1e9, *pose.translation_m, x, y, z, w])))
-    file.write_text("\n".join(lines) + "\n")
 
 
 def noisy_samples(
