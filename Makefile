@@ -98,7 +98,7 @@ types: .venv/.ok-test  ## mypy
 
 bench: .venv/.ok-test  ## measure this machine, hours: runs/bench, docs/results; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs
-	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all --out runs/bench $(BENCH)
+	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench --out runs/bench $(BENCH)
 	$(if $(findstring --quick,$(BENCH)),,cp runs/bench/*.json runs/bench/*.md runs/bench/*.png docs/results)
 	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 

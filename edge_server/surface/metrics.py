@@ -104,20 +104,3 @@ def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
         complete=float((to_mesh <= WITHIN_M).mean()),
         precise=float((to_truth <= WITHIN_M).mean()),
     )
-
-
-def depth_error_mm(depth: NDArray[np.float32], exact: NDArray[np.float64]) -> dict[str, float]:
-    """Bias (mean signed error, positive: too far), and median and 90th percentile of the absolute error, mm,
-    over pixels with both depths. Errors above 50 mm are excluded and counted as missed."""
-    both = (depth > 0) & np.isfinite(depth) & np.isfinite(exact)
-    error = 1e3 * (depth[both].astype(np.float64) - exact[both])
-    near = np.abs(error) <= 50.0
-    error = error[near]
-    if not error.size:
-        return {"bias_mm": float("nan"), "median_mm": float("nan"), "p90_mm": float("nan"), "missed": 1.0}
-    return {
-        "bias_mm": float(error.mean()),
-        "median_mm": float(np.median(np.abs(error))),
-        "p90_mm": float(np.percentile(np.abs(error), 90)),
-        "missed": float(1.0 - near.mean()),
-    }

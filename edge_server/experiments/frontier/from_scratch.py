@@ -32,9 +32,9 @@ class Still:
 
     @property
     def files(self) -> list[Path]:
-        """The data set, if it is one."""
+        """The folder of the data set, if it is one."""
         path = Path(self.scene)
-        return [path] if path.exists() else []
+        return [path.parent if path.is_file() else path] if path.exists() else []
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,33 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from camera_node.config import WorldConfig, source_config
+from camera_node.synthetic.placement import PlacedParts, place_static
+from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
-from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
 from edge_server.surface.mesh import Mesh
-from edge_server.surface.metrics import TARGET_CHAMFER_MM, TARGET_COMPLETE, WITHIN_M, compare
+from edge_server.surface.metrics import (
+    STEEPEST_DEG,
+    TARGET_CHAMFER_MM,
+    TARGET_COMPLETE,
+    WITHIN_M,
+    Truth,
+    compare,
+    thin_points,
+)
+from freshfield.geometry import world_rays
 from freshfield.scenario import load
 
 # Spacing of the points of the truth: half the distance that counts as complete; casting the rays then takes
 # seconds instead of minutes.
 SPACING_M = 0.5 * WITHIN_M
+_FINE = 3  # rays per pixel side for the truth, so that they are closer than its spacing
+_SAME = 2e-3  # share of the distance: a ray that ends this near to its target has reached it
 
 
 def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[dict[str, Any] | None, str]]:
@@ -53,10 +68,56 @@ def still_scene(scenario: str) -> Scene | None:
 def distances(mesh: Mesh, scene: Scene, views: Sequence[View]) -> dict[str, Any]:
     """The ``surface.metrics.Comparison`` of a mesh with the surface that cameras see of a scene, and the
     targets. Raises SurfaceError if one of the two is empty."""
-    found = compare(mesh, surface_truth(Scan(scene, tuple(views)), SPACING_M))
+    found = compare(mesh, surface_truth(scene, views))
     return {
         **dataclasses.asdict(found),
         "within_mm": 1e3 * WITHIN_M,
         "target_chamfer_mm": TARGET_CHAMFER_MM,
         "target_complete": TARGET_COMPLETE,
     }
+
+
+def surface_truth(scene: Scene, views: Sequence[View], spacing_m: float = SPACING_M) -> Truth:
+    """The object's surface that the cameras of views see (``surface.metrics.Truth``)."""
+    placed = place_static(scene.world.static_parts)
+    parts = scene.object_parts
+    parts = len(placed.parts) if parts is None else parts
+    points, normals = [], []
+    for view in views:
+        fine = view.intrinsics.scaled(_FINE)
+        origin, rays = world_rays(fine, view.camera_to_world)
+        rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
+        t, which = cast_rays(origin, rays, placed, np.full(rays.shape[1], np.inf))
+        hit = np.flatnonzero((which >= 0) & (which < parts))
+        met = origin[:, None] + t[hit] * rays[:, hit]
+        _, facing = surface_properties(placed, which[hit], met, rays[:, hit])
+        seen = -(facing * rays[:, hit]).sum(axis=0) >= np.cos(np.deg2rad(STEEPEST_DEG))
+        first = thin_points(met.T[seen], spacing_m)
+        points.append(met.T[seen][first])
+        normals.append(facing.T[seen][first])
+    every, all_normals = np.concatenate(points), np.concatenate(normals)
+    first = thin_points(every, spacing_m)
+    every, all_normals = every[first], all_normals[first]
+    count = np.zeros(len(every), np.int64)
+    for view in views:
+        count += _sees(view, placed, every, all_normals)
+    return Truth(every, count)
+
+
+def _sees(
+    view: View, placed: PlacedParts, points: NDArray[np.float64], normals: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether a camera sees each of the surface points (N, 3) with ``normals`` (N, 3); returns (N,)."""
+    pose, lens = view.camera_to_world, view.intrinsics
+    with np.errstate(invalid="ignore"):
+        at = lens.project((points - pose[:3, 3]) @ pose[:3, :3])
+        inside = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
+    ray = points - pose[:3, 3]
+    distance = np.linalg.norm(ray, axis=1)
+    ray /= distance[:, None]
+    turned = -(ray * normals).sum(axis=1) >= np.cos(np.deg2rad(STEEPEST_DEG))
+    asked = np.flatnonzero(inside & turned)
+    t, _ = cast_rays(pose[:3, 3], np.ascontiguousarray(ray[asked].T), placed, np.full(len(asked), np.inf))
+    out = np.zeros(len(points), np.bool_)
+    out[asked] = np.abs(t - distance[asked]) <= _SAME * distance[asked]
+    return out

@@ -97,10 +97,10 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
 def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     from edge_server.experiments.scenes.mesh_truth import distances, still_scene
-    from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
     from edge_server.surface.reconstruct import mesh_from_depth_maps
     from edge_server.surface.settings import MeshSettings
+    from tests.edge_server.surface.tile_scan import exact_depth, scan
 
     near = scan(64, ((-0.065, 0.0, 0.03), (0.065, 0.0, 0.03)))
     maps = [

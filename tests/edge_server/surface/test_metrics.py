@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from camera_node.synthetic import make_scene
-from edge_server.experiments.scenes.tile_scan import Scan, exact_depth, scan, surface_truth
+from edge_server.experiments.scenes.mesh_truth import surface_truth
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import depth_map
 from edge_server.surface.mesh import Mesh
-from edge_server.surface.metrics import Truth, compare, depth_error_mm, sample_mesh, thin_points
+from edge_server.surface.metrics import Truth, compare, sample_mesh, thin_points
+from tests.edge_server.surface.tile_scan import exact_depth, scan
 
 
 def sheet(z: float, share: float = 1.0) -> Mesh:
@@ -63,24 +64,17 @@ def test_thinning_leaves_one_a_cell():
     assert of_kept == len(kept) == cells
 
 
-def test_depth_error_tells_bias_from_spread():
-    exact = np.full((10, 10), 0.3)
-    found = depth_error_mm((exact + 0.002).astype(np.float32), exact)
-    assert found["bias_mm"] == pytest.approx(2.0, abs=1e-3) and found["missed"] == 0.0
-    assert depth_error_mm(np.zeros((10, 10), np.float32), exact)["missed"] == 1.0
-
-
 def test_the_truth_of_an_object_leaves_out_what_stands_around_it():
     close = scan(24, raster=((-0.2, 0.1, 0.03),))
     bench = make_scene("tile", {"count": 1, "width": 24, "height": 24, "bench": True})
-    found = surface_truth(Scan(bench.with_cameras(close.scene.cameras), close.views), spacing_m=0.004)
+    found = surface_truth(bench.with_cameras(close.scene.cameras), close.views, spacing_m=0.004)
     low, high = close.scene.bounds
     assert len(found.points) > 100 and ((found.points >= low) & (found.points <= high)).all()
 
 
 def test_the_truth_is_on_what_the_cameras_see():
     close = scan(24, raster=((-0.1, 0.0, 0.03), (0.1, 0.0, 0.03)))
-    found = surface_truth(close, spacing_m=0.004)
+    found = surface_truth(close.scene, close.views, spacing_m=0.004)
     assert len(close.views) == 10 and 0.2 < (found.cameras >= 2).mean() <= 1.0
     low, high = close.scene.bounds
     assert ((found.points >= low) & (found.points <= high)).all()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import field as bench_field
 from edge_server.experiments.bench import growth
-from edge_server.experiments.bench.command import PARTS
+from tests.edge_server.experiments.sets import write_recording
 
-TINY = bench_field.Workload(seeds=2, planned_s=(0.1, 0.4), recorded_s=(), rate_repeats=1, size=24, rate_s=0.1)
+TINY = bench_field.Workload(seeds=2, planned_s=(0.1, 0.4), recorded_s=(0.1,), size=24)
 
 
 def bench(part: str, out, *words: str) -> dict:
@@ -22,38 +23,32 @@ def bench(part: str, out, *words: str) -> dict:
 
 
 def test_a_curve_from_fits_to_table_and_nothing_is_fitted_again(tmp_path, monkeypatch):
-    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    write_recording(tmp_path / "data" / "blender_kitchen", cameras=5, instants=1, size=24)
+    monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path / "data"))
     monkeypatch.setattr(bench_field, "QUICK", TINY)
-    words = ["--field", "ngp", "--scene", "tile", "--option", "levels=4"]
+    words = ["--field", "ngp", "--scene", "tile,kitchen", "--option", "levels=4"]
     figures = bench("field", tmp_path, *words)
     found = figures["tile"]
     row = found[name := "ngp, levels=4"]
-    assert row["seeds"] == 2 and list(row["series"]) == ["0.1_s", "0.4_s"]
-    assert row["best_db"] == max(point["psnr_db"] for point in row["series"].values())
-    assert row["steps_per_s"] > 0.0 and row["render_128_ms"] > 0.0 and found["angle_deg"] >= 15.0
+    assert row["seeds"] == 2 and [point["planned_s"] for point in row["series"]] == [0.1, 0.4]
+    assert row["best_db"] == max(point["psnr_db"] for point in row["series"])
+    assert found["angle_deg"] >= 15.0 and figures["kitchen"]["scene"].endswith("4 views of 24 x 24")
     text = (tmp_path / "field.md").read_text()
-    shown = ", ".join(f"{p['seconds']:g}: {p['psnr_db']:.1f}" for p in row["series"].values())
+    shown = ", ".join(f"{p['planned_s']:g}: {p['psnr_db']:.1f}" for p in row["series"])
     assert f"| tile | {name} | 2 | {shown} |" in text and "![field](field.png)" in text
     lines = (tmp_path / "results.jsonl").read_text().splitlines()
-    assert len(lines) == 2 * 2 + 1  # fits and rates; with options the start is not measured
+    assert len(lines) == 2 * 2 + 1
 
     assert bench("field", tmp_path, *words) == figures
     assert (tmp_path / "results.jsonl").read_text().splitlines() == lines
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(1, (0.1,), (), 2, size=24, rate_s=0.1))
-    assert bench("field", tmp_path, *words)["tile"][name]["seeds"] == 1
-    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == len(lines) + 1  # the rates of two fits
+    monkeypatch.setattr(bench_field, "QUICK", replace(TINY, seeds=3))
+    assert bench("field", tmp_path, *words)["tile"][name]["seeds"] == 3
+    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == len(lines) + 2
 
 
 def test_seconds_to_a_quality_are_of_the_first_point_that_has_it():
-    series = [{"fitted_s": s, "psnr_db": db} for s, db in ((0.5, 21.9), (1.0, 25.0), (2.0, 24.0), (4.0, 28.5))]
-    found = bench_field._seconds_to_db(series)
-    assert found == {"22_db": 1.0, "25_db": 1.0, "28_db": 4.0, "30_db": None}
-
-
-@pytest.mark.slow
-def test_the_start_of_a_representation_is_measured_in_processes_of_its_own():
-    found = bench_field.start_up(bench_field.Start("ngp", cold=False))
-    assert found["peak_rss_mb"] > 50.0 and 0.0 < found["jit_cached_s"] < 60.0
+    series = [{"seconds": s, "psnr_db": db} for s, db in ((0.5, 21.9), (1.0, 25.0), (2.0, 24.0), (4.0, 28.5))]
+    assert bench_field.seconds_to_db(series) == {"22_db": 1.0, "25_db": 1.0, "28_db": 4.0, "30_db": None}
 
 
 @pytest.mark.slow
@@ -75,23 +70,22 @@ def test_a_point_is_saturated_where_frames_are_shed_or_one_core_is_full():
     assert not growth._is_saturated({"shed": 0.01, "following_cores": 0.9})
 
 
-def test_a_part_that_cannot_be_measured_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+def test_a_scene_that_was_asked_for_and_is_not_there_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    monkeypatch.setattr(bench_field, "QUICK", TINY)
-    words = ["--quick", "--field", "ngp", "--scene", "kitchen", "--out", str(tmp_path)]
-    assert edge_server(["bench", "track", "field", *words]) == 1
-    told = capsys.readouterr().err
-    assert "bench track: kitchen: set FRESHFIELD_DATA" in told and "bench field: kitchen: set FRESHFIELD_DATA" in told
+    assert edge_server(["bench", "field", "--quick", "--scene", "kitchen", "--out", str(tmp_path)]) == 1
+    assert "bench field: kitchen: set FRESHFIELD_DATA" in capsys.readouterr().err
+    monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
+    assert edge_server(["bench", "field", "--quick", "--scene", "kitchen", "--out", str(tmp_path)]) == 1
+    assert "there is no " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["speed"], "no part is called speed; there are: field, track"),
+        (["speed"], "no part is called speed; there are: field, growth"),
         (["field", "--field", "splot"], "no field is called splot; there are: ngp"),
-        (["track", "--scene", "attic"], "--scene attic: track knows room, kitchen"),
-        (["growth", "--scene", "room"], "growth: takes no --scene"),
-        (["scanned", "--field", "ngp"], "scanned: takes no --field"),
+        (["--scene", "attic"], "--scene attic: field knows tile, room, kitchen"),
+        (["growth", "--scene", "room"], "growth: takes no --field, --scene"),
         (["field", "--option", "colour=1"], "colour"),
     ],
 )
@@ -99,11 +93,3 @@ def test_what_means_nothing_to_a_part_is_refused(words, message, capsys):
     with pytest.raises(SystemExit):
         edge_server(["bench", *words])
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_every_part_has_its_functions_and_stands_in_the_help(name, capsys):
-    assert callable(PARTS[name].function("measure")) and callable(PARTS[name].function("table"))
-    with pytest.raises(SystemExit):
-        edge_server(["bench", "--help"])
-    assert f"\n{name:10} " in capsys.readouterr().out
