@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import struct
 
-from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES, MAX_PNG_CHUNKS
+from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES
+from freshfield.png import pixels_only, png_size
 
 # OpenCV reads this when it is first imported: a second barrier behind the header checks below.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
@@ -84,7 +85,7 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
     if codec == "jpeg":
         found = _jpeg_size(payload)
     elif codec == "png":
-        found = _png_size(payload)
+        found = png_size(payload)
     else:
         raise PayloadError("unknown_codec", f"codec {codec!r} is not one of {', '.join(CODECS)}")
     if found is None:
@@ -113,6 +114,11 @@ def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 
             raise PayloadError("undecodable", f"zstandard gave {len(raw)} bytes")
         return _halved(np.frombuffer(raw, np.uint8).reshape(height, width, 3), halvings)
     flags = cv2.IMREAD_UNCHANGED
+    if codec == "png":
+        try:
+            payload = pixels_only(payload)
+        except ValueError as error:
+            raise PayloadError("undecodable", str(error)) from None
     if codec == "jpeg":
         flags = _JPEG_FLAGS[halvings] | cv2.IMREAD_IGNORE_ORIENTATION
         width, height, halvings = -(-width >> halvings), -(-height >> halvings), 0
@@ -135,23 +141,6 @@ def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
         even = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
         image = np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
     return image
-
-
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header; None unless all chunks up to the last lie within the data."""
-    if len(data) < 33 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
-        return None
-    at, width, height = 8, *struct.unpack(">II", data[16:24])
-    for _ in range(MAX_PNG_CHUNKS):
-        if at + 12 > len(data):
-            return None
-        (length,) = struct.unpack_from(">I", data, at)
-        at += 12 + length
-        if at > len(data):
-            return None
-        if data[at - length - 8 : at - length - 4] == b"IEND":
-            return int(width), int(height)
-    return None
 
 
 def _jpeg_scans(data: bytes) -> int:

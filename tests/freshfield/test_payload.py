@@ -87,14 +87,16 @@ def test_what_cannot_be_sent_is_refused(image, codec, reason):
 # --- hostile input ---------------------------------------------------------------------------
 
 
-def png(width: int, height: int, depth: int = 8, kind: int = 2, rows: bytes | None = None) -> bytes:
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def png(
+    width: int, height: int, depth: int = 8, kind: int = 2, rows: bytes | None = None, interlaced: int = 0
+) -> bytes:
     """A PNG with any header, well-formed or not."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     data = zlib.compress(rows if rows is not None else b"\0" * 1000)
-    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, interlaced)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
@@ -193,6 +195,36 @@ def test_a_bomb_of_the_announced_size_is_bounded():
     assert decode(data, "png", side, side).shape == (side, side, 3)
     squeezed = zstandard.ZstdCompressor(level=19).compress(bytes(side * side * 3))
     assert decode(squeezed, "zstd", side, side).nbytes == side * side * 3
+
+
+def test_only_what_the_pixels_of_a_png_need_is_inflated():
+    """Text of 1 GB is left alone, wherever it stands; image data beyond the image are refused once they begin."""
+    image = np.random.default_rng(4).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    plain = encode(image, "png")
+    text = chunk(b"zTXt", b"note\0\0" + zlib.compress(bytes(2**26))) * 16
+    for data in (plain[:33] + text + plain[33:], plain[:-12] + text + plain[-12:]):
+        np.testing.assert_array_equal(decode(data, "png", 64, 48), image)
+        assert work_ms(lambda data=data: decode(data, "png", 64, 48)) < MOST_MS
+    bomb = png(64, 48, rows=bytes(2**27))
+
+    def refused():
+        with pytest.raises(PayloadError, match=r"more than 9264 bytes, not 9264"):
+            decode(bomb, "png", 64, 48)
+
+    assert work_ms(refused) < MOST_MS
+    with pytest.raises(PayloadError, match=r"of 9263 bytes, not 9264"):
+        decode(png(64, 48, rows=bytes(9263)), "png", 64, 48)
+
+
+def test_an_interlaced_png_is_decoded():
+    """5 x 3, gray: which columns and rows the seven passes of Adam7 have, written out."""
+    image = np.arange(15, dtype=np.uint8).reshape(3, 5) * 17
+    passes = [((0,), (0,)), ((4,), (0,)), ((), ()), ((2,), (0,)), ((0, 2, 4), (2,)), ((1, 3), (0, 2)), (range(5), (1,))]
+    rows = b"".join(b"\0" + bytes(image[y, x] for x in columns) for columns, lines in passes for y in lines)
+    back = decode(png(5, 3, 8, 0, rows, interlaced=1), "png", 5, 3)
+    np.testing.assert_array_equal(back, np.repeat(image[..., None], 3, axis=2))
+    with pytest.raises(PayloadError, match="more than"):
+        decode(png(5, 3, 8, 0, rows + b"\0", interlaced=1), "png", 5, 3)
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "png", "zstd"])
