@@ -1,12 +1,7 @@
-"""Light on surfaces: diffuse reflection and contact shadows always, others if effects add them.
-
-Effects may give a world a specular reflection, a shadow model, a medium and a light switch. This file defines
-only their protocols.
-"""
+"""Light on surfaces, diffuse reflection and contact shadows, and the protocol of the medium that an effect may add."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -36,41 +31,6 @@ class Light:
     ambient_above: Color
     tint: Color = (1.0, 1.0, 1.0)
 
-    @property
-    def point_color(self) -> Array:
-        """Color times strength (3, 1) of each point."""
-        return np.array(self.tint)[:, None] * (self.strength / len(self.points))
-
-
-@dataclass(frozen=True)
-class SurfacePoints:
-    """N surface points.
-
-    points, albedo, normals: (3, N); normals are unit vectors.
-    rays: (3, N), unit directions of the rays that hit the points.
-    visible: (S, N), 0 if a static part stands between light point and surface point, else 1.
-    """
-
-    points: Array
-    albedo: Array
-    normals: Array
-    rays: Array
-    visible: Array
-
-    def select(self, chosen: NDArray[np.intp] | slice) -> SurfacePoints:
-        """The points at some indices."""
-        fields = (self.points, self.albedo, self.normals, self.rays, self.visible)
-        return SurfacePoints(*(values[:, chosen] for values in fields))
-
-
-class SpecularReflection(Protocol):
-    """Light that surfaces reflect towards the viewer beyond the diffuse part."""
-
-    def reflectance(self, to_light: Array, normals: Array, rays: Array) -> Array:
-        """Share (N,) of a light's strength that is reflected along -rays (3, N), including the cosine at the
-        surface. to_light and normals: unit (3, N)."""
-        ...
-
 
 class Medium(Protocol):
     """A homogeneous medium between surfaces and cameras."""
@@ -85,33 +45,12 @@ class Medium(Protocol):
         ...
 
 
-class ShadowModel(Protocol):
-    """Shadows of moving parts."""
-
-    def blocked_light(
-        self, surface: SurfacePoints, light: Light, moving: Sequence[PlacedParts], specular: SpecularReflection | None
-    ) -> Array:
-        """Light (3, N) that moving parts take away from the surface points' colors."""
-        ...
-
-
-class Switch(Protocol):
-    """Lamps that go on and out."""
-
-    def on(self, t_s: float) -> bool:
-        """Whether all lamps are on at an instant."""
-        ...
-
-    def without(self, light: Light) -> Light:
-        """What is left of a light when they are out."""
-        ...
-
-
 def shade_diffuse(light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None) -> Array:
     """Colors (3, N) of surface points under ambient light and Lambert's law.
 
     albedo, points, normals: (3, N).
-    visible: (S, N), see ``SurfacePoints``; None replaces the light by one unshadowed point at its center.
+    visible: (S, N), 0 if a static part stands between light point and surface point, else 1; None replaces the
+        light by one unshadowed point at its center.
     """
     low, high = np.array(light.ambient_below)[:, None], np.array(light.ambient_above)[:, None]
     ambient = low + (high - low) * (0.5 + 0.5 * normals[2])
@@ -121,29 +60,6 @@ def shade_diffuse(light: Light, albedo: Array, points: Array, normals: Array, vi
         term = _lambert(source, light.falloff_m, points, normals)
         direct += term if visible is None else term * visible[k]
     return albedo * (ambient + np.array(light.tint)[:, None] * (light.strength / len(sources)) * direct)
-
-
-def direct_light(surface: SurfacePoints, light: Light, source: Array, specular: SpecularReflection | None) -> Array:
-    """Colors (3, N) that one of the light's points (3,) adds to surface points that see it."""
-    diffuse = surface.albedo * _lambert(source, light.falloff_m, surface.points, surface.normals)
-    if specular is None:
-        return light.point_color * diffuse
-    return light.point_color * (diffuse + _reflected(specular, source, light.falloff_m, surface))
-
-
-def specular_light(light: Light, specular: SpecularReflection, surface: SurfacePoints) -> Array:
-    """Colors (3, N) that specular reflection of all visible light points adds to surface points."""
-    total = np.zeros(surface.points.shape[1])
-    for k, source in enumerate(light.points):
-        total += _reflected(specular, source, light.falloff_m, surface) * surface.visible[k]
-    return light.point_color * total
-
-
-def _reflected(specular: SpecularReflection, source: Array, falloff_m: float, surface: SurfacePoints) -> Array:
-    to = source[:, None] - surface.points
-    distance2 = np.maximum((to * to).sum(axis=0), 1e-12)
-    share = specular.reflectance(to / np.sqrt(distance2), surface.normals, surface.rays)
-    return share / (1.0 + distance2 / (falloff_m * falloff_m))
 
 
 def _lambert(source: Array, falloff_m: float, points: Array, normals: Array) -> Array:

@@ -2,8 +2,7 @@
 
 The kinds, by where they act:
 
-* ``world``    changes the scene: bodies, shadows, highlights, fog (rendered ahead and cached; free while
-  streaming);
+* ``world``    changes the scene: bodies, fog (rendered ahead and cached; free while streaming);
 * ``lens``     changes a camera's lens, and the lens that its frames report (likewise);
 * ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
@@ -27,7 +26,7 @@ from typing import Annotated, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.render import Image, Rows
+from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
@@ -38,14 +37,10 @@ NAMES = (
     "fog",
     "hot_pixels",
     "lens_distortion",
-    "light_switch",
     "motion_blur",
     "occluder",
     "pose_noise",
-    "rolling_shutter",
     "sensor_noise",
-    "shadows",
-    "specular",
     "vignetting",
 )
 
@@ -96,18 +91,17 @@ class LensEffect(Protocol):
 
 
 class Renderer(Protocol):
-    """Renders a camera's image, or some of its rows, at any instant: a CameraRenderer, perhaps with exposure
-    effects around it."""
+    """Renders a camera's image at any instant: a CameraRenderer, perhaps with exposure effects around it."""
 
     @property
     def camera(self) -> Pinhole: ...
 
-    def image(self, t_s: float, rows: Rows | None = None) -> Image: ...
+    def image(self, t_s: float) -> Image: ...
 
 
 class ExposureEffect(Protocol):
-    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
-        """Image, or rows (first, one after the last), of an exposure around an instant."""
+    def expose(self, renderer: Renderer, t_s: float) -> Image:
+        """Image of an exposure around an instant."""
         ...
 
 
@@ -208,8 +202,8 @@ class _ExposedRenderer:
     def camera(self) -> Pinhole:
         return self.renderer.camera
 
-    def image(self, t_s: float, rows: Rows | None = None) -> Image:
-        return self.effect.expose(self.renderer, t_s, rows)
+    def image(self, t_s: float) -> Image:
+        return self.effect.expose(self.renderer, t_s)
 
 
 def load_effects(

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from camera_node.synthetic.effects import EffectParameters, Renderer
-from camera_node.synthetic.render import Image, Rows
+from camera_node.synthetic.render import Image
 from freshfield.settings import within
 
 
@@ -20,12 +20,12 @@ class MotionBlur(EffectParameters, frozen=True):
 
     kind: ClassVar[str] = "exposure"
 
-    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
+    def expose(self, renderer: Renderer, t_s: float) -> Image:
         n = self.samples
         share = (np.arange(n) + 0.5) / n - 0.5
         total: np.ndarray | None = None
         for offset in share * self.exposure_ms * 1e-3:
-            image = renderer.image(t_s + float(offset), rows).astype(np.uint16)  # 64 times 255 fits
+            image = renderer.image(t_s + float(offset)).astype(np.uint16)  # 64 times 255 fits
             total = image if total is None else total + image
         assert total is not None
         return ((total + n // 2) // n).astype(np.uint8)

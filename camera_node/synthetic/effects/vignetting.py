@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic.effects import EffectParameters, Renderer
-from camera_node.synthetic.render import Image, Rows
+from camera_node.synthetic.render import Image
 from freshfield.geometry import Pinhole
 from freshfield.settings import within
 
@@ -24,10 +24,8 @@ class Vignetting(EffectParameters, frozen=True):
 
     kind: ClassVar[str] = "exposure"
 
-    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
-        first, stop = (0, renderer.camera.height) if rows is None else rows
-        left = gains(renderer.camera, self.exponent)[first:stop]
-        return np.rint(renderer.image(t_s, rows) * left).astype(np.uint8)
+    def expose(self, renderer: Renderer, t_s: float) -> Image:
+        return np.rint(renderer.image(t_s) * gains(renderer.camera, self.exponent)).astype(np.uint8)
 
 
 @lru_cache(maxsize=16)

@@ -18,7 +18,6 @@ EFFECTS = {
     **dict.fromkeys(NAMES),
     "motion_blur": {"samples": 3},
     "occluder": {"period_s": 0.6},
-    "rolling_shutter": {"rows_at_once": 8},
     "clock_drift": {"drift_ppm": 50.0},
 }
 

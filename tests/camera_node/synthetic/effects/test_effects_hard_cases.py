@@ -40,17 +40,6 @@ EXTREMES: dict[str, list[dict]] = {
         {"translation_mm": 0.0, "rotation_deg": 0.0},
         {"translation_mm": 1e-300, "rotation_deg": 1e-300},
     ],
-    "rolling_shutter": [
-        {"readout_ms": 1000.0, "stamped_share": 0.0},
-        {"readout_ms": 0.0, "stamped_share": 1.0},
-        {"rows_at_once": 4096},
-    ],
-    "shadows": [{"opacity": 0.0}, {"opacity": 1.0}],
-    "specular": [
-        {"refractive_index": 1.0, "roughness": 0.02},
-        {"refractive_index": 50.0, "roughness": 0.02},
-        {"refractive_index": 50.0, "roughness": 1.0},
-    ],
     "vignetting": [{"exponent": 0.0}, {"exponent": 64.0}],
 }
 CASES = [(name, parameters) for name, some in EXTREMES.items() for parameters in some]
@@ -111,16 +100,13 @@ def test_no_number_may_be_nonsense(name, parameter, value):
 
 
 def test_there_are_numbers_to_refuse():
-    assert len(numbers()) >= 25
+    assert len(numbers()) >= 20
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_camera_within_a_fog_of_a_thousand_suns():
-    """A medium, a coat and shadows where every ray starts inside a shape and where nothing is hit at all."""
-    made = fx.load_effects(
-        {"fog": {"visibility_m": 0.05}, "specular": {"roughness": 0.02}, "shadows": {}},
-        lambda _: np.random.default_rng(0),
-    )
+    """A medium where every ray starts inside a shape and where nothing is hit at all."""
+    made = load("fog", {"visibility_m": 0.05})
     scene = made.extend(make_scene("tile", {"width": 12, "height": 12, "supersample": 1}))
     inside = np.eye(4)
     inside[:3, 3] = 0.0, 0.0, 0.03

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import effects as fx
-from camera_node.synthetic import make_scene, render
+from camera_node.synthetic import make_scene
 from freshfield.geometry import Pose
 
 STREAM = """
@@ -73,15 +73,6 @@ for name in fx.NAMES:
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.split("\n")[:-1] == [f"{name} True" for name in fx.NAMES]
-
-
-def test_without_specular_shadows_and_medium_nothing_of_them_is_computed(monkeypatch):
-    monkeypatch.setattr(render, "specular_light", None)
-    monkeypatch.setattr(render.CameraRenderer, "_shadow_static", None)
-    scene = make_scene("room", {"width": 16, "height": 16, "supersample": 1})
-    view = scene.renderer("cam00")
-    view.image(0.3)
-    assert view._transmittance is None and not hasattr(view, "_static_surface")
 
 
 def test_nothing_listed_passes_everything_through_untouched():
@@ -150,20 +141,16 @@ def test_an_invalid_effect_is_refused_in_one_line(listed, message):
     assert "\n" not in str(error.value)
 
 
-# Parameters with which an effect changes nothing. An occluder's arm is always there, and with shadows the moving
-# parts lie in those of the static ones.
+# Parameters with which an effect changes nothing. An occluder's arm is always there.
 NEUTRAL: dict[str, dict] = {
     "clock_drift": {},
     "exposure_drift": {"amplitude_stops": 0.0, "offset_spread_stops": 0.0},
     "fog": {"visibility_m": 1e6},
     "hot_pixels": {"hot_ppm": 0.0, "hits_per_megapixel": 0.0},
     "lens_distortion": {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0},
-    "light_switch": {"share": 0.0},
     "motion_blur": {"samples": 1},
     "pose_noise": {"translation_mm": 0.0, "rotation_deg": 0.0},
-    "rolling_shutter": {"readout_ms": 0.0},
     "sensor_noise": {"read_noise_counts": 0.0, "full_well_electrons": 0.0},
-    "specular": {"refractive_index": 1.0},
     "vignetting": {"exponent": 0.0},
 }
 
@@ -175,7 +162,7 @@ def test_an_effect_of_no_strength_changes_nothing(name):
     plain = scene.render("cam01", 0.4)
     changed = effects.extend(scene)
     image = effects.apply(effects.with_exposure(changed.renderer("cam01")).image(0.4), 6, 0.4)
-    assert np.abs(image.astype(int) - plain).max() <= (1 if name in ("fog", "specular") else 0)
+    assert np.abs(image.astype(int) - plain).max() <= (1 if name == "fog" else 0)
     camera, matrix = changed.cameras["cam01"]
     assert effects.reported_lens(camera) == scene.cameras["cam01"][0]
     assert np.allclose(effects.reported_pose(Pose.from_matrix(matrix), 6).matrix(), matrix, atol=1e-12)
@@ -211,7 +198,7 @@ def test_each_effect_has_its_own_random_stream():
     assert np.array_equal(alone.apply(image, 0, 0.0), among.apply(image, 0, 0.0))
 
 
-@pytest.mark.parametrize("name", ["fog", "lens_distortion", "occluder", "shadows", "specular"])
+@pytest.mark.parametrize("name", ["fog", "lens_distortion", "occluder"])
 def test_an_effect_leaves_the_original_scene_as_it_is(name):
     scene = make_scene("room", {"width": 32, "height": 32, "supersample": 1})
     world, cameras, before = scene.world, scene.cameras, scene.render("cam01", 0.4)

@@ -46,11 +46,6 @@ def test_it_follows_the_lens_off_its_center_and_distorted():
     assert not np.allclose(gain, gains(dataclasses.replace(lens, distortion=(0.0,) * 4), 4.0)[..., 0], atol=1e-3)
 
 
-def test_some_rows_are_those_rows_of_the_whole():
-    renderer = TimedRenderer(lambda t: WHITE, CAMERA)
-    assert np.array_equal(make().expose(renderer, 0.0, (10, 20)), make().expose(renderer, 0.0)[10:20])
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_steep_law_blackens_the_corners_and_nothing_overflows():
     image = make(64.0).expose(TimedRenderer(lambda t: np.full_like(WHITE, 255), CAMERA), 0.0)

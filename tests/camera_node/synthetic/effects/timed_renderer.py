@@ -14,13 +14,12 @@ from freshfield.geometry import Pinhole
 
 @dataclass
 class TimedRenderer:
-    """Shows ``render(t_s)``. asked: the requested instants and rows."""
+    """Shows ``render(t_s)``. asked: the requested instants."""
 
     render: Callable[[float], NDArray[np.uint8]]
     camera: Pinhole = field(default_factory=lambda: Pinhole.from_fov(2, 2, 60.0))
-    asked: list[tuple[float, tuple[int, int] | None]] = field(default_factory=list)
+    asked: list[float] = field(default_factory=list)
 
-    def image(self, t_s: float, rows: tuple[int, int] | None = None) -> Image:
-        self.asked.append((t_s, rows))
-        image = self.render(t_s)
-        return image if rows is None else image[rows[0] : rows[1]]
+    def image(self, t_s: float) -> Image:
+        self.asked.append(t_s)
+        return self.render(t_s)
