@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from math import inf, nan
 from pathlib import Path
@@ -29,8 +30,9 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import read_config
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment, WakeCondition
-from edge_server.fields import checkpoint
-from edge_server.fields.registry import make_field
+from edge_server.fields import Field, checkpoint
+from edge_server.fields.ngp import field as ngp_field
+from edge_server.fields.registry import make_field, settings_of
 from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
@@ -371,7 +373,7 @@ class ChaosDeployment(VirtualDeployment):
     def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
         """The updater of an edge that was just started. resume: load the last checkpoint, if there is one."""
         scenario, config = self.scenario, read_config(self.scenario)
-        field = make_field(config.field, config.field_options, seed=scenario.seed)
+        field = _small_field(config.field, config.field_options, scenario.seed)
         file = self._out / "field.npz"
         if resume and file.exists():
             field.load_state(checkpoint.load(file)[0])
@@ -396,3 +398,10 @@ class ChaosDeployment(VirtualDeployment):
 
     def _after(self, fault: Fault, action: Callable[[], None]) -> None:
         self.at(self.clock.now_ns() + round(fault.for_ms * 1e6), action)
+
+
+def _small_field(name: str, options: dict[str, Any], seed: int) -> Field:
+    """The field of an edge; that of ``ngp`` with an eighth of the cells, whose counting would take half the time."""
+    if name != "ngp":
+        return make_field(name, options, seed)
+    return ngp_field.make(replace(settings_of(name, options, seed), cells=32, finest_resolution=64))
