@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu.model import ages, faults, notation
+from channel_emu.model import faults, notation
 from channel_emu.model.config import ChannelConfig, channel_from_mapping, from_notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
-from channel_emu.model.presets import FROM_FILES, PRESETS
+from channel_emu.model.presets import PRESETS
 from freshfield import scenario, transport
 from freshfield.files import format_table, out_file, out_folder
 
@@ -29,7 +29,7 @@ In the help of a command, [x] after an option is its default.
   channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room --trace trace.jsonl
   channel-emu presets
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
-  channel-emu simulate --preset gilbert-elliott --metric shown:20ms:16.7ms --csv frames.csv --plot ages.png
+  channel-emu simulate --preset gilbert-elliott --csv frames.csv --plot ages.png
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu replay trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
@@ -155,22 +155,10 @@ def _add_simulate(commands: Any) -> None:
         help="frame period of the cameras; Poisson arrivals then sample their newest frame, as live",
     )
     sub.add_argument(
-        "--frame-bytes",
-        type=int,
-        default=20_000,
-        metavar="N",
-        help="size of a frame, for bandwidth and mahimahi [%(default)s]",
+        "--frame-bytes", type=int, default=20_000, metavar="N", help="size of a frame, for bandwidth [%(default)s]"
     )
     sub.add_argument(
         "--slot-ms", type=float, default=1.0, metavar="MS", help="slot of the slotted mean age [%(default)g]"
-    )
-    sub.add_argument(
-        "--metric",
-        action="append",
-        default=[],
-        metavar="NAME[:VALUE...]",
-        help="further age metrics; may be repeated. "
-        + "; ".join(f"{name}: {metric.about}" for name, metric in ages.METRICS.items()),
     )
     sub.add_argument(
         "--csv",
@@ -246,7 +234,7 @@ def _simulate(args: argparse.Namespace) -> int:
         frame_bytes=args.frame_bytes,
         slot_ms=args.slot_ms,
     )
-    result = simulation.summary(args.metric)
+    result = simulation.summary()
     if args.csv:
         output.write_frames(simulation, args.csv)
     if args.plot:
@@ -258,7 +246,6 @@ def _simulate(args: argparse.Namespace) -> int:
         "mean age (ms)": result["mean_age_ms"],
         "peak age (ms)": result["peak_age_ms"],
         "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"],
-        **result["metrics_ms"],
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
         **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
@@ -311,9 +298,8 @@ def _presets(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([{**row, **PRESETS[row["preset"]]._asdict()} for row in rows]))
         return 0
-    about = [*((name, preset.about) for name, preset in PRESETS.items()), *FROM_FILES.items()]
     print(format_table(rows) + "\n")
-    print(format_table([{"preset": name, "what it is": line} for name, line in about]))
+    print(format_table([{"preset": name, "what it is": preset.about} for name, preset in PRESETS.items()]))
     return 0
 
 

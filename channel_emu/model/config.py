@@ -63,7 +63,7 @@ class ChainConfig(Settings, frozen=True):
     generator_per_ms: instead of the two rates, row by row.
     scope: ``shared`` by all cameras, or ``per-camera``: an independent chain for each.
     sampled: continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
-        the slot, as the thesis does; ``closed_forms`` has the bias.
+        the slot, as the thesis does.
     """
 
     mu1_per_ms: Annotated[NotNegative | None, about("rate of leaving the first of two states (6.26)")] = None
@@ -240,7 +240,7 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
     name = mapping.get("preset", "ideal")
     try:
-        merged = preset(name if isinstance(name, str) else repr(name), folder)
+        merged = preset(name if isinstance(name, str) else repr(name))
     except ValueError as error:
         raise ScenarioError(f"{where}.preset: {error}") from None
     for key, value in mapping.items():

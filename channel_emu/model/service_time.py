@@ -2,7 +2,7 @@
 
 A law draws a frame's work, with mean one; the state sets the mean delay. ``at-start``: the state in which
 transmission starts counts (the thesis). ``modulated``: the work is served at the rate of whichever state the
-chain is in (the Gilbert-Elliott-modulated link of ``closed_forms``).
+chain is in (a Gilbert-Elliott-modulated link).
 """
 
 from __future__ import annotations

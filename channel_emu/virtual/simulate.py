@@ -4,7 +4,6 @@ clock. Some 70,000 frames a second."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,12 +42,8 @@ class Simulation:
         """Continuous time average of the age, over the cameras that had a delivery; None if none had."""
         return ages.mean_of_known([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
 
-    def summary(self, metrics: Sequence[str] = ()) -> dict[str, Any]:
-        """Results as plain values, as the command prints them with --json.
-
-        metrics: further age metrics (see ``ages.measure``), each averaged over the cameras that have a value.
-        Raises NotationError for an unknown one.
-        """
+    def summary(self) -> dict[str, Any]:
+        """Results as plain values, as the command prints them with --json."""
         saws = [run.sawtooth() for run in self.runs]
         delays = np.concatenate([run.delays_ms() for run in self.runs])
         share = np.mean([run.state_share for run in self.runs], 0)
@@ -57,12 +52,6 @@ class Simulation:
             "mean_age_ms": ages.mean_of_known([ages.mean_age_ms(s) for s in saws]),
             "mean_age_slotted_ms": ages.mean_of_known([ages.query_age_ms(s, self.slot_ms) for s in saws]),
             "peak_age_ms": ages.mean_of_known([ages.peak_age_ms(s) for s in saws]),
-            "metrics_ms": {
-                text: ages.mean_of_known(
-                    [ages.measure(text, saw, self.seed, run.camera) for saw, run in zip(saws, self.runs)]
-                )
-                for text in metrics
-            },
             "offered": sum(len(run.offered_ns) for run in self.runs),
             "delivered": counts.pop("delivered"),
             "dropped": sum(count for name, count in counts.items() if name != "in_flight"),

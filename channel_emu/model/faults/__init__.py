@@ -11,7 +11,7 @@ from typing import Any
 
 from channel_emu.model.link import Fault
 
-NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth", "mahimahi")
+NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth")
 
 
 # Where not a module of the fault's own name.

@@ -33,8 +33,8 @@ def late_ms(records: list[Record]) -> np.ndarray:
     return np.array([(r.actual_ns - r.ended_ns) / 1e6 for r in records if r.actual_ns is not None and r.ended_ns])
 
 
-# Losses by state, and a line that lets 20 packets go every 4 ms.
-LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "mahimahi": [4] * 20}}
+# Losses by state, and a line of a rate.
+LOSSY = {**FAST, "faults": {"loss": [0.1, 0.5], "bandwidth": 400.0}}
 
 
 @pytest.mark.parametrize("section", [FAST, LOSSY], ids=["ch6", "lossy"])

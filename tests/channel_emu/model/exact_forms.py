@@ -143,21 +143,6 @@ def modulated_drop_new(a: float, b: float, mu_good: float, mu_bad: float, period
     return float((period**2 * square / 2 + period * (alpha @ r @ r @ (big_a - big_b) @ m)) / (period * mean))
 
 
-def incorrect_without_delay(lam: float, away: float, back: float) -> float:
-    """Age of incorrect information where Poisson updates arrive at once, on a source of two states.
-
-    Wrong after the source left what was known, which lasts until it returns or is updated: visits to a state
-    of a chain (source, known). For each known state, its share of being wrong times the mean age of a visit.
-    """
-    # Of (source, known): 00, 10, 11, 01.
-    q = np.zeros((4, 4))
-    q[0, 1], q[1, 0], q[1, 2] = away, back, lam
-    q[2, 3], q[3, 2], q[3, 0] = back, away, lam
-    q -= np.diag(q.sum(1))
-    share = np.linalg.lstsq(np.vstack((q.T, np.ones(4))), np.array([0, 0, 0, 0, 1.0]), rcond=None)[0]
-    return float(share[1] / (back + lam) + share[3] / (away + lam))
-
-
 def gilbert_elliott(a: float, b: float, loss: tuple[float, float], period: float, delay: float) -> tuple[float, float]:
     """Mean and peak age of periodic frames that each take ``delay``, lost with the probability of the state.
 

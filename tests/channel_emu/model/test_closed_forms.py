@@ -12,7 +12,6 @@ pytest.importorskip("scipy", reason="the closed forms need scipy")
 from scipy import stats
 
 from channel_emu.model import ages
-from channel_emu.model.closed_forms import drop_new_age_ms
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 from tests.channel_emu.model import exact_forms as exact
@@ -134,39 +133,6 @@ def test_modulated_service(a: float, b: float, good: float, bad: float, period: 
     )
     theory = exact.modulated_drop_new(a, b, good, bad, period)
     assert age == pytest.approx(theory, rel=TOLERANCE)
-    # The package's own form, for any number of states and without scipy, is the same.
-    own = drop_new_age_ms(np.array([[-a, a], [b, -b]]), np.array([1 / good, 1 / bad]), period)
-    assert own == pytest.approx(theory, rel=1e-9)
-
-
-def test_the_packages_own_form_in_other_cases() -> None:
-    """One state; three states of which two are alike; slots so short that they are none; by hand."""
-    one = drop_new_age_ms(np.zeros((1, 1)), np.array([60.0]), 30.0)
-    assert one == pytest.approx(exact.dm1_drop_new(30.0, 1 / 60), rel=1e-12)
-    lumped = np.array([[-0.4, 0.4, 0.0], [0.1, -0.7, 0.6], [0.1, 0.3, -0.4]])  # the last two are one state
-    found = drop_new_age_ms(lumped, np.array([2.0, 5.0, 5.0]), 3.0)
-    assert found == pytest.approx(exact.modulated_drop_new(0.4, 0.1, 1 / 2, 1 / 5, 3.0), rel=1e-12)
-    two = np.array([[-0.4, 0.4], [0.1, -0.1]])
-    fine = drop_new_age_ms(two, np.array([2.0, 5.0]), 3.0, slot_ms=0.003)
-    assert fine == pytest.approx(found, rel=1e-5) and fine != found
-    with pytest.raises(ValueError, match="a whole number of slots in 3 ms"):
-        drop_new_age_ms(two, np.array([2.0, 5.0]), 3.0, slot_ms=0.7)
-
-
-@pytest.mark.parametrize("slot", [1.0, 2.0])
-def test_the_bias_of_a_chain_sampled_at_slots_is_what_theory_says(slot: float) -> None:
-    """A chain that switches ten times a period: 33 % and 62 % too old, against an exact value and not
-    against another simulation; and continuous time would not pass for it."""
-    chain = {"mu1_per_ms": 5.0, "mu2_per_ms": 5.0}
-    slotted = {**chain, "sampled": "slots", "slot_ms": slot}
-    q, means = np.array([[-5.0, 5.0], [5.0, -5.0]]), [0.2, 2.0]
-    predicted = drop_new_age_ms(q, np.array(means), 2.0, slot_ms=slot)
-    assert predicted > 1.02 * drop_new_age_ms(q, np.array(means), 2.0)
-    more: dict = {"service_state": "modulated", "seconds": 20}
-    found = mean_age(periodic(2.0), exponential(means), "drop-new", chain=slotted, **more)
-    assert found == pytest.approx(predicted, rel=TOLERANCE)
-    continuous = mean_age(periodic(2.0), exponential(means), "drop-new", chain=chain, **more)
-    assert continuous != pytest.approx(predicted, rel=0.1)
 
 
 def test_several_sources_at_one_server() -> None:
@@ -217,3 +183,21 @@ def test_slotted_age_differs_by_what_theory_says() -> None:
     section["service"] = exponential(60.0)
     found = simulate(channel_from_mapping(section), 4, 900, slot_ms=1.0).summary()
     assert found["mean_age_slotted_ms"] == pytest.approx(found["mean_age_ms"], abs=0.1)
+
+
+def test_losses_by_state() -> None:
+    """Gilbert and Elliott's channel: the mean age and peak age that bursts of losses leave."""
+    section: dict = {
+        "arrivals": "periodic:30ms",
+        "service": "det:20ms",
+        "discipline": "parallel",
+        "chain": "mu1=1/200,mu2=1/70",
+        "faults": {"loss": [0.05, 0.7]},
+    }
+    age, peak = exact.gilbert_elliott(1 / 200, 1 / 70, (0.05, 0.7), 30.0, 20.0)
+    found = simulate(channel_from_mapping(section), 1, 600, seed=5).summary()
+    assert found["mean_age_ms"] == pytest.approx(age, rel=TOLERANCE)
+    assert found["peak_age_ms"] == pytest.approx(peak, rel=TOLERANCE)
+    section["faults"] = {"loss": 0.05 * 20 / 27 + 0.7 * 7 / 27}  # as many losses, but not in bursts
+    found = simulate(channel_from_mapping(section), 1, 600, seed=5).summary()
+    assert found["mean_age_ms"] != pytest.approx(age, rel=TOLERANCE)

@@ -78,8 +78,6 @@ def test_keys_beside_a_preset_override_it() -> None:
         ("{faults: {rain: {}}}", "channel.faults.rain: unknown fault; expected one of loss"),
         ("{faults: {loss: [0.1, 0.2]}}", "channel: faults.loss.probability: expected one number or one a state"),
         ("{preset: ch6, faults: {loss: [0.1, 2]}}", "loss.probability[1]: expected a number, 0 to 1"),
-        ("{faults: {mahimahi: [3, 1]}}", "channel.faults.mahimahi: opportunities_ms: expected ascending"),
-        ("{preset: 'mahimahi:/no/such'}", "/no/such: cannot be read"),
         ("{service: 'exp'}", "channel.service: 'exp': expected exp:60ms"),
         ("{chain: 'mu3=1'}", "channel.chain: 'mu3=1': expected mu1="),
         ("{faults: {blackout: {windows_ms: [[5, 3]]}}}", "channel.faults.blackout: windows_ms"),
@@ -115,40 +113,13 @@ def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) 
             "{preset: gilbert-elliott, faults: {corruption: 0.1}}",
             "{preset: gilbert-elliott, faults: {loss: [0.01, 0.5], corruption: {probability: 0.1}}}",
         ),
-        ("{preset: 'mahimahi:a.trace'}", "{discipline: fcfs, faults: {mahimahi: {opportunities_ms: [0, 2, 2, 10]}}}"),
     ],
 )
 def test_the_short_notation_stands_for_sections(tmp_path: Path, short: str, long: str) -> None:
     """Files are relative to the given folder; the preset's name alone may differ."""
     (tmp_path / "delays.csv").write_text("# a link\ntime_s,delay_us\n0.1,1500\n0.2,20000\n0.3,3000\n")
-    (tmp_path / "a.trace").write_text("0\n2\n2\n10\n")
     found, expected = [channel_from_mapping(yaml.safe_load(text), "t", tmp_path) for text in (short, long)]
     assert msgspec.structs.replace(found, preset=None) == msgspec.structs.replace(expected, preset=None)
-
-
-def test_a_profile_of_errant(tmp_path: Path) -> None:
-    """Half the round trip each way, and as many packets of 1500 bytes as the upload has."""
-    head = "operator,country,rat,signal_quality,download_kbps,upload_kbps,latency_ms_avg,latency_ms_stdev\n"
-    (tmp_path / "p.csv").write_text(
-        head + "one,here,4G,good,9000,2400,80,20\none,here,3G,bad,900,130,200,50\none,here,3G,endless,900,1e9,200,50\n"
-    )
-    good, bad = [
-        channel_from_mapping({"preset": f"errant:p.csv:one/here/{name}"}, "t", tmp_path)
-        for name in ("4g/good", "3G/bad")
-    ]
-    assert (good.service.law, good.service.mean_ms, good.service.shape) == ("gamma", 40.0, 16.0)
-    for config, kbps in ((good, 2400), (bad, 130)):
-        times_ms = config.faults["mahimahi"].opportunities_ms
-        assert len(times_ms) * 12_000 / times_ms[-1] == pytest.approx(kbps, rel=0.001)
-    wrong = {
-        "p.csv:one/here/5g/good": "no profile",
-        "p.csv:one/here/3G/endless": "upload_kbps is 1e",
-        "no.csv:x": "cannot be read",
-        "p.csv": "expected one of",
-    }
-    for words, why in wrong.items():
-        with pytest.raises(ValueError, match=why):
-            channel_from_mapping({"preset": f"errant:{words}"}, "t", tmp_path)
 
 
 def test_only_listed_faults_are_imported() -> None:

@@ -93,20 +93,6 @@ def test_losses_follow_the_state_in_which_transmission_starts() -> None:
         assert np.mean(lost) == pytest.approx(chance, abs=4 * (chance * (1 - chance) / len(lost)) ** 0.5)
 
 
-def test_packets_leave_at_recorded_instants() -> None:
-    """Opportunities at 2, 2, 5 and 10 ms, then at 12, 12, 15, 20, ...: one for each packet, in order."""
-    section = {"discipline": "fcfs", "faults": {"mahimahi": [2, 2, 5, 10]}}
-    subject = Channel(channel_from_mapping(section), 1).link("a")
-    # When it is offered, its bytes, when it leaves.
-    frames = [(0, 1500, 2), (0, 1501, 5), (6, 0, 10), (10, 3000, 12), (12, 10, 15), (20, 1, 20), (40, 3000, 42)]
-    transits = [subject.offer(at * MS, None, size)[0] for at, size, _ in frames]
-    subject.advance(100 * MS)
-    assert [t.due_ns for t in transits] == [at * MS for *_, at in frames]
-    section["discipline"] = "parallel"  # of a line, frames that start together queue as well
-    subject = Channel(channel_from_mapping(section), 1).link("a")
-    assert [subject.offer(0, None, 1500)[0].due_ns for _ in range(5)] == [at * MS for at in (2, 2, 5, 10, 12)]
-
-
 def test_an_unlisted_fault_changes_no_draw() -> None:
     """The same delays with and without faults: their numbers come from streams of their own."""
     section = {"service": {"law": "exponential", "mean_ms": 3.0}, "discipline": "parallel"}
