@@ -77,8 +77,8 @@ class UpdateCounts(Struct):
     refused: dict[str, Count] = field(default_factory=dict)
 
 
-class Baseline(Struct):
-    """PSNR of two baselines that need no field."""
+class Baseline(Struct, frozen=True):
+    """PSNR of two baselines that need no field: a flat image in the mean color, and the nearest camera's own image."""
 
     mean_colour_db: Number | None = None
     nearest_view_db: Number | None = None

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge_server.fidelity.images import BLACK, Color, to_unit
 from edge_server.fidelity.psnr import psnr, psnr_of_mse
 from edge_server.fields import View
+from edge_server.run_records import Baseline
 
 
-@dataclass(frozen=True)
-class Baseline:
-    """PSNR in dB of both baselines; None where there was no training view."""
+class BaselineMean:
+    """The running mean of the baselines of any number of images; other threads may read ``mean``."""
 
-    mean_colour_db: float | None
-    nearest_view_db: float | None
+    def __init__(self) -> None:
+        self.mean = Baseline()
+        self._count = 0
+
+    def add(self, found: Baseline) -> None:
+        """Take the baselines of one image; both are known."""
+        self._count += 1
+        pairs = zip(msgspec.structs.astuple(self.mean), msgspec.structs.astuple(found))
+        self.mean = Baseline(*((mean or 0.0) + (db - (mean or 0.0)) / self._count for mean, db in pairs))
 
 
 def baseline(views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Color = BLACK) -> Baseline:
-    """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4)."""
+    """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4); none without views."""
     if not views:
-        return Baseline(None, None)
+        return Baseline()
     return Baseline(
         mean_colour_db=mean_colour_db([v.image for v in views], truth, background),
         nearest_view_db=view_db(nearest_view(views, camera_to_world).image, truth, background),

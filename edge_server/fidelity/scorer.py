@@ -100,6 +100,7 @@ class _Frame:
     background: Color = BLACK
     # As decoded: 8-bit images take an eighth of the memory of the metrics' float64.
     image: NDArray | None = None
+    compared: bool = False  # with the frame before, for the noise
 
     def pixels(self) -> Image:
         if self.image is None:
@@ -301,7 +302,9 @@ class Scorer:
         if truth is None:
             return None
         viewpoint = frames[nearest].viewpoint
-        if self._noisy_truth and nearest > 0 and frames[nearest - 1].viewpoint == viewpoint:
+        known = frames[nearest].compared or nearest == 0 or frames[nearest - 1].viewpoint != viewpoint
+        if self._noisy_truth and not known:
+            frames[nearest].compared = True
             before = state.pixels(frames[nearest - 1])
             if before is not None:
                 state.noise.add(before, truth)

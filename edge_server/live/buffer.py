@@ -122,10 +122,14 @@ class FrameBuffer:
         used = tuple(item for item in selected if id(item) not in left_out)
         return used, tuple(sorted(others, key=lambda item: item.received_ns))
 
+    def observe(self) -> tuple[int, dict[str, Frame]]:
+        """``arrivals`` and ``newest`` at one instant: the newest frames are among those counted."""
+        with self._arrived:
+            return self.arrivals, {c: self._newest[c] for c in self.cameras if c in self._newest}
+
     def newest(self) -> dict[str, Frame]:
         """Omega(t): the newest frame of every camera that has reported, in the order of ``cameras``."""
-        with self._arrived:
-            return {c: self._newest[c] for c in self.cameras if c in self._newest}
+        return self.observe()[1]
 
     def ages_ms(self, now_ns: int) -> dict[str, float | None]:
         """Age of each camera (5.4); None for one that never reported."""

@@ -159,16 +159,16 @@ class FieldUpdater:
         budget: what the fit that follows may spend; one in seconds sets the limit.
         most_new: the limit otherwise (virtual time, where no clock tells what the field has time for).
         """
-        arrivals = self.buffer.arrivals - self._selected_of
+        total, newest = self.buffer.observe()
+        arrivals = total - self._selected_of
         nothing_new = not arrivals and not self.buffer.held_back
         if now_ns < plan.wait_until_ns or (self.on_arrivals and nothing_new):
             return None
         self._follow_field()
-        newest = self.buffer.newest()
         cameras = self.policy.select(self._epoch(newest, now_ns), plan)
         if not cameras:
             return None
-        self._selected_of += arrivals
+        self._selected_of = total
         items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, most_new))
         if self.field.frame_s is not None:
             own = {item.camera: item for item in items}

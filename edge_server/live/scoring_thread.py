@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.baselines import Baseline, baseline
+from edge_server.fidelity.baselines import BaselineMean, baseline
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import View
 from edge_server.live.state import Comparison, Publication, Snapshot
@@ -95,7 +95,7 @@ class ScoringThread:
         self._views: list[View] = []
         self._rendered: dict[tuple[str, int], NDArray[np.float32]] = {}
         self.undecodable = 0
-        self.baselines: list[Baseline] = []
+        self.baselines = BaselineMean()
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
 
     def start(self) -> None:
@@ -237,7 +237,7 @@ class ScoringThread:
         frame = min(frames, key=lambda f: abs(f.generated_edge_ns - generated_ns))
         truth = self._decode(frame)
         if number % _BASELINE_EVERY == 0 and self._views:
-            self.baselines.append(baseline(self._views, truth, frame.pose.matrix()))
+            self.baselines.add(baseline(self._views, truth, frame.pose.matrix()))
         return Comparison(score.camera, truth[..., :3], to_bytes(image), number)
 
     def _score_selected(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import msgspec
-import numpy as np
 
 from edge_server.config import EdgeConfig, described, embedding_for, read_config
 from edge_server.edge_defaults import cameras_move
@@ -168,7 +167,6 @@ class EdgeServer:
             self._set_status_line,
             self._write_checkpoint,
         )
-        embedder = self.updater.embedder
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
@@ -184,7 +182,6 @@ class EdgeServer:
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
             decision=lambda: self.updater.policy.last_decision,
-            embed=None if embedder is None else embedder.embed,
         )
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", asdict(self.frontier))
@@ -266,8 +263,6 @@ class EdgeServer:
         self._update_ms.add(publication.update_ms)
         self._without_step += publication.steps == 0
         self._refused.update(publication.refused)
-        if self.state.bounds is None:
-            self.state.bounds = getattr(self.updater.field, "bounds", None)
         self.state.publish(publication, renderer)
         self.journal.published(publication)
         self._decision_log.record(self.updater.policy, publication.number)
@@ -302,7 +297,7 @@ class EdgeServer:
         """Follow the updater, which has begun anew because ``camera`` moves."""
         self.config, self._moving = config, camera
         self.loop.update_ms = config.update_ms
-        self.state.chosen, self.state.bounds = described(self.scenario, config, camera), None
+        self.state.chosen = described(self.scenario, config, camera)
         log.info("%s", self.state.chosen)
         with contextlib.suppress(ValueError):  # the file that a scenario names may know the first choice only
             self.frontier = self.state.frontier = open_frontier(self.scenario, config)
@@ -348,12 +343,6 @@ class EdgeServer:
     def status(self) -> dict[str, Any]:
         """Contents of edge.json."""
         last, scored = self.state.newest(), self.state.newest(scored=True)
-        baselines = self.scoring.baselines
-
-        def mean(name: str) -> float | None:
-            values = [v for b in list(baselines) if (v := getattr(b, name)) is not None]
-            return float(np.mean(values)) if values else None
-
         return {
             **({} if self.recorder is None else {"recording": self.recorder.status()}),
             "scenario": self.scenario.name,
@@ -385,7 +374,7 @@ class EdgeServer:
                 "refused": dict(self._refused),
             },
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
-            "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
+            "baseline": msgspec.to_builtins(self.scoring.baselines.mean),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
@@ -127,11 +127,9 @@ class EdgeState:
     start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
-    embed: embeds images as that policy does, on any thread; None where nothing is embedded.
     scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
-    bounds: world box (2, 3) in meters of what the field represents, once known.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
@@ -146,13 +144,11 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     decision: Callable[[], Decision | None] = lambda: None
-    embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
     scores: dict[str, Any] | None = None
     frontier: Frontier | None = None
     field_name: str = ""
     chosen: str = ""
     started: bool = False
-    bounds: NDArray[np.float64] | None = None
     status_line: str = ""
     warnings: list[str] = field(default_factory=list)
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))

@@ -31,8 +31,6 @@ __all__ = ["Page", "PageError", "start_page"]
 log = logging.getLogger(__name__)
 
 REFRESH_S = 0.5
-# Number of first updates during which the field's points are shown: they say more than a blurred rendering.
-POINT_UPDATES = 6
 BRAND: tuple[int, int, int] = (0, 150, 115)
 
 
@@ -78,9 +76,9 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
         dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium"
     )
     scene = Scene(server, state)
-    renders = RenderLoop(state, scene.show_points)
+    renders = RenderLoop(state)
     panel = Panel(server, state)
-    refresher = _Refresher(server, state, scene, renders, panel)
+    refresher = _Refresher(server, state, scene, panel)
 
     async def joined(client: viser.ClientHandle) -> None:
         renders.add_client(client)
@@ -112,15 +110,11 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
 class _Refresher:
     """The thread that keeps scene, panel and history up to date, at a fixed low rate."""
 
-    def __init__(
-        self, server: viser.ViserServer, state: EdgeState, scene: Scene, renders: RenderLoop, panel: Panel
-    ) -> None:
-        self._server, self._state = server, state
-        self._scene, self._renders, self._panel = scene, renders, panel
+    def __init__(self, server: viser.ViserServer, state: EdgeState, scene: Scene, panel: Panel) -> None:
+        self._server, self._state, self._scene, self._panel = server, state, scene, panel
         self._history = History()
         self._stopped = threading.Event()
         self._last_error = ""
-        self._wanted: tuple[Any, ...] = ()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def start(self) -> None:
@@ -153,23 +147,8 @@ class _Refresher:
         self._history.sample(state.now_s(), cameras, channel)
         watched = bool(self._server.get_clients())
         self._scene.refresh(cameras, watched)
-        if not watched and self._wanted:
-            return
-        publications = state.publications()
-        self._panel.refresh(cameras, self._history, publications, channel)
-        self._choose_view(publications[-1].number + 1 if publications else 0)
-
-    def _choose_view(self, updates: int) -> None:
-        """Tell the render loop what visitors want to see: points during the first updates, then images."""
-        controls = self._panel.controls
-        view = controls.view.value
-        early = updates < controls.updates_at_reset + POINT_UPDATES
-        points = view == "points" or (view == "automatic" and early)
-        wanted = (points, view != "points", controls.occlude.value)
-        if wanted != self._wanted:
-            self._wanted = wanted
-            self._renders.want_points, self._renders.want_rendering, self._renders.occlude = wanted
-            self._renders.refresh()
+        if watched:
+            self._panel.refresh(cameras, self._history, state.publications(), channel)
 
 
 def page_url(host: str, port: int, tls: bool = False) -> str:

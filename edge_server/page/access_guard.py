@@ -96,8 +96,6 @@ class Update(msgspec.Struct, tag="GuiUpdateMessage"):
         options = getattr(handle, "options", None)
         if options is not None:
             return value in options
-        if isinstance(handle.value, bool):
-            return isinstance(value, bool)
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

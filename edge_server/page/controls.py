@@ -22,7 +22,6 @@ from edge_server.scheduler import make_policy, policy_help, short_name
 log = logging.getLogger(__name__)
 
 NOTICE_S = 8.0
-VIEWS = ("automatic", "rendering", "points")
 
 
 class ControlPanel:
@@ -46,13 +45,7 @@ class ControlPanel:
         self.chosen = gui.add_html("", visible=bool(state.chosen))
         self.frontier = gui.add_html("", visible=state.frontier is not None)
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
-        self.view = gui.add_dropdown(
-            "view", VIEWS, hint="Automatic shows the field's points at first, then its rendering."
-        )
-        self.occlude = gui.add_checkbox("occlusion", False, hint="Hide cameras behind the field's surfaces.")
         self._paused: bool | None = None
-        self.updates_at_reset = 0
-        """Number of updates at the last reset from this page; the field starts again from there."""
         self.policy.on_update(lambda event: self._policy_chosen(event))
         self.value.on_update(lambda event: self._value_entered(event))
         self.buttons.on_click(self._pressed)
@@ -99,7 +92,6 @@ class ControlPanel:
         pressed, client, controls = event.target.value, event.client, self._state.controls
         if pressed == "reset":
             controls.reset_requested = True
-            self.updates_at_reset = next((p.number + 1 for p in reversed(self._state.publications())), 0)
             notify(client, "Reset", "The field forgets the scene and starts again.")
         elif pressed == "snapshot":
             save = partial(self._attempt, client, "snapshot", lambda: self._snapshot(client))

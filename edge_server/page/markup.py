@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -253,24 +252,6 @@ def _bar(name: str, share: float, widest: float) -> str:
         f'<div style="{bar}"></div>'
         f'<span style="text-align:right;font-variant-numeric:tabular-nums">{share:+.2f}</span></div>'
     )
-
-
-def channel_state(channel: dict[str, Any] | None) -> str:
-    """The state that the channel's chain is in, among all its states, and since when; empty without one."""
-    channel = channel or {}
-    state, states, series = channel.get("state"), channel.get("states"), channel.get("series")
-    if not isinstance(state, str) or not isinstance(states, list) or len(states) < 2:
-        return ""
-    cells = ""
-    for k, name in enumerate(states):
-        style = f"border-left:3px solid {css(scale_color(k / (len(states) - 1)))};font-weight:600"
-        style = style if name == state else f"{_DIM};opacity:.6"
-        cells += f'<span style="{_CARD};padding:.15em .6em;margin-right:.4em;{style}">{escape(str(name))}</span>'
-    since = ""
-    with suppress(KeyError, TypeError, ValueError, IndexError):  # of an emulator of another version
-        since = f"for {float(channel['uptime_s']) - float(series[-1][0]):.1f} s"  # type: ignore[index]
-    style = "padding:0 .9em .5em;font-size:.82em"
-    return f'<div style="{style}">channel {cells}<span style="{_DIM}">{since}</span></div>'
 
 
 def policy_scores(scores: dict[str, Any]) -> str:

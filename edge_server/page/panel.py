@@ -14,7 +14,6 @@ from edge_server.live.state import CameraView, Comparison, EdgeState, Publicatio
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
 from edge_server.page.decision_explanation import DecisionExplanation
-from edge_server.page.mesh_layer import MeshLayer
 from edge_server.page.timelines import History, Timelines
 
 MAIN_WIDTH = 372
@@ -39,7 +38,6 @@ class Panel:
         if state.warnings:
             gui.add_html(markup.warning(f"Insecure: {'; '.join(state.warnings)}."))
         self._status = gui.add_html("")
-        self._channel_state = gui.add_html("", visible=False)
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
         self._compared_update: int | None = None
@@ -47,7 +45,6 @@ class Panel:
         self._explanation = DecisionExplanation(gui, state)
         with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
-            self.surface = MeshLayer(server, state)
         if state.scores is not None:
             with gui.add_folder("What policies reach"):
                 gui.add_html(markup.policy_scores(state.scores))
@@ -74,8 +71,6 @@ class Panel:
         self._status.content = markup.status(summary(self._state, cameras, publications))
         self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
-        self._channel_state.content = markup.channel_state(channel)
-        self._channel_state.visible = bool(self._channel_state.content)
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
             self._channel.visible = True

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering, Snapshot
+from edge_server.fields import Snapshot
 from edge_server.live.state import EdgeState
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
@@ -48,14 +48,6 @@ LEAST_S = 0.03
 BAND_S = 0.1
 MIN_GAP_S = 0.05
 SETTLE_S = 0.25
-POINTS = 8000
-POINTS_SHARE = 0.05
-POINTS_EVERY_S = 1.0
-# viser packs depth into 24 bits of 1e-5 m: the largest depth that fits.
-FAR_M = 167.0
-# A multiple of 256 units has a constant low byte, which PNG compresses five times better.
-DEPTH_STEP_M = 256e-5
-DEPTH_ROWS = 180
 BACKDROP = np.array([18, 20, 24], np.float32) / 255
 
 
@@ -79,24 +71,17 @@ class ClientState:
 
 
 class RenderLoop:
-    """The render thread. It calls ``show_points(points, colors)`` with the field's points while
-    ``want_points`` is set, and with (None, None) once it no longer is."""
+    """The render thread."""
 
-    def __init__(self, state: EdgeState, show_points: Any) -> None:
+    def __init__(self, state: EdgeState) -> None:
         self._state = state
-        self._show_points = show_points
         self._visitors: dict[int, ClientState] = {}
         self._wake = threading.Condition()
         self._stopped = False
         self._rows = [1.5 * level.min_rows for level in LEVELS]
         self._not_before = [0.0] * len(LEVELS)
-        self._points_from: Snapshot | None = None
-        self._points_not_before = 0.0
-        self._points_shown = False
+        self._took_s = [level.budget_s for level in LEVELS]  # the last whole image of each level
         self._last_error = ""
-        self.want_points = False
-        self.want_rendering = True
-        self.occlude = False
         self._thread = threading.Thread(target=self._run, name="page-render", daemon=True)
 
     def start(self) -> None:
@@ -141,14 +126,6 @@ class RenderLoop:
             visitor.level = -1
             self._wake.notify_all()
 
-    def refresh(self) -> None:
-        """Render again for every visitor, after a change of the view options."""
-        with self._wake:
-            for visitor in self._visitors.values():
-                visitor.level = -1
-            self._points_from = None
-            self._wake.notify_all()
-
     # --- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -171,16 +148,7 @@ class RenderLoop:
         renderer = self._state.renderer
         with self._wake:
             visitors = [v for v in self._visitors.values() if v.viewpoint is not None]
-        if not visitors:
-            return False
-        if self._update_points(renderer, now):
-            return True
-        if renderer is None or not self.want_rendering:
-            for visitor in visitors:
-                if visitor.level < len(LEVELS) and visitor.sent:
-                    visitor.client.scene.set_background_image(None)
-                    visitor.sent = 0
-                visitor.level = -1
+        if not visitors or renderer is None:
             return False
         levels = [(self._next_level(visitor, renderer, now), visitor.sent, visitor) for visitor in visitors]
         due = [(level, sent, visitor) for level, sent, visitor in levels if level is not None]
@@ -220,12 +188,9 @@ class RenderLoop:
         if image is None:
             return
         self._adapt(level, spent)
-        color, depth = browser_images(image, camera)
         if visitor.client.client_id not in self._visitors:  # has left meanwhile
             return
-        visitor.client.scene.set_background_image(
-            color, format="jpeg", jpeg_quality=85, depth=depth if self.occlude else None
-        )
+        visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
         visitor.sent += 1
         with self._wake:
             if visitor.serial == serial:
@@ -241,46 +206,23 @@ class RenderLoop:
 
     def _adapt(self, number: int, spent: float) -> None:
         """Change the rows of the next image so that it takes about the time budget of its level."""
-        level = LEVELS[number]
+        level, self._took_s[number] = LEVELS[number], spent
         change = np.clip(np.sqrt(self._budget_s(number) / max(spent, 1e-4)), 0.7, 1.3)
         self._rows[number] = float(np.clip(self._rows[number] * change, level.min_rows, level.max_rows))
 
     def _render(
         self, renderer: Snapshot, pose: NDArray, camera: Pinhole, visitor: ClientState, serial: int, level: int
-    ) -> Rendering | None:
-        """The image, rendered in bands; None if the visitor has moved meanwhile."""
-        bands = max(1, round(LEVELS[level].budget_s / BAND_S)) if level else 1
+    ) -> NDArray[np.float32] | None:
+        """The color, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole
+        field again, so that there are no more of them than the time of the last such image calls for."""
+        bands = max(1, round(self._took_s[level] / BAND_S)) if level else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
         parts = []
         for top, bottom in pairwise(edges):
             if level and (visitor.serial != serial or self._stopped):
                 return None
-            parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))))
-        return Rendering(
-            np.concatenate([p.color for p in parts]),
-            np.concatenate([p.depth for p in parts]),
-            np.concatenate([p.opacity for p in parts]),
-        )
-
-    def _update_points(self, renderer: Snapshot | None, now: float) -> bool:
-        """Update the point cloud if it is wanted and due; remove it if not wanted. True if updated."""
-        if renderer is None or not self.want_points:
-            if self._points_shown:
-                self._points_shown, self._points_from = False, None
-                self._show_points(None, None)
-            return False
-        if renderer is self._points_from or now < self._points_not_before:
-            return False
-        points, colors = renderer.points(POINTS)
-        spent = perf_counter() - now
-        self._points_not_before = now + max(POINTS_EVERY_S, spent / POINTS_SHARE)
-        self._points_from = renderer
-        points, colors = np.asarray(points, np.float32), np.asarray(colors, np.float32)
-        good = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
-        if good.any():
-            self._points_shown = True
-            self._show_points(points[good], np.clip(colors[good] * 255, 0, 255).astype(np.uint8))
-        return True
+            parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))).color)
+        return np.concatenate(parts)
 
     def _log_error(self, error: Exception) -> None:
         """Log an error once, not at every frame, and pause for a second."""
@@ -290,26 +232,12 @@ class RenderLoop:
             self._last_error = text
         until = perf_counter() + 1.0
         self._not_before = [max(t, until) for t in self._not_before]
-        self._points_not_before = max(self._points_not_before, until)
 
 
-def browser_images(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The images for a browser: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, meters.
-
-    Pixels that are not finite become empty space.
-    """
-    color = np.nan_to_num(image.color, nan=0.0, posinf=1.0, neginf=0.0).astype(np.float32)
-    opacity = np.clip(np.nan_to_num(image.opacity, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-    bad: NDArray[np.bool_] = ~np.all(np.isfinite(image.color), axis=-1)
-    opacity = np.where(bad, 0.0, opacity).astype(np.float32)
-    color = np.where(bad[..., None], BACKDROP, color)
-    step = max(1, -(-camera.height // DEPTH_ROWS))
-    distance = image.depth[::step, ::step]
-    axial = np.asarray(distance, np.float32) * camera.rays()[::step, ::step, 2].astype(np.float32)
-    empty = ~np.isfinite(axial) | (axial <= 0) | (opacity[::step, ::step] < 0.5)
-    axial = np.where(empty, FAR_M, np.minimum(axial, FAR_M)).astype(np.float32)
-    depth = np.round(axial / DEPTH_STEP_M) * np.float32(DEPTH_STEP_M)
-    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8), depth.astype(np.float32)
+def browser_image(color: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Color (H, W, 3) as uint8; pixels that are not finite show the backdrop."""
+    good = np.isfinite(color).all(axis=-1, keepdims=True)
+    return (np.clip(np.where(good, color, BACKDROP), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _same(a: tuple | None, b: tuple) -> bool:

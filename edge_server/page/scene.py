@@ -1,4 +1,4 @@
-"""The 3D scene: a frustum for each camera, the field's points, and the starting viewpoint of visitors."""
+"""The 3D scene: a frustum for each camera, and the starting viewpoint of visitors."""
 
 from __future__ import annotations
 
@@ -51,13 +51,12 @@ class Scene:
         self._state = state
         self._nodes: dict[str, _CameraNode] = {}
         self._viewpoint: Viewpoint | None = None
-        self._placed_for = 0
+        self._placed_for = (0, False)  # number of cameras, and whether the field's box was known
         self._first_seen: float | None = None
         self._seen = 0
         self._seen_at = 0.0
         self._placed: dict[int, NDArray[np.float64]] = {}
         self._next_thumbnail = 0
-        self._points: Any = None
         self._undecodable: set[str] = set()
 
     def refresh(self, cameras: list[CameraView], watched: bool) -> None:
@@ -69,24 +68,6 @@ class Scene:
             if camera.newest is not None:
                 self._frustum(camera, camera.newest)
         self._thumbnails([c for c in cameras if c.newest is not None])
-
-    def show_points(self, points: NDArray | None, colors: NDArray | None) -> None:
-        """Show points (N, 3) with uint8 colors (N, 3), or none."""
-        if points is None or colors is None:
-            if self._points is not None:
-                self._points.remove()
-                self._points = None
-            return
-        radius = self._viewpoint.radius_m if self._viewpoint else 1.0
-        self._points = self._server.scene.add_point_cloud(
-            "/field/points",
-            points,
-            colors,
-            point_size=radius * 0.006,
-            point_shape="circle",
-            precision="float32",
-            point_shading="flat",
-        )
 
     # --- frustums -------------------------------------------------------------------------------
 
@@ -173,7 +154,8 @@ class Scene:
     # --- the starting viewpoint -----------------------------------------------------------------
 
     def _place_visitors(self, cameras: list[CameraView]) -> None:
-        """Choose the starting viewpoint when cameras have reported, and again while more of them do."""
+        """Choose the starting viewpoint when cameras have reported, again while more of them do, and once the field
+        knows its box."""
         poses = [c.newest.pose.matrix() for c in cameras if c.newest is not None]
         now = perf_counter()
         if not poses:
@@ -183,9 +165,11 @@ class Scene:
         if len(poses) > self._seen:
             self._seen, self._seen_at = len(poses), now
         complete = len(poses) == len(cameras) or now - self._seen_at > QUIET_S
-        if len(poses) > self._placed_for and complete and now - self._first_seen < SETTLE_S:
-            self._placed_for = len(poses)
-            self._viewpoint = initial_viewpoint(np.stack(poses), self._state.bounds)
+        box = getattr(self._state.renderer, "box", None)
+        known = (len(poses), box is not None)
+        if known > self._placed_for and complete and now - self._first_seen < SETTLE_S:
+            self._placed_for = known
+            self._viewpoint = initial_viewpoint(np.stack(poses), None if box is None else box.centre_m)
             start, view = self._server.initial_camera, self._viewpoint
             self._server.scene.set_up_direction(view.up)
             start.position, start.look_at, start.up = view.position, view.look_at, view.up

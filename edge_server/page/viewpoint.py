@@ -71,23 +71,22 @@ def convergence_point(poses: Array) -> Array | None:
     return point if np.median(ahead) > 0 else None
 
 
-def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> Viewpoint:
+def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> Viewpoint:
     """A viewpoint behind and above the cameras, looking at what they look at.
 
-    poses: camera-to-world (N, 4, 4), N >= 1. bounds: the field's box (2, 3), used if the optical axes do not
-    meet. All values returned are finite.
+    poses: camera-to-world (N, 4, 4), N >= 1. center: the middle (3,) of the field's box, used if the optical
+    axes do not meet. All values returned are finite.
     """
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     up = world_up(poses)
-    center = convergence_point(poses)
-    box = None if bounds is None else np.asarray(bounds, dtype=np.float64)
-    if center is None and box is not None and np.all(np.isfinite(box)):
-        center = box.mean(axis=0)
+    meeting = convergence_point(poses)
+    center = center if meeting is None else meeting
     if center is None:
         spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
         ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > _SCATTERED else axes[0]
         center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
+    center = np.asarray(center, dtype=np.float64)
     radius = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     radius = max(radius, 1e-2)
     direction = _outward(eyes - center, up, radius)

@@ -29,7 +29,7 @@ class EdgeCollector:
                 age.add_metric([camera.camera], camera.age_ms / 1e3)
             delivered.add_metric([camera.camera], camera.delivered)
         rejected = CounterMetricFamily("freshfield_frames_rejected", "frames refused", labels=["reason"])
-        for reason, count in self._ingest.rejected.items():
+        for reason, count in dict(self._ingest.rejected).items():  # ingest adds reasons meanwhile
             rejected.add_metric([reason], count)
         shed = self._ingest.buffer.shed
         yield from (age, delivered, rejected)

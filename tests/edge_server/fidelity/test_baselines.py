@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.fidelity.baselines import baseline, mean_colour_db, nearest_view, view_db
+from edge_server.fidelity.baselines import BaselineMean, baseline, mean_colour_db, nearest_view, view_db
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fields import View
+from edge_server.run_records import Baseline
 from freshfield.geometry import Pinhole, look_at
 
 
@@ -44,5 +45,11 @@ def test_both_together_and_none_without_views():
     found = baseline([view("a", (2, 0, 0)), view("b", (0, 2, 0), truth)], truth, look_at((0, 2.1, 0), (0, 0, 0)))
     assert found.nearest_view_db == PSNR_CEILING_DB
     assert found.mean_colour_db == pytest.approx(-20 * np.log10(64 / 255))
+    mean = BaselineMean()
+    assert mean.mean == Baseline()
+    for each in (found, Baseline(1.0, 2.0), Baseline(3.0, 7.0)):
+        mean.add(each)
+    expected = (found.mean_colour_db + 4.0) / 3, (found.nearest_view_db + 9.0) / 3
+    assert (mean.mean.mean_colour_db, mean.mean.nearest_view_db) == pytest.approx(expected)
     empty = baseline([], truth, np.eye(4))
     assert (empty.mean_colour_db, empty.nearest_view_db) == (None, None)

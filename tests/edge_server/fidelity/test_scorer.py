@@ -64,6 +64,15 @@ def test_nothing_moves_in_a_static_scene():
     assert score.psnr_moving_db is None and score.moving_share == 0.0
 
 
+def test_a_pair_of_frames_tells_the_noise_once_however_often_it_is_scored():
+    scorer = Scorer(noisy_truth=True)
+    for ms in range(0, 200, 40):
+        scorer.held_out("h", truth_at(ms), ms * MS)
+    for _ in range(5):
+        assert scorer.publish("h", np.zeros((48, 48, 3), np.float32), 150 * MS)
+    assert len(scorer._camera("h").noise.pairs) == 1
+
+
 def test_no_capture_within_half_a_period_means_no_score():
     scorer = Scorer(period_ms=40)
     feed(scorer, 400)

@@ -75,6 +75,26 @@ def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_ev
     assert again.arrivals == 1 and again.others == () and len(again.items) == 2
 
 
+def test_a_frame_that_arrives_during_a_selection_is_used_by_the_next_one_and_once(monkeypatch):
+    u = updates(cameras=("cam01",))
+    u.on_arrivals = True
+    u.buffer.put(frame(generated_ns=10 * MS), 10 * MS)
+    follow, late = u._follow_field, [frame(sequence=1, generated_ns=20 * MS)]
+
+    def meanwhile():
+        follow()
+        if late:
+            u.buffer.put(late.pop(), 20 * MS)
+
+    monkeypatch.setattr(u, "_follow_field", meanwhile)
+    found = [u.select(u.plan(30 * MS), 30 * MS) for _ in range(3)]
+    assert [selection and [(i.sequence, selection.arrivals) for i in selection.items] for selection in found] == [
+        [(0, 1)],
+        [(1, 1)],
+        None,
+    ]
+
+
 def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     cameras = tuple(f"cam{k:02d}" for k in range(8))
     u = updates(cameras=cameras)

@@ -1,25 +1,21 @@
 """A toy deployment for the page.
 
-A ball circles over a floor. Cameras on an arc capture it, a toy network delays the images, and the "field" is
-the analytic scene at the mean capture time of the views that the policy selects: what a perfect field would
-show. Ages, policies and scores are computed, so their relations are real; only the learning is left out.
+A ball circles over a floor, and cameras on an arc see it. The "field" is the analytic scene at the instant of an
+update: what a perfect field would show. Only learning and network are left out.
 """
 
 from __future__ import annotations
 
 import json
 import threading
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.scheduler import POLICIES, Epoch, Policy, make_policy
+from edge_server.scheduler import POLICIES, make_policy
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame
@@ -30,7 +26,6 @@ LENS = Pinhole.from_fov(128, 96, 55.0)
 BALL_RADIUS_M = 0.55
 ORBIT_RADIUS_M = 0.6
 PERIOD_S = 6.0
-CAPTURE_S = 0.25
 UPDATE_S = 0.8
 FLOOR_RADIUS_M = 2.2
 EMPTY = np.array([0.10, 0.115, 0.135])
@@ -68,17 +63,6 @@ class BallScene:
             color.astype(np.float32), np.where(seen, depth, 0.0).astype(np.float32), seen.astype(np.float32)
         )
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        half = count // 2
-        rng = np.random.default_rng(0)
-        directions = rng.normal(size=(half, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        ball = self.center + BALL_RADIUS_M * directions
-        radius, angle = FLOOR_RADIUS_M * np.sqrt(rng.random(half)), 2 * np.pi * rng.random(half)
-        floor = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(half)], axis=1)
-        colors = np.concatenate([self._ball_color(ball), self._floor_color(floor)])
-        return np.concatenate([ball, floor]).astype(np.float32), colors.astype(np.float32)
-
     def _ball_color(self, at: NDArray) -> NDArray:
         normal = (at - self.center) / BALL_RADIUS_M
         turned = np.arctan2(normal[..., 1], normal[..., 0]) - self.spin
@@ -94,171 +78,81 @@ class BallScene:
 
 
 class Preview:
-    """The cameras, network and updates of the toy deployment."""
+    """The cameras and updates of the toy deployment, on a thread of its own."""
 
-    def __init__(self, folder: Path, cameras: int = CAMERAS, silent: int = 0, seed: int = 0) -> None:
-        """folder: for snapshots. cameras: 3 or more. silent: how many of them never report."""
-        if cameras < 3:
-            raise ValueError(f"3 cameras or more are needed, not {cameras}: the middle one is held out")
+    def __init__(self, folder: Path, cameras: int = CAMERAS, silent: int = 0) -> None:
+        """folder: for snapshots. silent: how many cameras never report. The middle one is held out."""
         self._folder = folder
         self._clock = WallClock()
-        self._start_ns = self._clock.now_ns()
-        self._rng = np.random.default_rng(seed)
-        self._lock = threading.Lock()
         self._stopped = threading.Event()
         self.names = tuple(f"cam{i:02d}" for i in range(cameras))
-        self._silent = set(self.names[cameras - silent :])
+        self._reporting = self.names[: cameras - silent]
         self._held_out = self.names[cameras // 2]
         self._poses = {name: _arc(i, cameras) for i, name in enumerate(self.names)}
         self._newest: dict[str, Frame] = {}
-        self._in_flight: list[tuple[int, Frame]] = []
-        self._delivered = dict.fromkeys(self.names, 0)
-        self._congested = False
-        self._policy: Policy = make_policy("threshold", 600.0, self._rng)
         self.state = EdgeState(
             scenario="preview",
             policies=tuple(POLICIES),
-            controls=Controls(self._policy.name, self._policy.value),
+            controls=Controls("threshold", 600.0),
             cameras=self.cameras,
-            start_ns=self._start_ns,
+            start_ns=self._clock.now_ns(),
             now_ns=self._clock.now_ns,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
-            channel=self._channel,
+            channel=lambda: {"preset": "toy", "states": ["low", "high"], "state": "low"},
             field_name="analytic",
-            bounds=np.array([[-2.5, -2.5, -0.1], [2.5, 2.5, 2.0]]),
         )
-        self._threads = [
-            threading.Thread(target=run, name=name, daemon=True)
-            for name, run in (("preview-cameras", self._capture), ("preview-updates", self._update))
-        ]
+        self._thread = threading.Thread(target=self._update, name="preview", daemon=True)
 
     def start(self) -> None:
-        for thread in self._threads:
-            thread.start()
+        self._thread.start()
 
     def stop(self) -> None:
         self._stopped.set()
-        for thread in self._threads:
-            thread.join(timeout=5.0)
+        self._thread.join(timeout=5.0)
 
     def cameras(self) -> list[CameraView]:
-        now_ns = self._clock.now_ns()
-        with self._lock:
-            newest = dict(self._newest)
-        views = []
-        for name in self.names:
-            frame = newest.get(name)
-            age = (now_ns - frame.generated_ns) / 1e6 if frame else None
-            views.append(CameraView(name, name == self._held_out, frame, age, self._delivered[name], 0))
-        return views
-
-    def _channel(self) -> dict[str, Any]:
-        """The channel's status, as the emulator writes it."""
-        state = "high" if self._congested else "low"
-        forwarded = sum(self._delivered.values())
-        return {
-            "preset": "toy",
-            "discipline": "parallel",
-            "states": ["low", "high"],
-            "state": state,
-            "counts": {"forwarded": forwarded},
-        }
-
-    # --- cameras and network --------------------------------------------------------------------
-
-    def _capture(self) -> None:
-        number = 0
-        while not self._stopped.wait(CAPTURE_S / len(self.names)):
-            self._deliver()
-            name = self.names[number % len(self.names)]
-            number += 1
-            if name in self._silent:
-                continue
-            now_ns = self._clock.now_ns()
-            if self._rng.random() < 0.02:
-                self._congested = not self._congested
-            image = _uint8(self._scene(now_ns).render(self._poses[name], LENS))
-            frame = Frame(
-                name,
-                "preview",
-                number,
-                now_ns,
-                Pose.from_matrix(self._poses[name]),
-                LENS,
-                "jpeg",
-                payload.encode(image),
-                held_out=name == self._held_out,
-            )
-            mean_ms = 0.0 if frame.held_out else (700.0 if self._congested else 90.0)
-            self._in_flight.append((now_ns + round(1e6 * self._rng.exponential(mean_ms)), frame))
-
-    def _deliver(self) -> None:
-        now_ns = self._clock.now_ns()
-        arrived = [item for item in self._in_flight if item[0] <= now_ns]
-        self._in_flight = [item for item in self._in_flight if item[0] > now_ns]
-        with self._lock:
-            for _, frame in arrived:
-                known = self._newest.get(frame.camera)
-                self._delivered[frame.camera] += 1
-                if known is None or known.generated_ns < frame.generated_ns:
-                    self._newest[frame.camera] = frame
-
-    # --- updates --------------------------------------------------------------------------------
+        now_ns, newest = self._clock.now_ns(), dict(self._newest)
+        ages = {name: (now_ns - frame.generated_ns) / 1e6 for name, frame in newest.items()}
+        return [CameraView(n, n == self._held_out, newest.get(n), ages.get(n), 1, 0) for n in self.names]
 
     def _update(self) -> None:
         number = 0
         while not self._stopped.wait(UPDATE_S):
-            controls = self.state.controls
-            if controls.reset_requested:
-                controls.reset_requested = False
-                self.state.status_line = "the field was reset"
-            if controls.paused:
+            self.state.controls.reset_requested = False
+            if self.state.controls.paused:
                 continue
-            decided_ns = self._clock.now_ns()
-            with self._lock:
-                newest = {n: f for n, f in self._newest.items() if not f.held_out}
-            generated = {n: f.generated_ns for n, f in newest.items()}
-            epoch = Epoch(decided_ns, number, generated, received_ns=dict.fromkeys(newest, decided_ns))
-            plan = self._policy.plan(epoch)
-            selected = self._policy.select(epoch, plan)
-            if not selected:
-                self.state.status_line = "waiting for a frame that qualifies"
-                continue
-            captured_ns = np.array([newest[n].generated_ns for n in selected])
-            renderer = self._scene(int(captured_ns.mean()))
-            truth = _uint8(self._scene(decided_ns).render(self._poses[self._held_out], LENS))
-            shown = _uint8(renderer.render(self._poses[self._held_out], LENS))
             now_ns = self._clock.now_ns()
-            ages = tuple(float(a) for a in (now_ns - captured_ns) / 1e6)
+            scene = BallScene((now_ns - self.state.start_ns) / 1e9)
+            for name in self._reporting:
+                image, pose = _uint8(scene.render(self._poses[name], LENS)), Pose.from_matrix(self._poses[name])
+                held_out = name == self._held_out
+                self._newest[name] = Frame(
+                    name, "preview", number, now_ns, pose, LENS, "jpeg", payload.encode(image), held_out=held_out
+                )
+            truth = _uint8(scene.render(self._poses[self._held_out], LENS))
+            used = tuple(name for name in self._reporting if name != self._held_out)
             publication = Publication(
                 number,
                 self.state.now_s(),
                 now_ns,
-                plan.omega_ms,
-                selected,
-                ages,
-                float(np.mean(ages)),
-                (now_ns - decided_ns) / 1e6,
+                600.0,
+                used,
+                (50.0,) * len(used),
+                50.0,
+                20.0,
+                psnr_db=30.0,
                 scored_on=self._held_out,
             )
-            self.state.status_line = f"used {len(selected)} views of {len(newest)}"
-            self.state.publish(publication, renderer)
-            self.state.scored(
-                replace(publication, psnr_db=psnr(shown, truth)), Comparison(self._held_out, truth, shown, number)
-            )
+            self.state.publish(publication, scene)
+            self.state.scored(publication, Comparison(self._held_out, truth, truth, number))
             number += 1
 
-    def _scene(self, at_ns: int) -> BallScene:
-        return BallScene((at_ns - self._start_ns) / 1e9)
-
     def _set_policy(self, name: str, value: float | None) -> None:
-        self._policy = make_policy(name, value, self._rng)
-        self.state.controls.policy, self.state.controls.value = self._policy.name, self._policy.value
+        policy = make_policy(name, value, np.random.default_rng(0))
+        self.state.controls.policy, self.state.controls.value = policy.name, policy.value
 
     def _save_snapshot(self) -> Path:
-        if not self.state.started:
-            raise RuntimeError("there is nothing to save before the first update")
         path = self._folder / "preview-snapshot.json"
         path.write_text(json.dumps({"updates": len(self.state.publications())}))
         return path

@@ -103,15 +103,6 @@ def test_the_table_marks_age_truth_use_and_refusals():
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
 
 
-def test_the_channels_state_stands_out_among_all_its_states():
-    channel = {"state": "high", "states": ["low", "high<"], "uptime_s": 12.5, "series": [[3.0, "low"], [9.0, "high"]]}
-    html = markup.channel_state(channel | {"states": ["low", "high"]})
-    low, high = html.split("</span>")[:2]
-    assert "high" in high and "600" in high and "600" not in low and "for 3.5 s" in html
-    assert markup.channel_state(None) == markup.channel_state({"state": "-", "states": ["-"]}) == ""
-    assert "high&lt;" in markup.channel_state({**channel, "series": [["soon", "low"]]})
-
-
 def test_the_scores_of_policies_say_where_they_are_from():
     row = {"own_seed": {"psnr_db": 27.96, "views": 12.0}, "psnr_db_over_all": [-0.03, -0.11, 0.05]}
     scores = {

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import cv2
@@ -16,13 +17,16 @@ import pytest
 
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
+from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
-from edge_server.page.rendering import DEPTH_ROWS, FAR_M, LEVELS, MOVING, NEWER, RenderLoop, browser_images
-from edge_server.page.scene import thumbnail
-from freshfield.geometry import Pinhole, look_at
+from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image
+from edge_server.page.scene import Scene, thumbnail
+from freshfield import payload
+from freshfield.geometry import Pinhole
+from tests.edge_server.frames import frame
 from tests.edge_server.page.preview import BallScene, Preview
 from tests.edge_server.page.visitor import Visitor
 from tests.waiting import wait_until
@@ -57,9 +61,6 @@ class Broken:
             np.full(shape, np.nan, np.float32),
         )
 
-    def points(self, count: int):
-        return np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.inf, np.float32)
-
 
 class Raising(Broken):
     """A renderer that fails outright."""
@@ -92,31 +93,47 @@ def publication(number: int) -> Publication:
 # --- what is sent ------------------------------------------------------------------------------
 
 
-def test_an_image_is_valid_whatever_was_rendered():
-    camera = Pinhole.from_fov(40, 400, 60)
-    color, depth = browser_images(Broken().render(np.eye(4), camera), camera)
-    assert color.dtype == np.uint8 and color.shape == (400, 40, 3)
-    assert np.ptp(color.reshape(-1, 3), axis=0).max() == 0  # the backdrop, everywhere
-    assert (depth >= FAR_M - 0.01).all() and depth.shape[0] <= DEPTH_ROWS
+def test_what_is_not_finite_shows_the_backdrop_and_the_rest_its_color():
+    color = np.full((4, 3, 3), 0.5, np.float32)
+    color[1, 1, 0], color[2, 2, 2] = np.nan, np.inf
+    image = browser_image(color)
+    assert image.dtype == np.uint8 and (image[0] == 128).all()
+    assert image[1, 1].tolist() == image[2, 2].tolist() == [18, 20, 24]
 
 
-def test_depth_is_along_the_view_axis_not_along_the_ray():
-    """A floor seen from straight above has one depth; rays to its corners are longer."""
-    camera = Pinhole.from_fov(64, 64, 50)
-    floor = BallScene(0.0).render(look_at((-1.2, 0, 1.0), (-1.2, 0, 0)), camera)
-    assert floor.depth[0, 0] > 1.1
-    _, depth = browser_images(floor, camera)
-    assert np.allclose(depth, 1.0, atol=0.003)
+@pytest.mark.parametrize(("took_s", "bands"), [(0.05, 1), (0.4, 4), (1.2, 12)])
+def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_one_took(took_s, bands):
+    """Each band projects the whole field again: an image that is quick is rendered whole."""
+    loop, finest = RenderLoop(bare_state()), len(LEVELS) - 1
+    loop._adapt(finest, took_s)
+    broken, visitor = Broken(), ClientState(None)
+    camera = Pinhole.from_fov(40, 300, 60)
+    assert loop._render(broken, np.eye(4), camera, visitor, visitor.serial, finest).shape == (300, 40, 3)
+    assert broken.renders == bands
+    broken.renders = 0
+    loop._render(broken, np.eye(4), camera, visitor, visitor.serial, MOVING)
+    assert broken.renders == 1
 
 
-def test_thumbnails_are_small_and_damaged_frames_have_none(tmp_path):
-    preview = Preview(tmp_path)
-    preview.start()
-    wait_until(lambda: any(c.newest for c in preview.cameras()), "no frame arrived")
-    preview.stop()
-    frame = next(c.newest for c in preview.cameras() if c.newest)
-    assert thumbnail(frame).shape == (84, 112, 3)
-    assert thumbnail(replace(frame, payload=b"\xff\xd8 nothing")) is None
+def test_thumbnails_are_small_and_damaged_frames_have_none():
+    image = payload.encode(np.zeros((96, 128, 3), np.uint8))
+    good = frame(payload=image, intrinsics=Pinhole.from_fov(128, 96, 55.0))
+    assert thumbnail(good).shape == (84, 112, 3)
+    assert thumbnail(replace(good, payload=b"\xff\xd8 nothing")) is None
+
+
+def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_box_is():
+    seen = frame()
+    state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0)])
+    server = MagicMock()
+    server.get_clients.return_value = {}
+    scene = Scene(server, state)
+    scene.refresh(state.cameras(), watched=True)
+    ahead = scene._viewpoint.look_at - seen.pose.translation_m
+    assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
+    state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, centre_m=(0.5, 0.0, 0.25))))
+    scene.refresh(state.cameras(), watched=True)
+    assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
 
 
 def test_truth_and_rendering_of_any_size_fit_side_by_side():
@@ -239,7 +256,7 @@ def test_images_come_coarse_first_then_fine(tmp_path):
 @pytest.mark.parametrize(("update_ms", "newer_s"), [(25.0, 0.03), (800.0, 0.16), (5000.0, 0.2)])
 def test_a_picture_of_what_is_newer_takes_no_longer_than_its_share_of_an_update(update_ms, newer_s):
     state = bare_state()
-    loop = RenderLoop(state, None)
+    loop = RenderLoop(state)
     state.publish(replace(publication(1), update_ms=update_ms), BallScene(0.0))
     assert loop._budget_s(NEWER) == pytest.approx(newer_s)
     assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s

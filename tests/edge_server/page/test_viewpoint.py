@@ -91,7 +91,7 @@ def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
 
 def test_one_camera_uses_the_fields_box_or_else_what_is_before_it():
     pose = rig(1, 0)
-    boxed = initial_viewpoint(pose, bounds=[TARGET - 1, TARGET + 1])
+    boxed = initial_viewpoint(pose, TARGET)
     assert np.allclose(boxed.look_at, TARGET)
     alone = initial_viewpoint(pose)
     ahead = alone.look_at - pose[0, :3, 3]

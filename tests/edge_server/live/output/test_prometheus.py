@@ -1,0 +1,29 @@
+"""Metrics are read while ingest goes on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+
+from edge_server.live.output.prometheus import EdgeCollector
+from tests.edge_server.page.test_page import bare_state
+
+
+class Growing(Counter):
+    """Rejections of which a new reason arrives with every one that is read."""
+
+    def items(self):
+        for item in super().items():
+            self[f"after {item[0]}"] += 1
+            yield item
+
+
+def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
+    ingest = SimpleNamespace(
+        rejected=Growing(crc=4, stale=1),
+        buffer=SimpleNamespace(shed=2),
+        check_ms=SimpleNamespace(percentile=lambda percent: None),
+    )
+    found = {metric.name: metric for metric in EdgeCollector(bare_state(), ingest).collect()}
+    rejected = {s.labels["reason"]: s.value for s in found["freshfield_frames_rejected"].samples}
+    assert rejected == {"crc": 4.0, "stale": 1.0}
