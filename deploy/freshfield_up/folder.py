@@ -1,16 +1,26 @@
-"""Prepares the folder of a run: a new one, or that of an earlier run, which is replaced. Others are
-refused."""
+"""Prepares the folder of a run: a new one, or that of an earlier run, which is replaced. Others are refused, and so
+is one that holds a file which no run writes."""
 
 from __future__ import annotations
 
 import fcntl
 import json
 import shutil
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import IO, Any
 
 MARKER = "run.json"
-"""Written first into every run's folder. Only a folder that holds one may be replaced."""
+"""Written first into every run's folder. Only a folder that holds one, with the key KEY in it, may be replaced."""
+KEY = "freshfield_run"
+"""Names what the scenario adds to WRITTEN."""
+WRITTEN = (
+    *("edge.json", "channel.json", "node-*.json", "frontier.json", "mesh.json", "processes.jsonl"),
+    *("series.jsonl", "shown.jsonl", "ages.jsonl", "poses.jsonl", "ledger-*.tsv", "log-*.txt", "decisions"),
+    *("field.npz", "snapshot-*.npz", "truth.png", "rendered.png", "figure-*.png", "report.json", "report.html"),
+    ".*.part",
+)
+"""Names, with wildcards, of what the processes of a run write into its folder."""
 EARLIER = "earlier-run"
 """Subfolder that keeps the replaced run's files until the new run is up, so a mistyped option loses none."""
 
@@ -19,22 +29,19 @@ class FolderError(ValueError):
     """The folder cannot be used; the message says what to do."""
 
 
-def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
+def prepare(out: Path, about: dict[str, Any], adds: tuple[str, ...] = ()) -> IO[str]:
     """Make ``out`` an empty run folder with a marker. The folder is locked while the returned file is open.
     Files of an earlier run are moved to ``EARLIER``, where they stay until ``forget_earlier``.
 
-    about: contents of the marker.
+    about: contents of the marker, besides KEY.
+    adds: names of files that this scenario's run writes beside WRITTEN.
     Raises FolderError if the folder cannot be used, holds other files than a run's, or a run is still using
     it.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
         marker = out / MARKER
-        if not marker.exists() and any(out.iterdir()):
-            raise FolderError(
-                f"{out} holds files that are not an earlier run's (no {MARKER} in it); "
-                "name an empty or a new folder with --out"
-            )
+        _refuse_a_strangers(out)
         lock = marker.open("a+")
     except OSError as error:
         raise FolderError(f"cannot use {out} for the run's files: {error.strerror}") from None
@@ -54,9 +61,31 @@ def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
             path.rename(part / path.name)
         part.rename(earlier)
     lock.truncate(0)
-    json.dump(about, lock, indent=1)
+    json.dump({KEY: list(adds), **about}, lock, indent=1)
     lock.flush()
     return lock
+
+
+def _refuse_a_strangers(out: Path) -> None:
+    """Raise FolderError unless all files in ``out`` are a run's."""
+    found = {path.name for path in out.iterdir()}
+    if not found:
+        return
+    elsewhere = "name an empty or a new folder with --out"
+    if MARKER not in found:
+        raise FolderError(f"{out} holds files that are not an earlier run's (no {MARKER} in it); {elsewhere}")
+    try:
+        marker = json.loads((out / MARKER).read_text() or "{}")
+        known = (*WRITTEN, *marker[KEY], MARKER, EARLIER, f".{EARLIER}")
+    except (ValueError, TypeError, KeyError):
+        # A start that was killed before it wrote its marker leaves an empty one, and nothing else.
+        if found == {MARKER} and not (out / MARKER).stat().st_size:
+            return
+        raise FolderError(
+            f"{out}: {MARKER} is not of a run of this version of freshfield, so its files stay; {elsewhere}"
+        ) from None
+    if strange := sorted(name for name in found if not any(fnmatchcase(name, pattern) for pattern in known)):
+        raise FolderError(f"{out} holds {strange[0]}, which no run wrote; move it, or {elsewhere}")
 
 
 def forget_earlier(out: Path) -> None:

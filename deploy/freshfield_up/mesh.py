@@ -27,6 +27,12 @@ def check(scenario: Scenario) -> None:
         )
 
 
+def file_names(scenario: Scenario) -> tuple[str, ...]:
+    """Name of the file that the scenario asks for."""
+    section = export_section(scenario)
+    return () if section is None else (str(section["mesh"]),)
+
+
 def possible(out: Path) -> bool:
     """Whether the field of the run in ``out`` was ever updated; otherwise there is nothing to export."""
     return bool(number(read_json(out / "edge.json"), "updates", "count"))

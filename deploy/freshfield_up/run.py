@@ -84,7 +84,7 @@ class Launcher:
             options.edge,
         )
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
-        lock = folder.prepare(options.out, about)
+        lock = folder.prepare(options.out, about, mesh.file_names(self.scenario))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                 signal.signal(number, self._on_signal)

@@ -7,18 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from freshfield_up.folder import EARLIER, MARKER, FolderError, forget_earlier, prepare
+from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
 
 
 def test_an_earlier_run_is_replaced(tmp_path: Path) -> None:
-    prepare(tmp_path, {"run": 1}).close()
-    (tmp_path / "ledger-edge-edge-1.tsv").write_text("old")
-    (tmp_path / "field").mkdir()
-    (tmp_path / "field" / "weights").write_text("old")
+    prepare(tmp_path, {"run": 1}, ("room.ply",)).close()
+    for name in ("ledger-edge-edge-1.tsv", "room.ply", ".edge.json.4f.part"):
+        (tmp_path / name).write_text("old")
+    (tmp_path / "decisions").mkdir()
+    (tmp_path / "decisions" / "000001.npz").write_text("old")
     prepare(tmp_path, {"run": 2}).close()
     forget_earlier(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [MARKER]
-    assert json.loads((tmp_path / MARKER).read_text()) == {"run": 2}
+    assert json.loads((tmp_path / MARKER).read_text()) == {KEY: [], "run": 2}
 
 
 def test_an_earlier_run_outlives_starts_that_fail(tmp_path: Path) -> None:
@@ -33,13 +34,13 @@ def test_an_earlier_run_outlives_starts_that_fail(tmp_path: Path) -> None:
 
 def test_a_start_that_is_killed_while_it_moves_files_loses_none(tmp_path: Path) -> None:
     prepare(tmp_path, {"run": 1}).close()
-    for name in ("a", "b"):
+    for name in ("field.npz", "edge.json"):
         (tmp_path / name).write_text(name)
     part = tmp_path / f".{EARLIER}"
     part.mkdir()
-    (tmp_path / "a").rename(part / "a")
+    (tmp_path / "edge.json").rename(part / "edge.json")
     prepare(tmp_path, {"run": 2}).close()
-    assert {p.name for p in (tmp_path / EARLIER).iterdir()} == {"a", "b"} and not part.exists()
+    assert {p.name for p in (tmp_path / EARLIER).iterdir()} == {"field.npz", "edge.json"} and not part.exists()
 
 
 def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) -> None:
@@ -48,23 +49,42 @@ def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) ->
     (precious / "photo").write_text("keep")
     out = tmp_path / "out"
     prepare(out, {}).close()
-    (out / "link").symlink_to(precious)
+    (out / "decisions").symlink_to(precious)
     prepare(out, {}).close()
     forget_earlier(out)
     assert list(out.iterdir()) == [out / MARKER] and (precious / "photo").read_text() == "keep"
 
 
-def test_anything_else_is_refused_and_left_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("marker", "error"),
+    [
+        (None, "not an earlier run's"),
+        ('{"accuracy": 0.9}', "not of a run of this version"),
+        ("[1]", "not of a run of this version"),
+        ("", "not of a run of this version"),
+        (json.dumps({KEY: []}), "holds thesis.tex, which no run wrote"),
+    ],
+)
+def test_anything_else_is_refused_and_left_alone(tmp_path: Path, marker: str | None, error: str) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(FolderError, match="not an earlier run's"):
+    (tmp_path / "edge.json").write_text("{}")
+    if marker is not None:
+        (tmp_path / MARKER).write_text(marker)
+    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    with pytest.raises(FolderError, match=error):
         prepare(tmp_path, {})
-    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+def test_a_start_that_was_killed_before_its_marker_was_written(tmp_path: Path) -> None:
+    (tmp_path / MARKER).touch()
+    prepare(tmp_path, {}).close()
 
 
 def test_a_run_that_is_still_going_on_is_refused(tmp_path: Path) -> None:
     with prepare(tmp_path, {"run": 1}), pytest.raises(FolderError, match="another run is writing"):
         prepare(tmp_path, {"run": 2})
-    assert json.loads((tmp_path / MARKER).read_text()) == {"run": 1}
+    assert json.loads((tmp_path / MARKER).read_text()) == {KEY: [], "run": 1}
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:

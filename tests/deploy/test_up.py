@@ -125,6 +125,7 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     used = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
     assert all(used[-1][name]["rss_mb"] > 10 for name in ("node", "emulator", "edge"))
     assert not leftovers(run.out)
+    prepare(run.out, {}).close()  # knows all the names that a run writes
 
 
 @pytest.mark.parametrize(
