@@ -14,8 +14,7 @@ import numpy as np
 
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at
-from camera_node.sources.datasets.video import VideoRig, rig_dataset
-from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.datasets.video import Clip, rig_dataset
 from camera_node.sources.rig_calibration import CalibratedCamera
 from freshfield.geometry import Pinhole, Pose
 
@@ -25,8 +24,8 @@ FILES = (POSES,)
 _SAME_SHAPE = 0.02
 
 
-def load_rig(path: Path) -> VideoRig:
-    """The rig of a folder, or of its ``poses_bounds.npy``. Opens every video. Raises DatasetError."""
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """Every frame of every video of a folder, or of its ``poses_bounds.npy``, as an image. Raises DatasetError."""
     file = path if path.is_file() else path / POSES
     rows = _rows(file)
     videos = sorted(file.parent.glob("cam*.mp4"))
@@ -35,13 +34,9 @@ def load_rig(path: Path) -> VideoRig:
             f"{file}: has poses of {len(rows)} cameras, its folder {len(videos)} videos cam*.mp4: "
             "they belong together in the order of their names"
         )
-    cameras = {video.stem: _camera(row, video, f"{file}: row {k}") for k, (row, video) in enumerate(zip(rows, videos))}
-    return VideoRig(cameras, {video.stem: video for video in videos})
-
-
-def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
-    """Every frame of every video as an image. Raises DatasetError."""
-    return rig_dataset(load_rig(path), path, options.scale)
+    clips = [Clip(video) for video in videos]
+    cameras = [_camera(row, clip, f"{file}: row {k}") for k, (row, clip) in enumerate(zip(rows, clips))]
+    return rig_dataset({clip.path.stem: (camera, clip) for camera, clip in zip(cameras, clips)}, path, options)
 
 
 def _rows(file: Path) -> np.ndarray:
@@ -67,17 +62,15 @@ def _rows(file: Path) -> np.ndarray:
     return rows
 
 
-def _camera(row: np.ndarray, video: Path, where: str) -> CalibratedCamera:
+def _camera(row: np.ndarray, clip: Clip, where: str) -> CalibratedCamera:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4]
     if min(height, width, focal) <= 0:
         raise DatasetError(f"{where}: height, width, focal length are {height:g}, {width:g}, {focal:g}")
-    clip = Clip(video)
-    clip.close()
     x, y = clip.width / width, clip.height / height
     if not abs(x / y - 1.0) <= _SAME_SHAPE:
         raise DatasetError(
-            f"{where}: is of images of {width:g} x {height:g}, {video.name} has {clip.width} x {clip.height}"
+            f"{where}: is of images of {width:g} x {height:g}, {clip.path.name} has {clip.width} x {clip.height}"
         )
     down, right, backwards, position = matrix[:, :4].T
     with errors_at(where):

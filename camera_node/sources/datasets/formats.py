@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast
 
-from camera_node.config import MODELS, RecordedConfig
+from camera_node.config import MODELS, RecordedConfig, VideoConfig
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
-from camera_node.sources.datasets.video import VideoRig
 
 # In this order of preference: if several fit, the one with most information about its images comes first.
 FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
@@ -29,28 +28,19 @@ class Reader(Protocol):
         """The posed images of a folder or describing file. Raises DatasetError."""
 
 
-@runtime_checkable
-class RigReader(Protocol):
-    """Additional interface of the modules for synchronized videos."""
-
-    def load_rig(self, path: Path, **keys: Any) -> VideoRig:
-        """The rig of a folder or describing file. Raises DatasetError."""
-
-
 def reader(name: str) -> Reader:
     """Import and return the reader module of a format, one of ``FORMATS``."""
     return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{name}"))
 
 
-def open_configured(path: Path, config: RecordedConfig) -> Dataset | VideoRig:
+def open_configured(path: Path, config: RecordedConfig) -> Dataset:
     """Open the data set of a scenario's ``source:`` section. path: located ``data``. Raises DatasetError."""
     shared = {*RecordedConfig.__struct_fields__, "background", "trajectory"}
     keys = {name: getattr(config, name) for name in config.__struct_fields__ if name not in shared}
-    found = reader(config.kind)
-    if isinstance(found, RigReader):
-        return found.load_rig(path, **keys)
+    if isinstance(config, VideoConfig) and config.trajectory is not None:
+        keys["posed_elsewhere"] = [config.assignment.get(camera, camera) for camera in config.trajectory.files]
     options = ImageOptions(config.scale, getattr(config, "background", "keep"))
-    return found.load_dataset(path, options, **keys)
+    return reader(config.kind).load_dataset(path, options, **keys)
 
 
 def recognize(file: Path) -> str:

@@ -23,7 +23,7 @@ class DatasetError(ValueError):
     """A data set that cannot be used. The message is one line: file, what was wrong, what to do."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PosedImage:
     """One posed image of a data set.
 
@@ -35,6 +35,7 @@ class PosedImage:
     read: returns uint8 (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is
         damaged or has another size.
     path: the image's own file, if ``read`` does not scale, mask or undistort it; else None.
+    release: frees what ``read`` keeps open, such as a decoder.
     """
 
     name: str
@@ -44,6 +45,7 @@ class PosedImage:
     intrinsics: Pinhole
     read: Callable[[], Image]
     path: Path | None = None
+    release: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)

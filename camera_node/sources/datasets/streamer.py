@@ -7,29 +7,23 @@ through its photos back and forth, like a moving camera.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 from camera_node.config import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
-from camera_node.pose.providers import FixedPose, PoseProvider, read_tum
+from camera_node.pose.providers import PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.datasets.formats import open_configured
-from camera_node.sources.datasets.imaging import shrink
-from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage
-from camera_node.sources.datasets.video import VideoRig, open_clip
-from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
 from freshfield import payload
 from freshfield.geometry import Pose
-from freshfield.scenario import Scenario, ScenarioError
+from freshfield.scenario import Scenario
 
 HOLD_OUT_EVERY = 8
 PHOTO_FPS = 10.0
-# Videos decode only forwards: for backward playback, this many (shrunk) frames are decoded at once.
-_BLOCK = 12
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
@@ -62,8 +56,6 @@ def open_recorded(
     """See ``camera_node.sources.registry.open_sources``."""
     path = find_data(config.data, scenario, data)
     found = open_configured(path, config)
-    if isinstance(found, VideoRig):
-        return _video_sources(scenario, config, cameras, found, path)
     if found.moving or found.per_camera:
         names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: found.of(name) for camera, name in names.items()}
@@ -72,10 +64,15 @@ def open_recorded(
         shares = split_photos(len(found), scenario.training, scenario.held_out)
         shown = {camera: tuple(found[i] for i in shares[camera]) for camera in cameras}
         recorded = {camera: rate(config.fps or PHOTO_FPS) for camera in cameras}
-    return {
-        camera: ImageSource(camera, shown[camera], _playback(config, len(shown[camera]), fps), config.codec)
-        for camera, fps in recorded.items()
-    }
+    poses: dict[str, PoseProvider] = {}
+    if isinstance(config, VideoConfig) and config.trajectory is not None:
+        poses = _trajectory_poses(scenario, config.trajectory, cameras, path)
+    sources: dict[str, Source] = {}
+    for camera, fps in recorded.items():
+        count = len(shown[camera])
+        playback = Playback(count, rate(config.fps) if config.fps else fps, fps, config.loop == "back-and-forth")
+        sources[camera] = ImageSource(camera, shown[camera], playback, config.codec, poses.get(camera))
+    return sources
 
 
 def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[str, list[int]]:
@@ -89,11 +86,6 @@ def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -
     if empty:
         raise DatasetError(f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras")
     return shares
-
-
-def _playback(config: RecordedConfig, count: int, recorded: Fraction) -> Playback:
-    fps = rate(config.fps) if config.fps else recorded
-    return Playback(count, fps, recorded, config.loop == "back-and-forth")
 
 
 def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
@@ -117,21 +109,33 @@ def _recorded_rate(fps: float, path: Path) -> Fraction:
 
 
 class ImageSource(Source):
-    """A camera that shows image files one after the other."""
+    """A camera that shows images one after the other. poses: replace those of the images; None: theirs."""
 
-    def __init__(self, camera: str, images: Sequence[PosedImage], playback: Playback, codec: str) -> None:
+    def __init__(
+        self,
+        camera: str,
+        images: Sequence[PosedImage],
+        playback: Playback,
+        codec: str,
+        poses: PoseProvider | None = None,
+    ) -> None:
         self.camera, self.fps = camera, playback.fps
         self.contents = len(images)
         self.intrinsics = images[0].intrinsics
-        self._images, self._playback, self._codec = images, playback, codec
+        self._images, self._playback, self._codec, self._poses = images, playback, codec, poses
 
     def content(self, tick: int) -> int:
         return self._playback.frame(tick)
 
     def read(self, content: int) -> Shot:
         shown = self._images[content]
-        image = self._as_stored(shown) or shown.read()
-        return Shot(image, Pose.from_matrix(shown.camera_to_world), shown.intrinsics)
+        pose, gap_ns = Pose.from_matrix(shown.camera_to_world), 0
+        if self._poses is not None:
+            pose, gap_ns = self._poses.at(round((shown.time_s or 0.0) * 1e9))
+        return Shot(self._as_stored(shown) or shown.read(), pose, shown.intrinsics, gap_ns)
+
+    def release(self) -> None:
+        self._images[0].release()
 
     def _as_stored(self, shown: PosedImage) -> bytes | None:
         """The file's bytes if they can be sent as they are, since compressing again would cost quality."""
@@ -145,91 +149,23 @@ class ImageSource(Source):
         return data
 
 
-class VideoSource(Source):
-    """One camera of a video rig."""
+def _trajectory_poses(
+    scenario: Scenario, config: TrajectoryConfig, cameras: Sequence[str], path: Path
+) -> dict[str, PoseProvider]:
+    """Poses on the clip's time scale, from the TUM files that the scenario names, by camera."""
+    base, where = path if path.is_dir() else path.parent, f"{scenario.path}: source.trajectory"
+    found: dict[str, PoseProvider] = {}
+    for camera in set(cameras) & set(config.files):
+        with errors_of(f"{where}.files.{camera}"):
+            found[camera] = read_tum(
+                base / config.files[camera],
+                config.pairing == "interpolated",
+                round(config.max_gap_ms * 1e6),
+                round(config.start_s * 1e9),
+            )
+        if config.hand_eye:
+            from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 
-    def __init__(
-        self, camera: str, rig: VideoRig, name: str, scale: float, playback: Playback, poses: PoseProvider
-    ) -> None:
-        self.camera, self.fps = camera, playback.fps
-        self.contents = playback.count
-        self.intrinsics = shrink(rig.cameras[name].intrinsics, scale)
-        self._rig, self._name = rig, name
-        self._playback, self._poses = playback, poses
-        self._clip: Clip | None = None
-        self._last = -1
-        self._block: OrderedDict[int, Image] = OrderedDict()
-
-    def content(self, tick: int) -> int:
-        return self._playback.frame(tick)
-
-    def read(self, content: int) -> Shot:
-        fps = self._playback.recorded_fps
-        pose, gap_ns = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
-        return Shot(self._image(content), pose, self.intrinsics, gap_ns)
-
-    def release(self) -> None:
-        if self._clip is not None:
-            self._clip.close()
-        self._clip = None
-        self._block.clear()
-
-    def _image(self, index: int) -> Image:
-        backwards, self._last = index < self._last, index
-        if index in self._block:
-            return self._block[index]
-        if self._clip is None:
-            self._clip = open_clip(self._rig, self._name)
-        self._block.clear()
-        width, height = self.intrinsics.width, self.intrinsics.height
-        if not backwards:
-            return self._clip.frame(index, width, height)
-        for i in range(max(0, index - _BLOCK + 1), index + 1):
-            self._block[i] = self._clip.frame(i, width, height)
-        return self._block[index]
-
-
-def _video_sources(
-    scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], rig: VideoRig, path: Path
-) -> dict[str, Source]:
-    names = assign_cameras(scenario, config.assignment, cameras, list(rig.cameras))
-    clips = {name: open_clip(rig, name) for name in rig.cameras}
-    # All cameras turn back at the same frame; otherwise they would drift apart at every turn.
-    count = min(clip.count for clip in clips.values())
-    rates = {_recorded_rate(clip.fps, clip.path) for clip in clips.values()}
-    for clip in clips.values():
-        clip.close()
-    if len(rates) != 1:
-        raise DatasetError(f"{path}: the videos differ in frame rate: {', '.join(map(str, sorted(rates)))}")
-    playback = _playback(config, count, rates.pop())
-    trajectory = config.trajectory if isinstance(config, VideoConfig) else None
-    base = path if path.is_dir() else path.parent
-    where = f"{scenario.path}: source.trajectory"
-    sources: dict[str, Source] = {}
-    for camera, name in names.items():
-        pose = rig.cameras[name].pose
-        if trajectory is not None and camera in trajectory.files:
-            poses = _trajectory_poses(trajectory, camera, base, where)
-        elif pose is not None:
-            poses = FixedPose(pose)
-        else:
-            raise ScenarioError(f"{where}.files.{camera}: missing, and the calibration has no pose for {name}")
-        sources[camera] = VideoSource(camera, rig, name, config.scale, playback, poses)
-    return sources
-
-
-def _trajectory_poses(config: TrajectoryConfig, camera: str, base: Path, where: str) -> PoseProvider:
-    """Poses of one camera, on the clip's time scale, from the TUM file that the scenario names."""
-    with errors_of(f"{where}.files.{camera}"):
-        poses = read_tum(
-            base / config.files[camera],
-            config.pairing == "interpolated",
-            round(config.max_gap_ms * 1e6),
-            round(config.start_s * 1e9),
-        )
-    if not config.hand_eye:
-        return poses
-    from camera_node.robot.arm.hand_eye_mount import read_hand_eye
-
-    with errors_of(f"{where}.hand_eye"):
-        return read_hand_eye(base / config.hand_eye).camera_poses(poses)
+            with errors_of(f"{where}.hand_eye"):
+                found[camera] = read_hand_eye(base / config.hand_eye).camera_poses(found[camera])
+    return found

@@ -2,34 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 
-from camera_node.sources.datasets.imaging import shrink
+import numpy as np
+
+from camera_node.sources.datasets.imaging import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, errors_at, find_files, path_within
-from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    Image,
+    PosedImage,
+    errors_at,
+    find_files,
+    path_within,
+)
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
-from freshfield.geometry import Pinhole
+from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+
+import cv2  # isort: skip
 
 FILES = ("calib*.json",)
 _PLACES = ("videos/{}.mp4", "{}.mp4")
+# Up to this distance, decoding forward is cheaper than seeking, which decodes from a key frame.
+_SKIP_FRAMES = 30
+# Videos decode only forwards: to play backwards, this many (shrunk) frames are decoded at once.
+_BLOCK = 12
 
 
-@dataclass(frozen=True)
-class VideoRig:
-    """Synchronized videos. cameras: calibration at full size, by name. files: video file, by name."""
-
-    cameras: dict[str, CalibratedCamera]
-    files: dict[str, Path]
-
-
-def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
-    """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
+def load_dataset(
+    path: Path,
+    options: ImageOptions = FULL_SIZE,
+    files: Mapping[str, str] | None = None,
+    posed_elsewhere: Collection[str] = (),
+) -> Dataset:
+    """Every frame of the videos of a calibration JSON, or of the only one in a folder; cameras without a video are
+    left out.
 
     files: camera to video file, relative to the JSON, for videos that are not at ``_PLACES``.
+    posed_elsewhere: cameras that need no pose in the JSON.
     Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
@@ -51,30 +64,39 @@ def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
             raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
-    return VideoRig({name: cameras[name] for name in found}, found)
+    return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, posed_elsewhere)
 
 
-def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
-    """``rig_dataset`` of a calibration JSON, or of the only one in a folder. Raises DatasetError."""
-    return rig_dataset(load_rig(path), path, options.scale)
-
-
-def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:
+def rig_dataset(
+    rig: Mapping[str, tuple[CalibratedCamera, Clip]],
+    path: Path,
+    options: ImageOptions,
+    posed_elsewhere: Collection[str] = (),
+) -> Dataset:
     """Every frame of every video as an image that is read on demand, one camera after the other.
 
-    Poses are those of the calibration. All videos are cut to the length of the shortest.
-    path: for error messages. scale: image sizes are divided by it.
-    Raises DatasetError if a pose is missing, or a video cannot be opened.
+    All videos are cut to the length of the shortest: played back and forth, they would else drift apart.
+    path: for error messages. posed_elsewhere: as in ``load_dataset``.
+    Raises DatasetError if a pose is missing, or a video has another size than its calibration or another rate.
     """
-    clips = {name: open_clip(rig, name) for name in rig.cameras}
-    count = min(clip.count for clip in clips.values())
+    count = min(clip.count for _, clip in rig.values())
+    rates = sorted({clip.fps for _, clip in rig.values()})
+    if len(rates) != 1:
+        raise DatasetError(
+            f"{path}: the videos differ in frame rate: {', '.join(f'{fps:g}' for fps in rates)}; re-encode them at one "
+            "(ffmpeg -fps_mode cfr)"
+        )
     images: list[PosedImage] = []
-    for name, clip in clips.items():
-        calibrated = rig.cameras[name]
-        if calibrated.pose is None:
+    for name, (camera, clip) in rig.items():
+        lens = camera.intrinsics
+        if (clip.width, clip.height) != (lens.width, lens.height):
+            raise DatasetError(
+                f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for {lens.width} x {lens.height}"
+            )
+        if camera.pose is None and name not in posed_elsewhere:
             raise DatasetError(f"{path}: {name}: R_world_to_cam is missing")
-        small = shrink(calibrated.intrinsics, scale)
-        matrix = calibrated.pose.matrix()
+        small = shrink(lens, options.scale)
+        matrix = np.eye(4) if camera.pose is None else camera.pose.matrix()
         for index in range(count):
             images.append(
                 PosedImage(
@@ -84,21 +106,10 @@ def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:
                     camera_to_world=matrix,
                     intrinsics=small,
                     read=partial(clip.frame, index, small.width, small.height),
+                    release=clip.close,
                 )
             )
-    return Dataset(tuple(images), 0, next(iter(clips.values())).fps)
-
-
-def open_clip(rig: VideoRig, name: str) -> Clip:
-    """Open a camera's video. Raises DatasetError if it cannot be opened, or its size is not the
-    calibration's."""
-    clip = Clip(rig.files[name])
-    expected: Pinhole = rig.cameras[name].intrinsics
-    if (clip.width, clip.height) != (expected.width, expected.height):
-        raise DatasetError(
-            f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for {expected.width} x {expected.height}"
-        )
-    return clip
+    return Dataset(tuple(images), 0, rates[0])
 
 
 def _find_calibration(folder: Path) -> Path:
@@ -109,3 +120,70 @@ def _find_calibration(folder: Path) -> Path:
         names = ", ".join(p.name for p in found) or "none"
         raise DatasetError(f"{folder}: expected one calib*.json, found {names}; name the file itself")
     return found[0]
+
+
+class Clip:
+    """Frames 0 to count - 1 of a video file, which is decoded forwards. Its decoder opens with the first frame.
+
+    Attributes: count, fps (30 if the file does not tell), width and height as stored.
+    Raises DatasetError if the file cannot be opened, or has no frames.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        capture = self._open()
+        self.fps = float(capture.get(cv2.CAP_PROP_FPS)) or 30.0
+        self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self.count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        capture.release()
+        if self.count < 1:
+            raise DatasetError(f"{path}: the video says it has no frames")
+        self._capture: cv2.VideoCapture | None = None
+        self._next, self._last = 0, -1
+        self._block: dict[int, Image] = {}
+
+    def frame(self, index: int, width: int, height: int) -> Image:
+        """Frame ``index`` as uint8 RGB, area-averaged to (height, width, 3). Raises DatasetError if there is
+        no such frame, or it cannot be decoded."""
+        if not 0 <= index < self.count:
+            raise DatasetError(f"{self.path}: frame {index} is not within 0..{self.count - 1}")
+        backwards, self._last = 0 < self._last - index <= _BLOCK, index
+        found = self._block.get(index)
+        if found is None or found.shape[:2] != (height, width):
+            first = max(0, index - _BLOCK + 1) if backwards else index
+            self._block = {k: self._decode(k, width, height) for k in range(first, index + 1)}
+        return self._block[index]
+
+    def close(self) -> None:
+        """Free the decoder; ``frame`` opens it again."""
+        if self._capture is not None:
+            self._capture.release()
+        self._capture, self._next = None, 0
+        self._block.clear()
+
+    def _decode(self, index: int, width: int, height: int) -> Image:
+        if self._capture is None:
+            self._capture = self._open()
+        if not self._next <= index <= self._next + _SKIP_FRAMES:
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            self._next = int(self._capture.get(cv2.CAP_PROP_POS_FRAMES))
+            if self._next > index:  # a container without an index: start again and decode forward
+                self._capture.release()
+                self._capture, self._next = self._open(), 0
+        while self._next < index and self._capture.grab():
+            self._next += 1
+        ok, image = self._capture.read() if self._next == index else (False, None)
+        if not ok or image is None:
+            self.close()  # its position is unknown now
+            raise DatasetError(f"{self.path}: frame {index} of {self.count} cannot be decoded")
+        self._next += 1
+        return resize(as_image(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)), width, height)
+
+    def _open(self) -> cv2.VideoCapture:
+        if not self.path.is_file():
+            raise DatasetError(f"{self.path}: no such video")
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise DatasetError(f"{self.path}: OpenCV cannot open it as a video")
+        return capture

@@ -12,8 +12,7 @@ import pytest
 from camera_node.config import source_config
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.sources.datasets.video import load_dataset
-from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.datasets.video import Clip, load_dataset
 from camera_node.sources.registry import open_sources
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import look_at, se3_inverse
@@ -23,13 +22,14 @@ from tests.conftest import data_dir
 FRAMES = 40
 
 
-def write_rig(folder: Path, cameras: int = 2, width: int = 64, height: int = 48) -> Path:
-    """Videos whose frame k has the brightness 16 + 6 k, and their calibration JSON."""
+def write_rig(folder: Path, cameras: int = 2, width: int = 64, height: int = 48, faster: float = 0.0) -> Path:
+    """Videos whose frame k has the brightness 16 + 6 k, and their calibration JSON. faster: frames a second, from camera
+    to camera."""
     (folder / "videos").mkdir(parents=True)
     rig = {}
     for c in range(cameras):
         file = str(folder / f"videos/cam{c:02d}.mp4")
-        writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"mp4v"), 20.0, (width, height))
+        writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"mp4v"), 20.0 + faster * c, (width, height))
         for k in range(FRAMES):
             writer.write(np.full((height, width, 3), 16 + 6 * k, np.uint8))
         writer.release()
@@ -131,6 +131,13 @@ def test_the_data_set_lists_every_frame_of_every_camera():
     record = dataset.of("cam03")[59]
     assert record.time_s == pytest.approx(59 / 60)
     assert record.read().shape == (record.intrinsics.height, record.intrinsics.width, 3) == (240, 136, 3)
+
+
+def test_videos_of_different_rates_are_refused_streamed_or_not(tmp_path):
+    file = write_rig(tmp_path, faster=10.0)
+    for opens in (load_dataset, lambda path: opened(video_scenario(path))):
+        with pytest.raises(DatasetError, match=r"differ in frame rate: 20, 30; re-encode"):
+            opens(file)
 
 
 def test_what_does_not_fit_is_named(tmp_path):
