@@ -94,11 +94,6 @@ class FrameCache:
             with contextlib.suppress(OSError):
                 os.utime(self._folder)  # used now: the last to be deleted
 
-    @property
-    def on_disk(self) -> bool:
-        """Whether rendered frames outlive this process."""
-        return self._folder is not None
-
     def content(self, tick: int) -> int:
         """Number of the output of ``read`` that a tick shows."""
         return tick % self.contents if self.contents else tick

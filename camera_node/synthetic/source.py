@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import pickle
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -20,26 +14,13 @@ from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
-log = logging.getLogger("camera-node")
-
-Stopped = Callable[[], bool]  # whether to stop
-
 WORLD_FPS = 15.0
-# Casting takes about 350 bytes a ray at its peak. For more rays than this another process renders ahead, so
-# that this one's memory stays small.
-_MAX_RAYS = 200_000
-_POLL_S = 0.1
 
 
 class WorldSource(Source):
-    """One camera of a scene, with its frames in a ``FrameCache``.
+    """One camera of a scene, with its frames in a ``FrameCache``."""
 
-    render_in_subprocess: fills the cache from another process, for large images.
-    """
-
-    def __init__(
-        self, camera: str, frames: FrameCache, effects: Effects, render_in_subprocess: Callable[[Stopped], None]
-    ) -> None:
+    def __init__(self, camera: str, frames: FrameCache, effects: Effects) -> None:
         self.camera = camera
         self.fps, self.phase_ns = frames.fps, frames.phase_ns
         lens, matrix = frames.scene.cameras[frames.camera_id]
@@ -49,7 +30,6 @@ class WorldSource(Source):
         self._pose = Pose.from_matrix(matrix)
         self._effects = effects
         self._frames = frames
-        self._render_in_subprocess = render_in_subprocess
 
     def content(self, tick: int) -> int:
         return tick if self.contents is None else self._frames.content(tick)
@@ -58,10 +38,7 @@ class WorldSource(Source):
         pose = self._effects.reported_pose(self._pose, content)
         return Shot(self._frames.read(self._frames.content(content)), pose, self.intrinsics)
 
-    def prepare(self, stopped: Stopped) -> None:
-        rays = self.intrinsics.width * self.intrinsics.height * self._frames.scene.params.supersample**2
-        if rays > _MAX_RAYS and self._frames.on_disk:
-            self._render_in_subprocess(stopped)
+    def prepare(self, stopped: Callable[[], bool]) -> None:
         self._frames.fill(stop=stopped)
 
     def release(self) -> None:
@@ -88,10 +65,7 @@ def open_sources(
         on_hand = {camera: frames.pop(camera) for camera in cameras if camera in config.arm.cameras}
         carried = open_flange_cameras(scenario, config.arm, on_hand, effects)
     return carried | {
-        camera: WorldSource(
-            camera, each, effects.get(camera) or NO_EFFECTS, partial(render_in_subprocess, scenario, config, camera)
-        )
-        for camera, each in frames.items()
+        camera: WorldSource(camera, each, effects.get(camera) or NO_EFFECTS) for camera, each in frames.items()
     }
 
 
@@ -127,43 +101,3 @@ def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:
     if len(known) < len(scenario.cameras):
         raise ScenarioError(f"{scenario.path}: cameras: the scene has {len(known)}: {', '.join(known)}")
     return dict(zip(scenario.cameras, known))
-
-
-def render_in_subprocess(scenario: Scenario, config: WorldConfig, camera: str, stopped: Stopped) -> None:
-    """Render one camera's frames in another process, which frees its memory when it ends: casting a large
-    image takes hundreds of megabytes. Returns when the frames are cached, when ``stopped`` returns True, or
-    if the process fails; frames that are still missing are rendered on demand."""
-    log.info("%s: rendering its frames ahead, once: they are kept for next time", camera)
-    begin = time.perf_counter()
-    child = subprocess.Popen([sys.executable, "-m", "camera_node.synthetic.source"], stdin=subprocess.PIPE)
-    try:
-        assert child.stdin is not None
-        try:
-            with child.stdin:
-                child.stdin.write(pickle.dumps((scenario, config, camera)))
-        except BrokenPipeError:
-            pass  # the exit status tells
-        while child.poll() is None and not stopped():
-            time.sleep(_POLL_S)
-    finally:
-        child.terminate()
-        status = child.wait()
-    if status == 0:
-        log.info("%s: frames are ready after %.1f s", camera, time.perf_counter() - begin)
-    elif not stopped():
-        log.warning("%s: rendering ahead failed (exit %d): frames are rendered as they come", camera, status)
-
-
-def _subprocess_main() -> None:
-    scenario, config, camera = pickle.load(sys.stdin.buffer)
-    from camera_node.sources.with_effects import camera_effects
-
-    effects = {camera: camera_effects(scenario, config, camera)}
-    frames = frame_caches(scenario, config, [camera], effects)[camera]
-    frames.fill(stop=lambda: frames.disk_error is not None)
-    if frames.disk_error is not None:
-        sys.exit(f"camera-node: {frames.disk_error}")
-
-
-if __name__ == "__main__":
-    _subprocess_main()

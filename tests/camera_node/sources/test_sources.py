@@ -112,23 +112,6 @@ def test_the_world_repeats_and_is_exact(tmp_path, monkeypatch):
     np.testing.assert_array_equal(rgb(source.read(8), "zstd"), scene.render("cam01", 0.8))
 
 
-def test_a_large_world_is_rendered_by_a_child(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("camera_node.synthetic.source._MAX_RAYS", 10)
-    scenario = world_scenario(scene="tile", codec="zstd")
-    source = opened(scenario, ["cam02"])["cam02"]
-
-    def never(*_):
-        raise AssertionError("rendered in this process")
-
-    monkeypatch.setattr("camera_node.synthetic.scene.Scene.renderer", never)
-    source.prepare(lambda: False)
-    shown = rgb(source.read(0), "zstd")
-    monkeypatch.undo()
-    scene = make_scene("tile", {"count": 3, "width": 24, "height": 16})
-    np.testing.assert_array_equal(shown, scene.render("cam02", 0.0))
-
-
 def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     recorded = photo_scenario(

@@ -23,8 +23,8 @@ FRAMES = 40
 
 
 def write_rig(folder: Path, cameras: int = 2, width: int = 64, height: int = 48, faster: float = 0.0) -> Path:
-    """Videos whose frame k has the brightness 16 + 6 k, and their calibration JSON. faster: frames a second, from camera
-    to camera."""
+    """Videos whose frame k has the brightness 16 + 6 k, and their calibration JSON. faster: more frames a second from
+    camera to camera."""
     (folder / "videos").mkdir(parents=True)
     rig = {}
     for c in range(cameras):
