@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import grpc
 import grpc.aio
+import numpy as np
 
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
@@ -201,12 +202,17 @@ class RollingPercentiles:
     """Percentiles of the last ``size`` values."""
 
     def __init__(self, size: int) -> None:
-        self._values: deque[float] = deque(maxlen=size)
+        self._values = np.zeros(size)
+        self._added = 0
 
     def add(self, value: float) -> None:
-        self._values.append(value)
+        self._values[self._added % len(self._values)] = value
+        self._added += 1
 
     def percentile(self, percent: float) -> float | None:
         """The value that ``percent`` of the values (0 to 100) do not exceed; None without values."""
-        values = sorted(self._values)
-        return values[min(len(values) - 1, int(len(values) * percent / 100))] if values else None
+        values = self._values[: self._added]
+        if not len(values):
+            return None
+        rank = min(len(values) - 1, int(len(values) * percent / 100))
+        return float(np.partition(values, rank)[rank])

@@ -18,7 +18,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec.structs import asdict
+from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SHOWN, Score
 from edge_server.fields import View
@@ -55,7 +57,7 @@ class Journal:
         self._last_s: float | None = None  # instant of the last publication
         self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
-        self._last_pose: dict[str, Pose] = {}
+        self._last_pose: dict[str, NDArray[np.floating]] = {}
         self._poses_left = _MOST_POSES
         self._status_failed = False
 
@@ -104,13 +106,13 @@ class Journal:
     def poses(self, views: Sequence[View]) -> None:
         """Write the poses of those views whose cameras have moved."""
         for view in views:
-            pose = Pose.from_matrix(view.camera_to_world)
-            if self._last_pose.get(view.camera) == pose or not self._poses_left:
+            matrix = view.camera_to_world
+            if np.array_equal(self._last_pose.get(view.camera, ()), matrix) or not self._poses_left:
                 continue
-            self._last_pose[view.camera] = pose
+            self._last_pose[view.camera] = matrix
             self._poses_left -= 1
-            q, t_m = pose.quaternion, pose.translation_m
-            line = {"camera": view.camera, "ns": view.generated_ns, "q": q, "t_m": t_m}
+            pose = Pose.from_matrix(matrix)
+            line = {"camera": view.camera, "ns": view.generated_ns, "q": pose.quaternion, "t_m": pose.translation_m}
             self._files["poses"].write(json.dumps(line))
 
     def write_status(self) -> None:

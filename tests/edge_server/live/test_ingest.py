@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.ingest import FrameAdmission, Ingest
+from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
 from freshfield import access, payload
 from freshfield.clock import VirtualClock
 from freshfield.frame import FrameRejected, checksum, to_request
@@ -198,3 +198,11 @@ def test_an_unknown_clock_cannot_bring_a_frame_from_tomorrow():
     with pytest.raises(FrameRejected) as refused:
         FrameAdmission(["cam01"], []).admit(tomorrow, NOW)
     assert refused.value.reason == "from_future"
+
+
+def test_percentiles_are_of_the_last_values():
+    values = RollingPercentiles(4)
+    assert values.percentile(50) is None
+    for value in (9.0, 1.0, 4.0, 3.0, 2.0):  # the first is the one too many
+        values.add(value)
+    assert [values.percentile(p) for p in (0, 25, 50, 99, 100)] == [1.0, 2.0, 3.0, 4.0, 4.0]
