@@ -93,7 +93,6 @@ def _add_teleop(commands: Any) -> None:
     add("--dry-run", type=Path, metavar="FILE", help="write the trajectory to FILE (CSV) instead of moving an arm")
     add("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")
-    add("--json", action="store_true", help="print the counts at the end as one JSON object")
 
 
 def log_to_stderr(level: int = logging.INFO) -> None:

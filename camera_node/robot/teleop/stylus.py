@@ -1,24 +1,62 @@
-"""The samples of every stylus: pose, clutch and time.
+"""Styluses: what an operator holds, read once per tick as samples of pose, clutch and time.
 
-Adapters (keyboard, network) are polled once per tick. They do not know the arm; ``limits`` makes
-every sample safe for it.
+The keyboard is one: keys move it by steps, the space bar presses and releases the clutch. Drivers of other devices
+(a 3D Systems Touch, a VR controller, a script) send samples over the network; ``camera-node teleop --help`` describes
+the datagrams. No stylus knows the arm; ``limits`` makes every sample safe for it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import logging
 import math
+import os
+import select
+import socket
+import sys
+import termios
+import tty
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from freshfield.geometry import quaternion_normalize
+from camera_node.robot.teleop import TeleopError
+from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
+
+log = logging.getLogger("camera-node.teleop")
 
 Array = NDArray[np.float64]
 
 FARTHEST_M = 10.0
 """Positions farther from the origin are invalid."""
+KEYS = """\
+  w s   forwards, back (x)       i k   tip up, down
+  a d   left, right (y)          j l   turn left, right
+  r f   up, down (z)             u o   roll
+  space clutch: press, release   q     end"""
+
+_STEP_M, _STEP_RAD = 0.005, 0.02
+_MOVES = {
+    "w": (0, 1),
+    "s": (0, -1),
+    "a": (1, 1),
+    "d": (1, -1),
+    "r": (2, 1),
+    "f": (2, -1),
+    "o": (3, 1),
+    "u": (3, -1),
+    "k": (4, 1),
+    "i": (4, -1),
+    "j": (5, 1),
+    "l": (5, -1),
+}
+_ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
+MAX_BYTES = 2048
+_MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
+_OWNED_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -63,3 +101,146 @@ class Stylus(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+class KeyboardStylus:
+    """Reads the terminal ``fd`` without blocking; its line mode is off until ``close``. Raises TeleopError if
+    it is not a terminal.
+
+    A terminal reports presses, not whether a key is held. Every press, and every repetition of a held key, is one
+    step. The filter turns the steps into a smooth motion.
+    """
+
+    def __init__(self, fd: int | None = None) -> None:
+        self._fd = sys.stdin.fileno() if fd is None else fd
+        self.ended = False
+        self._clutch = False
+        self._position, self._quaternion = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        try:
+            self._before = termios.tcgetattr(self._fd)
+            tty.setcbreak(self._fd)
+        except termios.error:
+            raise TeleopError("--stylus keyboard needs a terminal: run it in one, or use network:PORT") from None
+
+    def poll(self, now_ns: int) -> list[StylusSample]:
+        """See ``Stylus``. Returns one sample, also if no key was pressed."""
+        step = np.zeros(6)
+        for key in self._read():
+            if key in ("q", _END_OF_FILE):
+                self.ended = True
+            elif key == " ":
+                self._clutch = not self._clutch
+            elif key in _MOVES:
+                axis, sign = _MOVES[key]
+                step[axis] += sign * (_STEP_M if axis < 3 else _STEP_RAD)
+        half = 0.5 * FARTHEST_M  # with the clutch open it may move without end
+        self._position = np.clip(self._position + step[:3], -half, half)
+        turned = matrix_to_quaternion(so3_exp(step[3:]))
+        self._quaternion = quaternion_normalize(quaternion_multiply(turned, self._quaternion))
+        (x, y, z), (qw, qx, qy, qz) = self._position.tolist(), self._quaternion.tolist()
+        return [StylusSample(now_ns, (x, y, z), (qw, qx, qy, qz), self._clutch and not self.ended)]
+
+    def close(self) -> None:
+        """Restore the terminal's settings."""
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+
+    def _read(self) -> str:
+        """Keys typed since the last call, without arrow and function keys."""
+        if not select.select([self._fd], [], [], 0.0)[0]:
+            return ""
+        try:
+            data = os.read(self._fd, _MAX_BYTES)
+        except OSError:
+            data = b""
+        if not data:
+            self.ended = True  # the terminal is gone
+        typed = data.decode("ascii", errors="ignore").lower()
+        return typed.split(_ESCAPE)[0]
+
+
+class NetworkStylus:
+    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError.
+
+    Only the first sender counts, until it has been silent for a second. Datagrams are neither authenticated nor
+    encrypted, so the default address is reachable from this machine alone.
+    """
+
+    ended = False
+
+    def __init__(self, host: str, port: int) -> None:
+        self._owner: tuple[str, int] | None = None
+        self._heard_ns = 0
+        try:
+            kind = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.socket(kind, socket.SOCK_DGRAM)
+            self._socket.bind((host, port))
+        except OSError as error:
+            raise TeleopError(
+                f"--stylus network: cannot listen at {host}:{port}: {error.strerror}; name another port"
+            ) from None
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+
+    def poll(self, now_ns: int) -> list[StylusSample]:
+        """See ``Stylus``."""
+        found = []
+        for _ in range(_MAX_MESSAGES):
+            try:
+                data, sender = self._socket.recvfrom(MAX_BYTES + 1)
+            except OSError:
+                break  # nothing there
+            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
+                continue
+            sample = parse(data)
+            if sample is None:
+                continue
+            if self._owner != sender[:2]:
+                log.info("stylus: messages come from %s:%d", *sender[:2])
+            self._owner, self._heard_ns = sender[:2], now_ns
+            found.append(sample)
+        return found
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def parse(data: bytes) -> StylusSample | None:
+    """Parse a message; None if it is malformed. Its numbers are checked later (``StylusSample.is_valid``)."""
+    if len(data) > MAX_BYTES:
+        return None
+    try:
+        message = json.loads(data)
+        t_ns, clutch = message["t_ns"], message["clutch"]
+        position = tuple(float(v) for v in message["p"])
+        quaternion = tuple(float(v) for v in message["q"])
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return None
+    whole = isinstance(t_ns, int) and not isinstance(t_ns, bool) and isinstance(clutch, bool)
+    if not whole or len(position) != 3 or len(quaternion) != 4:
+        return None
+    return StylusSample(t_ns, position, quaternion, clutch)
+
+
+def encode(sample: StylusSample) -> bytes:
+    """The datagram of a sample, for senders in Python."""
+    message = {"t_ns": sample.t_ns, "p": sample.position_m, "q": sample.quaternion, "clutch": sample.clutch}
+    return json.dumps(message).encode()
+
+
+def open_stylus(text: str) -> Stylus:
+    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or
+    ``network:HOST:PORT``. Raises TeleopError."""
+    kind, _, rest = text.partition(":")
+    if kind == "keyboard" and not rest:
+        keyboard = KeyboardStylus()
+        print(KEYS, file=sys.stderr)
+        return keyboard
+    if kind == "network":
+        host, _, port = rest.rpartition(":")
+        if not port.isdigit() or not 0 < int(port) < 65536:
+            raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
+        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
+        log.info("waiting for a stylus at UDP port %d", stylus.port)
+        return stylus
+    raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")

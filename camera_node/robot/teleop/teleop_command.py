@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import logging
 import os
 import sys
 import time
@@ -13,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.config import ArmConfig
-from camera_node.robot import stdout
 from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.control import confirm_motion, open_stream, stop_event
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
@@ -22,20 +19,17 @@ from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
-from camera_node.robot.teleop.stylus import Stylus
+from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 from freshfield.settings import read_settings
-
-log = logging.getLogger("camera-node.teleop")
 
 _SHOW_S = 0.5
 # Within the limits of a TeleopConfig no stop takes longer.
 _LONGEST_STOP_S = 3.0
 
 
-@stdout.only_python_output()
 def run(args: argparse.Namespace) -> int:
     """Teleoperate until the operator ends it, Ctrl-C or ``--seconds``. Returns 1 after an error of the arm or
     the file. Raises ScenarioError, TeleopError and ArmError before the arm moves."""
@@ -60,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         # After the question, because a keyboard stylus switches the terminal's line mode off.
         stylus = open_stylus(args.stylus)
         sink = _sink(args.dry_run, stream, model, config)
-        status = _run_loop(operator, stylus, sink, args.seconds, args.json)
+        status = _run_loop(operator, stylus, sink, args.seconds)
     finally:
         if stylus is not None:
             stylus.close()
@@ -77,28 +71,6 @@ def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
     return read_settings(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
 
 
-def open_stylus(text: str) -> Stylus:
-    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or
-    ``network:HOST:PORT``. Raises TeleopError."""
-    kind, _, rest = text.partition(":")
-    if kind == "keyboard" and not rest:
-        from camera_node.robot.teleop.keyboard import KEYS, KeyboardStylus
-
-        keyboard = KeyboardStylus()
-        print(KEYS, file=sys.stderr)
-        return keyboard
-    if kind == "network":
-        from camera_node.robot.teleop.network_stylus import NetworkStylus
-
-        host, _, port = rest.rpartition(":")
-        if not port.isdigit() or not 0 < int(port) < 65536:
-            raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
-        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
-        log.info("waiting for a stylus at UDP port %d", stylus.port)
-        return stylus
-    raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")
-
-
 def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: TeleopConfig) -> Sink:
     if stream is not None:
         return ServoSink(stream, 1.0 / config.rate_hz)
@@ -109,7 +81,7 @@ def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: 
         raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
 
 
-def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None, as_json: bool) -> int:
+def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None) -> int:
     """Tick until asked to end, then bring the arm to rest within the limits. Returns the exit status."""
     stop_requested, clock = stop_event(), WallClock()
     period_s = 1.0 / operator.config.rate_hz
@@ -139,8 +111,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
         status = 1
     finally:
         sink.close()
-    summary = {**operator.summary(), "late_ticks": late}
-    print(json.dumps(summary) if as_json else f"\n{_status_line(operator)}; {late} ticks late")
+    print(f"\n{_status_line(operator)}; {late} of {operator.ticks} ticks late")
     return status
 
 
@@ -161,5 +132,6 @@ def _status_line(operator: Teleoperator) -> str:
     held = f", held by {', '.join(refused)}" if refused else ""
     return (
         f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "
+        f"clutch pressed {counts.engaged} times, "
         f"{counts.unsound + counts.backwards} refused, {counts.jumps} jumps{held}"
     )

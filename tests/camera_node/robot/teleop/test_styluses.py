@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.keyboard import KeyboardStylus
-from camera_node.robot.teleop.network_stylus import NetworkStylus, encode, parse
-from camera_node.robot.teleop.teleop_command import open_stylus
+from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, encode, open_stylus, parse
 from tests.camera_node.robot.teleop.checks import sample
 
 GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}

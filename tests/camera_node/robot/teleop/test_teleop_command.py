@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import json
 import math
 import signal
 import socket
@@ -17,7 +16,7 @@ from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.teleop import sinks
-from camera_node.robot.teleop.network_stylus import encode
+from camera_node.robot.teleop.stylus import encode
 from camera_node.robot.teleop.teleoperator import Command
 from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
@@ -60,13 +59,13 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     scenario = write_cell(tmp_path, "127.0.0.2", teleop=teleop)
     with Sender(port):
         status = main(
-            ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file), "--json"]
+            ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file)]
         )
     assert status == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["messages"]["engaged"] >= 1
+    said = capsys.readouterr().out
+    assert "clutch pressed 0 times" not in said
     rows = list(csv.DictReader(file.open()))
-    assert len(rows) == summary["ticks"]
+    assert f"of {len(rows)} ticks late" in said
     joints = np.array([[float(row[f"q{k}_rad"]) for k in range(1, 7)] for row in rows])
     assert np.allclose(joints[0], HOME, atol=0.01)
     assert np.abs(np.diff(joints, axis=0)).max() * 125.0 <= 0.5 + 1e-6
@@ -81,10 +80,10 @@ def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys, host):
     port = free_port()
     file = write_cell(tmp_path, host)
     with simulated_arm(host), Sender(port):
-        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--seconds", 3, "--json")
+        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--seconds", 3)
         out, said = process.communicate(timeout=60)
         assert process.returncode == 0, said
-        assert json.loads(out)["messages"]["engaged"] >= 1
+        assert "clutch pressed 0 times" not in out
         joints = TruthClient(host).joints(WallClock().now_ns())
     assert np.abs(joints - HOME).max() > 1e-3, "the arm has moved"
 
@@ -94,7 +93,7 @@ def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path, host):
     port = free_port()
     file = write_cell(tmp_path, host, simulated=False)  # patience as on a bench
     with simulated_arm(host) as arm, Sender(port):
-        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--yes", "--json")
+        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--yes")
         wait_until_moving(TruthClient(host), process)
         arm.send_signal(signal.SIGSTOP)
         try:
@@ -104,8 +103,7 @@ def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path, host):
             arm.send_signal(signal.SIGCONT)
     out, said = process.communicate()
     assert f"camera-node: arm at {host}" in said
-    assert json.loads(out)["messages"]["engaged"] >= 1  # and nothing else, whatever the library prints
-    assert "Reconnecting" in said
+    assert "clutch pressed" in out
 
 
 def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):

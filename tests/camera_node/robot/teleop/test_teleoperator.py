@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.teleop.damped_least_squares import commanded_twist, joint_speeds
 from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.teleoperator import commanded_twist, joint_speeds
 from freshfield.geometry import se3, so3_exp
 from tests.camera_node.robot.teleop.checks import HOME
 
