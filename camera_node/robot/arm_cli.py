@@ -39,8 +39,6 @@ def add_commands(commands: Any) -> None:
         metavar="PPM",
         help="frequency error of its clock, positive: fast [%(default)g]",
     )
-    add("--noise-rad", type=float, default=0.0, metavar="RAD", help="standard deviation of encoder noise [%(default)g]")
-    add("--seed", type=int, default=0, metavar="N", help="random seed of the noise [%(default)s]")
 
     drive = commands.add_parser(
         "drive-arm",

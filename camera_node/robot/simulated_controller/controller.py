@@ -40,18 +40,9 @@ class Controller:
     start_ns: the instant of step 0.
     joints: initial joint angles (6,), radians.
     drift_ppm: how much faster the controller's clock runs than true time.
-    noise_rad, seed: standard deviation and seed of the joint encoders' noise. The true joints have none.
     """
 
-    def __init__(
-        self,
-        arm: ArmModel,
-        start_ns: int,
-        joints: ArrayLike = HOME_RAD,
-        drift_ppm: float = 0.0,
-        noise_rad: float = 0.0,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, arm: ArmModel, start_ns: int, joints: ArrayLike = HOME_RAD, drift_ppm: float = 0.0) -> None:
         self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
         self.answer = 0
@@ -59,8 +50,6 @@ class Controller:
         self.steps = 0
         self._start_ns = start_ns
         self._drift = 1.0 + drift_ppm * 1e-6
-        self._noise_rad = noise_rad
-        self._rng = np.random.default_rng(seed)
         self._busy = False
         self._watchdog_steps: int | None = None
         self._watchdog_reset_step = 0
@@ -98,12 +87,11 @@ class Controller:
         return round(self._start_ns + position * STEP_NS), (1.0 - part) * a + part * b
 
     def values(self) -> dict[str, Any]:
-        """Current values of the output variables that are not zero. Each call draws new encoder noise."""
-        q = self.motion.q
+        """Current values of the output variables that are not zero."""
         running = self.runtime_state == PLAYING
         return {
             "timestamp": self.steps * STEP_S * self._drift,
-            "actual_q": q + self._rng.normal(0.0, self._noise_rad, 6) if self._noise_rad > 0.0 else q,
+            "actual_q": self.motion.q,
             "robot_mode": 7,
             "safety_mode": 1,
             "safety_status_bits": 1,

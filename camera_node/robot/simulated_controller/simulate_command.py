@@ -10,7 +10,6 @@ import sys
 
 import numpy as np
 
-from camera_node.config import errors_of
 from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
@@ -28,8 +27,7 @@ def run(args: argparse.Namespace) -> int:
         host, arm = args.host or config.host, arm_model(scenario, config)
     joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
-    with errors_of("--noise-rad"):
-        controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm, args.noise_rad, args.seed)
+    controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm)
     server = ControllerServer(controller, host, clock)
 
     async def serve() -> None:

@@ -41,7 +41,6 @@ NAMES = (
     "occluder",
     "pose_noise",
     "sensor_noise",
-    "vignetting",
 )
 
 

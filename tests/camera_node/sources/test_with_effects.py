@@ -106,7 +106,7 @@ def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["fog", "lens_distortion", "motion_blur", "vignetting"])
+@pytest.mark.parametrize("name", ["fog", "lens_distortion", "motion_blur"])
 def test_recordings_have_lenses_and_weather_of_their_own(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})
     with pytest.raises(ScenarioError, match="kinds world, lens and exposure need source kind world"):

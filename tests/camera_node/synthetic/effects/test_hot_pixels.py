@@ -39,20 +39,6 @@ def test_damage_is_the_same_in_every_frame_and_another_in_every_camera():
     assert both < 10 < np.count_nonzero(other.any(axis=2))
 
 
-def test_the_damage_grows_with_the_hours_and_heals_nowhere():
-    sensor = make(hot_ppm=1000.0, growth_ppm_per_h=3600.0)
-    counts, before = [], None
-    for hours in (0.0, 1.0, 2.0, 5.0):
-        hit = sensor.apply(BLACK, 0, 3600.0 * hours).any(axis=2)
-        assert before is None or (hit | ~before).all()
-        before = hit
-        counts.append(np.count_nonzero(hit))
-    for count, expected in zip(counts, (200, 920, 1640, 3800)):
-        assert count == pytest.approx(expected, abs=4 * np.sqrt(expected))
-    # Without growth the damage equals that of growth at its start.
-    assert np.array_equal(make(hot_ppm=1000.0).apply(BLACK, 0, 0.0), sensor.apply(BLACK, 0, 0.0))
-
-
 def test_hits_are_a_poisson_process_that_repeats_by_frame():
     sensor = make(hits_per_megapixel=150.0, hit_counts=1e6)  # 30 a frame here, each visible
     numbers = np.array([np.count_nonzero(sensor.apply(BLACK, k, 0.0)) for k in range(400)])

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects.motion_blur import MotionBlur
-from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
+
+
+@dataclass
+class Shown:
+    """A renderer that shows a function of time."""
+
+    image: Callable[[float], np.ndarray]
 
 
 def make(exposure_ms: float = 20.0, samples: int = 5) -> MotionBlur:
@@ -26,7 +35,7 @@ def test_the_mean_of_the_exposure_is_at_its_middle():
         asked.append(t_s)
         return ramp(t_s)
 
-    assert (make(exposure_ms=400.0, samples=8).expose(TimedRenderer(render), 1.0) == 100).all()
+    assert (make(exposure_ms=400.0, samples=8).expose(Shown(render), 1.0) == 100).all()
     assert np.mean(asked) == pytest.approx(1.0)
     assert max(asked) - min(asked) == pytest.approx(0.4 * 7 / 8)
     assert len(asked) == 8
@@ -34,7 +43,7 @@ def test_the_mean_of_the_exposure_is_at_its_middle():
 
 def test_bright_images_do_not_overflow():
     white = np.full((2, 2, 3), 255, np.uint8)
-    assert (make(samples=64).expose(TimedRenderer(lambda t: white), 0.0) == 255).all()
+    assert (make(samples=64).expose(Shown(lambda t: white), 0.0) == 255).all()
 
 
 def test_only_what_moves_is_blurred():

@@ -151,7 +151,6 @@ NEUTRAL: dict[str, dict] = {
     "motion_blur": {"samples": 1},
     "pose_noise": {"translation_mm": 0.0, "rotation_deg": 0.0},
     "sensor_noise": {"read_noise_counts": 0.0, "full_well_electrons": 0.0},
-    "vignetting": {"exponent": 0.0},
 }
 
 
