@@ -201,8 +201,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(INSTALL) -e '.[edge,embed,up,test,dev]'
 	@touch $@
 
-# What slow tests need besides: Ray, some 240 MB; gymnasium and Stable-Baselines3, the oracle of our own PPO;
-# scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
+# What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
 .venv/.ok-slow: .venv/.ok-test
-	@$(INSTALL) -e '.[cluster,detector,gym,oracle,surface,colmap,ur,oak,realsense,kinematics,mcap]'
+	@$(INSTALL) -e '.[cluster,detector,surface,colmap,ur,oak,realsense,kinematics,mcap]'
 	@touch $@

@@ -77,8 +77,6 @@ class EdgeConfig(Settings, frozen=True):
     frontier: page and report draw it; not given: the shipped one.
     compute: ``zero``, the milliseconds of ``ComputeConfig``, or a file of ``edge-server costs``, relative to the
         scenario.
-    scores: the values of a scores.json of ``edge-server train-scheduler --hold``, which a scenario names relative to
-        itself, for the page.
     noisy_truth: the bound of moving pixels follows the noise of held-out frames.
     keyframes: null: earlier viewpoints do not go on supervising.
     embedding, foreground: an ``embed.EmbeddingConfig`` and a ``foreground.ForegroundConfig``, whose modules only a
@@ -103,7 +101,6 @@ class EdgeConfig(Settings, frozen=True):
     keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None
     foreground: Annotated[Any, about("cuts the background out of every view")] = None
     export: Annotated[ExportConfig | None, about("what the launcher makes of the field when the run ends")] = None
-    scores: Annotated[Any, about("what policies reach in virtual time")] = None
 
 
 def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:
@@ -143,31 +140,6 @@ def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
     return make_embedder(embedding)
 
 
-class _Machine(msgspec.Struct):
-    cpu: str
-    cores: int
-
-
-class _OwnSeed(msgspec.Struct):
-    psnr_db: float | None
-    views: float | None
-
-
-class _Policy(msgspec.Struct):
-    own_seed: _OwnSeed
-    psnr_db_over_all: tuple[float | None, float | None, float | None] = (None, None, None)
-
-
-class _Scores(msgspec.Struct):
-    """What the page shows of a scores.json (``page.markup.policy_scores``)."""
-
-    seconds: float
-    seed: int
-    seeds: int
-    machine: _Machine
-    policies: dict[str, _Policy]
-
-
 def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
     """The edge section of a scenario, with what it leaves open. Raises ScenarioError.
 
@@ -186,8 +158,6 @@ def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
         from edge_server.foreground import read_foreground
 
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
-    if section.get("scores") is not None:
-        section["scores"] = _read_json(scenario, "scores", section["scores"], _Scores)
     config = read_settings(EdgeConfig, section, f"{scenario.path}: edge")
     name = resolve_checkpoint(config.policy.name, scenario.path.parent)
     return replace(config, policy=replace(config.policy, name=name))

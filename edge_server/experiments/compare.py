@@ -16,7 +16,7 @@ from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, at_least, command_parser, folders_of, run_command
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.seed_table import Row, SeedTable
+from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import discoveries, interval, paired
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.rollout import run_rollouts
@@ -66,14 +66,13 @@ def _run(args: argparse.Namespace) -> None:
     labels = _labels(args.policies)
     with Engine(args.results, args.jobs, threads=1) as engine:
         table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
-        own = None if args.json is None else _own_seed(setting, folders_of(args), engine, labels)
     print(as_text(table, list(labels)))
     if args.json is not None:
         about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}
         about |= {"compute": as_mapping(setting.compute), "machine": machine(), "commit": commit()}
         args.json.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.json, {**about, "policies": as_json(table, list(labels), own or {})}, indent=1)
+        write_json(args.json, {**about, "policies": as_json(table, list(labels))}, indent=1)
 
 
 def setting_of(
@@ -142,13 +141,12 @@ def as_text(table: SeedTable, labels: Sequence[str]) -> str:
     return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths)).rstrip() for line in lines)
 
 
-def as_json(table: SeedTable, labels: Sequence[str], own: Mapping[str, Row]) -> dict[str, Any]:
-    """The comparison as JSON values, which the page shows if ``edge.scores`` names the file: for each policy
-    ``own_seed`` (with the scenario's own seed), and [mean, low, high] of each metric and of its difference to the
-    first policy."""
+def as_json(table: SeedTable, labels: Sequence[str]) -> dict[str, Any]:
+    """The comparison as JSON values: [mean, low, high] of each policy's metrics and of their differences to the first
+    policy."""
     found: dict[str, Any] = {}
     for label in labels:
-        row: dict[str, Any] = {"own_seed": own[label]} if label in own else {}
+        row: dict[str, Any] = {}
         for metric, (_, _, of) in COLUMNS.items():
             values = table.values(metric, policy=label)
             row[metric] = interval(values.values()).rounded(4)
@@ -156,13 +154,6 @@ def as_json(table: SeedTable, labels: Sequence[str], own: Mapping[str, Row]) -> 
                 row[f"{metric}_over_{labels[0]}"] = paired(values, table.values(metric, policy=labels[0])).rounded(4)
         found[label] = row
     return found
-
-
-def _own_seed(setting: Setting, folders: Folders, engine: Engine, labels: Mapping[str, str]) -> dict[str, Row]:
-    """What each policy shows with the scenario's own seed and motion."""
-    as_it_is = dataclasses.replace(setting, motions=False)
-    table = compare(as_it_is, folders, engine, labels, [setting.scenario.seed])
-    return {row["policy"]: {name: row[name] for name in COLUMNS} for row in table.rows}
 
 
 def _labels(policies: Sequence[str]) -> dict[str, str]:
@@ -187,7 +178,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--costs", type=Path, metavar="FILE", help="file written by `edge-server costs` [edge.compute of the scenario]")
     add("--slower", type=float, default=1.0, metavar="K", help="computing takes K times as long [%(default)g]")
     add("--jobs", type=at_least(1), default=usable_cores(), metavar="N", help="worker processes [%(default)s]")
-    add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE, which edge.scores may name")
+    add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE")
     add("--results", type=out_file, metavar="FILE", help="keep finished runs in FILE, and use those it has [none]")
     add_folders(parser)
     return parser

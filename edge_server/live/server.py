@@ -177,7 +177,6 @@ class EdgeServer:
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
             channel=ReplacedJson((options.emulator_out or options.out) / "channel.json").read,
-            scores=config.scores,
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),

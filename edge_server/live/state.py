@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +127,6 @@ class EdgeState:
     start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
-    scores: what policies reach in virtual time (``edge.scores``), as ``train-scheduler --hold`` writes it.
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     warnings: what other machines can do here that they should not, in words (--insecure).
@@ -144,7 +143,6 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     decision: Callable[[], Decision | None] = lambda: None
-    scores: dict[str, Any] | None = None
     frontier: Frontier | None = None
     field_name: str = ""
     chosen: str = ""

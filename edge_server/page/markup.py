@@ -254,27 +254,6 @@ def _bar(name: str, share: float, widest: float) -> str:
     )
 
 
-def policy_scores(scores: dict[str, Any]) -> str:
-    """What policies reached in virtual time (``edge.scores``): a row each, with what the numbers are."""
-    rows = ""
-    for name, row in scores["policies"].items():
-        over = [] if name == "all" else row.get("psnr_db_over_all", [])
-        difference = f"{over[0]:+.2f} [{over[1]:+.2f}, {over[2]:+.2f}]" if None not in over and over else ""
-        values = (number(row["own_seed"]["psnr_db"], 1), number(row["own_seed"]["views"], 1), difference)
-        rows += (
-            f'<tr><td style="{_CELL};text-align:left">{escape(name)}</td>'
-            + "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
-            + "</tr>"
-        )
-    about = (
-        f"In virtual time, not now: {scores['seconds']:g} s of this scenario and its channel's seed "
-        f"{scores['seed']}, updates charged with what they take on {scores['machine']['cpu']}, "
-        f"{scores['machine']['cores']} cores; PSNR of what was shown. Over all: paired over "
-        f"{scores['seeds']} other seeds, 95 %."
-    )
-    return note(about) + _table(("policy", "dB", "views", "over all, dB"), rows)
-
-
 def channel_line(channel: dict[str, Any]) -> str:
     """The emulator's status in one line; values that it does not report are left out."""
     counts = channel.get("counts")

@@ -45,9 +45,6 @@ class Panel:
         self._explanation = DecisionExplanation(gui, state)
         with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
-        if state.scores is not None:
-            with gui.add_folder("What policies reach"):
-                gui.add_html(markup.policy_scores(state.scores))
         side = gui.add_panel()
         with side.add_tab("Timelines"):
             self._timelines = Timelines(gui)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_server.scheduler import fixed, index
+from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
 from freshfield.limits import MAX_POLICY_CHARS
@@ -24,9 +24,6 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "round-robin": (fixed.RoundRobin, "the next k cameras in turn; value: k"),
     "freshest-k": (fixed.FreshestK, "the k youngest frames; value: k"),
     "age-driven": (fixed.AgeDriven, "the largest set whose mean age is minimal"),
-    "whittle": (index.Whittle, "the k views that most reduce the squared ages of frames used last; value: k"),
-    "aoii": (index.IncorrectAge, "the k views with the largest age of incorrect information; value: k"),
-    "covariance": (index.PredictedCovariance, "the k views whose predicted variance falls most; value: k"),
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-arrived": (WaitArrived, "as wait, but frames that arrive meanwhile, however old (6.16)"),

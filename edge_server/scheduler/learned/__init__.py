@@ -7,7 +7,6 @@
     distributions.py    log-probabilities, exact also near 0 and 1, of non-empty sets and of omegas
     ppo.py              single-step PPO (5.23, algorithm 1), contextual-bandit PPO (6.42, algorithm 2)
     rewards.py          (5.19) and (6.36)-(6.38), term by term
-    gym_environment.py  gymnasium environment: draw a round, get the reward of an action
     actor.py            a trained actor, in numpy
     bandit.py           a checkpoint as a policy, live and in virtual time
     explain.py          attributes a decision to parts of the state, cameras and image regions

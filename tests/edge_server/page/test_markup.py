@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
-from edge_server.config import read_config
 from edge_server.live.frontier import Frontier, FrontierPoint
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
 from edge_server.page.panel import age_parts_ms
-from freshfield.scenario import ScenarioError, parse
 
 
 def summary(**changes) -> markup.Summary:
@@ -101,46 +97,6 @@ def test_the_table_marks_age_truth_use_and_refusals():
     assert "truth" in rows[0] and css(HELD_OUT) in rows[0]
     assert "9000 ms" in rows[1] and "&#10003;" in rows[1] and css(STALE) in rows[1] and ">3<" in rows[1]
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
-
-
-def test_the_scores_of_policies_say_where_they_are_from():
-    row = {"own_seed": {"psnr_db": 27.96, "views": 12.0}, "psnr_db_over_all": [-0.03, -0.11, 0.05]}
-    scores = {
-        "policies": {"all": row, "<learned>": row},
-        "seconds": 10.0,
-        "seed": 7,
-        "seeds": 12,
-        "machine": {"cpu": "a machine", "cores": 2},
-    }
-    html = markup.policy_scores(scores)
-    for part in ("virtual time", "seed 7", "a machine", "12 other seeds", "28.0", "&lt;learned&gt;"):
-        assert part in html
-    assert html.count("-0.03 [-0.11, +0.05]") == 1, "all is not compared with itself"
-
-
-ROW = {"own_seed": {"psnr_db": None, "views": 12.0}}
-SCORES = {"policies": {"all": ROW}, "seconds": 8.0, "seed": 7, "seeds": 12, "machine": {"cpu": "a machine", "cores": 2}}
-
-
-@pytest.mark.parametrize(
-    ("change", "where"),
-    [
-        ({}, ""),
-        ({"policies": {}, "seconds": None}, "seconds"),
-        ({"policies": {"all": 3}}, "policies"),
-        ({"policies": {"learned": {**ROW, "psnr_db_over_all": [0.1]}}}, "psnr_db_over_all"),
-        ({"machine": {}}, "machine"),
-    ],
-)
-def test_scores_that_the_page_cannot_show_are_refused_when_read(tmp_path, change, where) -> None:
-    (tmp_path / "scores.json").write_text(json.dumps(SCORES | change))
-    scenario = parse({"cameras": {"count": 2}, "edge": {"scores": "scores.json"}}, tmp_path / "x.yaml")
-    if not where:
-        assert "&ndash;" in markup.policy_scores(read_config(scenario).scores)
-        return
-    with pytest.raises(ScenarioError, match=rf"edge\.scores: .*scores\.json: .*{where}") as error:
-        read_config(scenario)
-    assert "\n" not in str(error.value)
 
 
 def test_the_channel_line_shows_only_what_the_emulator_reports():

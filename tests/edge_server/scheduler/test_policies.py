@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_live_policy, make_policy, policy_help
-from edge_server.scheduler.learned.state import State
 from edge_server.scheduler.registry import resolve_checkpoint
 from tests.work import MOST_MS, work_ms
 
@@ -75,60 +74,6 @@ def test_freshest_k_and_its_ties():
 def test_age_driven_minimises_the_mean_age():
     assert choose("age-driven", AT) == ("a",)
     assert choose("age-driven", epoch(9, a=5, b=3, c=5)) == ("a", "c")
-
-
-def test_whittle_serves_whom_the_field_knows_least_of_and_counts_what_it_used():
-    policy = make_policy("whittle", 1, np.random.default_rng(0))
-
-    def ask(at: Epoch) -> tuple[str, ...]:
-        return policy.select(at, policy.plan(at))
-
-    assert ask(epoch(10, a=8, b=9)) == ("a",) and ask(epoch(10, a=8, b=9)) == ("b",)  # once each, unseen first
-    assert ask(epoch(20, a=8, b=9)) == ("a",)  # nothing new: no gain anywhere, ties go by order
-    assert ask(epoch(20, a=8, b=19)) == ("b",)
-    # Known 12 and 1 old, to become 10 and 0.
-    assert ask(epoch(20, a=10, b=20)) == ("a",)
-
-
-def seen(now_ms: float, generated_ms: dict[str, float], **z: float) -> Epoch:
-    """An epoch whose cameras see one number each."""
-    at, n = epoch(now_ms, **generated_ms), len(z)
-    rows = np.array(list(z.values()), np.float32)[:, None]
-    state = State(np.zeros(n), np.zeros((n, 6)), rows, np.ones(n, bool), tuple(z))
-    return replace(at, state=lambda parts=(): state)
-
-
-@pytest.mark.parametrize("name", ["aoii", "covariance"])
-def test_policies_that_see_prefer_what_changed_and_fall_back_on_ages(name: str):
-    policy = make_policy(name, 1, np.random.default_rng(0))
-
-    def ask(at: Epoch) -> tuple[str, ...]:
-        return policy.select(at, policy.plan(at))
-
-    assert ask(seen(10, {"a": 10, "b": 10}, a=0.0, b=0.0)) == ("a",)  # once each, unseen first
-    assert ask(seen(10, {"a": 10, "b": 10}, a=0.0, b=0.0)) == ("b",)
-    # Both equally old: b has changed, a has not.
-    assert ask(seen(20, {"a": 20, "b": 20}, a=0.0, b=1.0)) == ("b",)
-    # aoii: a change of 1, 20 ms ago, against one of 1, 10 ms ago. covariance: walks of 1 in 20 ms and of 2 in
-    # 20 ms, over 20 and 10 ms; a tie, which goes by order.
-    assert ask(seen(30, {"a": 30, "b": 30}, a=1.0, b=2.0)) == ("a",)
-    assert ask(seen(40, {"a": 30, "b": 30}, a=1.0, b=2.0)) == ("b",)  # nothing new of a
-    blind = make_policy(name, 1, np.random.default_rng(0))
-    for at in (epoch(10, a=8, b=9), epoch(10, a=8, b=9)):
-        blind.select(at, blind.plan(at))
-    later = epoch(20, a=10, b=20)
-    assert blind.select(later, blind.plan(later)) == (("a",) if name == "aoii" else ("b",))
-
-
-def test_covariance_learns_how_much_each_camera_sees_change():
-    """b changes three times as fast as a: nine times the variance, so 10 ms of b count as 90 of a."""
-    policy = make_policy("covariance", 1, np.random.default_rng(0))
-    for t in range(0, 100, 10):
-        at = seen(t, {"a": t, "b": t}, a=t / 10, b=3 * t / 10)
-        policy.select(at, policy.plan(at))
-    for b_ms, chosen in ((9, "a"), (11, "b")):
-        policy._used_ns = {"a": 0, "b": (90 - b_ms) * MS}
-        assert policy.select(at, policy.plan(at)) == (chosen,)
 
 
 def test_round_robin_gives_everybody_a_turn():
