@@ -1,8 +1,7 @@
 """Episodes: run a virtual deployment, draw decisions from it, and evaluate choices with field fits.
 
 The channel does not depend on the edge's decisions, so one recorded run serves every action at every
-decision, and the record gives the buffer at any instant. (If decisions flush the links, each has its own
-record with one flush, which all actions share.) Each choice gets its own field fit, from an empty field or
+decision, and the record gives the buffer at any instant. Each choice gets its own field fit, from an empty field or
 from a copy of the same warm field, so actions of one decision are comparable (thesis 5.4, algorithm 1; 6.3,
 algorithm 2).
 """
@@ -276,9 +275,8 @@ class Episode:
         self.points = tuple(self._point(number) for number in range(setting.decisions))
         self._scored: dict[tuple[int, Choice, tuple[str, ...]], dict[str, Outcome]] = {}
 
-    def _recorded(self, flush_ns: int | None = None) -> tuple[VirtualDeployment, list[Arrival]]:
-        """Run the deployment to the end of the record; returns it and all arrivals. flush_ns: when its links
-        are flushed; None: never."""
+    def _recorded(self) -> tuple[VirtualDeployment, list[Arrival]]:
+        """Run the deployment to the end of the record; returns it and all arrivals."""
         factory, setting = self._factory, self._factory.setting
         scenario, stage = factory.scenario(self.seed), factory.stage(self.seed)
         heard = tuple(c for c in scenario.cameras if c not in setting.silent)
@@ -293,13 +291,9 @@ class Episode:
         )
         recorder = _Recorder([c for c in scenario.training if c in heard])
         deployment.updates.buffer = recorder
-        if flush_ns is not None:
-            deployment.run(flush_ns / 1e9)
-            deployment.flush()
-        deployment.run((self._until_ns - deployment.clock.now_ns()) / 1e9)
+        deployment.run(self._until_ns / 1e9)
         record = recorder.record
-        # Kept for the images only: the instant of reception depends on the record.
-        self._frames |= {(b.camera, b.sequence): b for b in record}
+        self._frames = {(b.camera, b.sequence): b for b in record}
         return deployment, [Arrival(b.camera, b.sequence, b.generated_edge_ns, b.received_ns) for b in record]
 
     def evaluate(self, number: int, choice: Choice, cameras: tuple[str, ...] | None = None) -> dict[str, Outcome]:
@@ -340,8 +334,7 @@ class Episode:
 
     def _point(self, number: int) -> DecisionPoint:
         setting, now_ns = self._factory.setting, self.instants_ns[number]
-        record = self._recorded(now_ns)[1] if setting.flush else self._record
-        cameras = setting.scenario.training
+        cameras, record = setting.scenario.training, self._record
         reported = _newest(record, now_ns, cameras)
         arrivals = sorted(reported.values(), key=lambda a: a.received_ns)
         arrivals += [a for a in record if a.received_ns > now_ns]

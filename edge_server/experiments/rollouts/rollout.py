@@ -1,10 +1,9 @@
 """One rollout for training, evaluation and comparison: an episode in which an actor decides, whole in one process.
 
 An actor makes a policy from a random generator: a fixed one by name, or one with a learned actor's weights. In a
-``deployed`` setting the policy decides in a running deployment, with computing charged, and the outcome of a decision
-is what is shown until the next one; it also depends on all earlier decisions. Otherwise it decides at single
-instants, each time from the same field, so that the outcomes of several samples of one decision are comparable
-(``episode``).
+``deployed`` setting the policy decides in a running deployment, with computing charged, and the outcome is what is
+shown. Otherwise it decides at single instants, each time from the same field, so that the outcomes of several samples
+of one decision are comparable (``episode``).
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from edge_server.experiments.rollouts.episode import SCORES, Choice, Episode, Ep
 from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.live.state import Publication
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
@@ -48,7 +46,7 @@ class Decided:
     """A decision and its outcome, as plain values.
 
     slot: number of the decision; those of one slot in several samples of an episode are comparable.
-    outcomes: by the camera that scored; in a running deployment by "", the mean over all cameras.
+    outcomes: by the camera that scored.
     features, action, logp: what a learned policy saw ((N, width)), its action ((N,) bool, or the index of an omega) and
         its log-probability; None and 0 for other policies.
     """
@@ -75,7 +73,7 @@ class Decided:
 
 @dataclass(frozen=True)
 class Run:
-    """One sample of an episode. whole: the outcome of all of it; None unless in a running deployment."""
+    """One sample of an episode: its single decisions, or of a running deployment the outcome of all of it."""
 
     decided: list[Decided]
     whole: Outcome | None = None
@@ -138,18 +136,10 @@ def choose(policy: Policy, episode: Episode, number: int) -> Choice:
 
 
 def _deployed(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple[str, ...] | None) -> Run:
-    """Run an episode under ``policy``: the decisions after the lead of a learned policy, and the outcome of all that
-    was shown after it."""
+    """Run an episode under ``policy``: the outcome of all that was shown after the lead."""
     setting, scenario = factory.setting, factory.scenario(seed)
     edge, stage, field = read_config(scenario), factory.stage(seed), factory.field(seed)
     field.reset()
-    decisions: list[Decision] = []
-
-    def published(publication: Publication) -> None:
-        last = policy.last_decision
-        if last is not None and (not decisions or decisions[-1].now_ns != last.now_ns):
-            decisions.append(last.without_frames())
-
     settings = RunSettings(
         steps=edge.steps,
         compute=setting.compute,
@@ -158,35 +148,22 @@ def _deployed(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple
         score_every_ms=None,
         shown_every_ms=SHOWN_EVERY_MS,
     )
+    truth, embedder = stage.truth(cameras or setting.rewarding), factory.embedder
     deployment = build_deployment(
-        scenario,
-        settings,
-        field=field,
-        cameras=stage.cameras,
-        truth=stage.truth(cameras or setting.rewarding),
-        embedder=factory.embedder,
-        on_published=published,
+        scenario, settings, field=field, cameras=stage.cameras, truth=truth, embedder=embedder
     )
     deployment.updates.policy = policy
     deployment.run((setting.lead_ms + setting.span_ms) / 1e3)
-    lead_ns, end_ns = round(setting.lead_ms * 1e6), deployment.clock.now_ns()
-
-    def outcome(begin_ns: int, until_ns: int) -> Outcome:
-        """Means of the images shown and of the updates published in [begin, until)."""
-        shown = [s for s in deployment.shown if begin_ns <= s.published_ns < until_ns]
-        updates = [p for p in deployment.publications if begin_ns <= p.published_ns < until_ns]
-        return Outcome(
-            **{name: mean_or_none([getattr(s, name) for s in shown]) for name in SCORES},
-            aaoi_ms=mean_or_none([p.aaoi_ms for p in updates]),
-            views=mean_or_none([p.views for p in updates]) or 0.0,
-            wait_ms=mean_or_none([p.update_ms for p in updates]) or 0.0,
-        )
-
-    kept = [d for d in decisions if d.now_ns >= lead_ns]
-    ends = [*(d.now_ns for d in kept[1:]), end_ns]
-    hold_ns = round((kept[0].actor.spec.hold_ms if kept else 0.0) * 1e6) or 1
-    decided = [Decided.of_policy(d.now_ns // hold_ns, {"": outcome(d.now_ns, end)}, d) for d, end in zip(kept, ends)]
-    return Run(decided, outcome(lead_ns, end_ns))
+    lead_ns = round(setting.lead_ms * 1e6)
+    shown = [s for s in deployment.shown if s.published_ns >= lead_ns]
+    updates = [p for p in deployment.publications if p.published_ns >= lead_ns]
+    whole = Outcome(
+        **{name: mean_or_none([getattr(s, name) for s in shown]) for name in SCORES},
+        aaoi_ms=mean_or_none([p.aaoi_ms for p in updates]),
+        views=mean_or_none([p.views for p in updates]) or 0.0,
+        wait_ms=mean_or_none([p.update_ms for p in updates]) or 0.0,
+    )
+    return Run([], whole)
 
 
 # --- actors ------------------------------------------------------------------------------------------------

@@ -57,7 +57,6 @@ class Setting:
     parts: parts of the state (6.33); only "semantics" embeds frames, as the scenario's ``edge.embedding``
         configures.
     silent: cameras that never send.
-    flush: discard the frames in transit at each decision (6.5), whatever is chosen.
     Raises ScenarioError or ValueError.
     """
 
@@ -77,7 +76,6 @@ class Setting:
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     parts: tuple[str, ...] = ("age", "pose")
     silent: tuple[str, ...] = ()
-    flush: bool = False
 
     def __post_init__(self) -> None:
         if not self.scenario.held_out:

@@ -11,7 +11,7 @@ from edge_server.experiments.common.arguments import add_folders, command_parser
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
-from edge_server.experiments.studies.registry import CAPTURING, CASED, LEARNING, ON_A_CHANNEL, STUDIES, make_study
+from edge_server.experiments.studies.registry import CAPTURING, CASED, LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
 from edge_server.experiments.training.scheduler.trainer import TrainingError
@@ -32,7 +32,7 @@ verdicts.
   edge-server study omega --seeds 20 --jobs 8 --scene kitchen --data ~/data
   edge-server study phase --ray auto
 
-{"".join(f"  {name:17} {line}{chr(10)}" for name, (_, _, line) in STUDIES.items())}
+{"".join(f"  {name:17} {study.title}{chr(10)}" for name, study in STUDIES.items())}
 Studies that train policies, ppo-select and below, take half an hour to an hour each with --quick on two
 cores, with one training per variant; without it, with three, most of a day or more. In between:
 
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING)], "learning": list(LEARNING)}
         for name in checked(names.get(args.study, [args.study]), request):
-            study, began = make_study(name), time.monotonic()
+            study, began = STUDIES[name], time.monotonic()
             print(f"== {name}: {study.title}", flush=True)
             for verdict in run_study(study, request):
                 print("  " + verdict.line())

@@ -9,23 +9,37 @@ from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.studies.findings import better, better_than_all, half_way, no_worse
 from edge_server.experiments.studies.learning import (
     FOUR_VIEWPOINTS,
+    Cases,
     LearningCase,
     RewardChoice,
     Training,
     measure,
     room,
 )
-from edge_server.experiments.studies.study import Claim, Study, StudyError, StudyRequest
+from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyError, StudyRequest
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
 from edge_server.scheduler.learned.learner_spec import Action
 
 LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}
 THRESHOLD, WAIT, WAIT_ARRIVED = ({"policy": p, "best": "value"} for p in ("threshold", "wait", "wait-arrived"))
-ELSEWHERE, REWARDED = {"judged_from": "elsewhere"}, {"judged_from": "where it is rewarded"}
-PANELS = ("case", "judged_by")
+ELSEWHERE = {"judged_from": "elsewhere"}
 # The thesis's weight of a millisecond of age, and a fifth of it. With the thesis's weight (6.5) a single
 # young view is better than any number of views that are 30 ms older, so there is little to decide.
 THESIS_AGE, LESS_AGE = -0.015, -0.003
+
+
+def _study(name: str, title: str, cases: Cases, *claims: Claim) -> Study:
+    """A study of learned schedulers, judged by the reward, case by case."""
+    return Study(name, title, cases, measure(name), ("reward",), claims, ("case", "judged_by"))
+
+
+def _claim(text: str, statistic: Statistic, bound: float = 0.0, **where: str) -> Claim:
+    """A claim judged by cameras that neither reward nor train, unless ``where`` says otherwise."""
+    return Claim(text, statistic, bound, {**ELSEWHERE, **where})
+
+
+def _learned(name: str) -> Row:
+    return {"policy": f"learned {name}"}
 
 
 def _chosen(request: StudyRequest, cases: Sequence[LearningCase], quick: int) -> list[LearningCase]:
@@ -81,41 +95,34 @@ def _select_cases(request: StudyRequest) -> list[LearningCase]:
     return _chosen(request, found, len(found))
 
 
-PPO_SELECT = Study(
+PPO_SELECT = _study(
     "ppo-select",
     "A scheduler that learns which views to use (figure 5.9)",
     _select_cases,
-    measure("ppo-select"),
-    ("reward",),
-    tuple(
-        claim
-        for where in (REWARDED, ELSEWHERE)
-        for claim in (
-            Claim(
+    *(
+        _claim(text, statistic, judged_from=where)
+        for where in ("where it is rewarded", "elsewhere")
+        for text, statistic in (
+            (
                 "better than a uniformly random set; the thesis has +16.7 % over its first episodes (5.6.2).",
                 better(LEARNED, RANDOM),
-                where=where,
             ),
-            Claim("better than every fixed threshold (5.6.2).", better(LEARNED, THRESHOLD), where=where),
-            Claim("better than using all.", better(LEARNED, ALL), where=where),
-            Claim(
+            ("better than every fixed threshold (5.6.2).", better(LEARNED, THRESHOLD)),
+            ("better than using all.", better(LEARNED, ALL)),
+            (
                 "better than each policy without learning.",
                 better_than_all(LEARNED, tuple({"policy": p} for p in BASELINE_POLICIES[2:])),
-                where=where,
             ),
-            Claim(
+            (
                 "most of what could be won is won: more than half of the way from random to the oracle.",
                 half_way(LEARNED, RANDOM, {"policy": "oracle"}),
-                where=where,
             ),
-            Claim(
+            (
                 "the best threshold differs between decisions: who knew it beforehand would win.",
                 better({"policy": "oracle threshold"}, THRESHOLD),
-                where=where,
             ),
         )
     ),
-    PANELS,
 )
 
 # --- figure 6.8 ----------------------------------------------------------------------------------------------
@@ -146,48 +153,25 @@ def _wait_cases(request: StudyRequest) -> list[LearningCase]:
     return _chosen(request, found, 2)
 
 
-PPO_WAIT = Study(
+PPO_WAIT = _study(
     "ppo-wait",
     "A scheduler that learns how long to wait, or how old is too old (figure 6.8)",
     _wait_cases,
-    measure("ppo-wait"),
-    ("reward",),
-    (
-        *(
-            claim
-            for best in (WAIT, THRESHOLD)
-            for kind in (best["policy"],)
-            for claim in (
-                Claim(
-                    f"{kind}: better than its best fixed omega.",
-                    better({"policy": f"learned {kind}"}, best),
-                    where=ELSEWHERE,
-                ),
-                Claim(
-                    f"{kind}: no worse than its best fixed omega by 1 %.",
-                    no_worse({"policy": f"learned {kind}"}, best),
-                    -0.01,
-                    ELSEWHERE,
-                ),
-                Claim(
-                    f"{kind}: better than a uniformly random set.",
-                    better({"policy": f"learned {kind}"}, RANDOM),
-                    where=ELSEWHERE,
-                ),
-                Claim(
-                    f"{kind}: the best omega differs between decisions: who knew it beforehand would win.",
-                    better({"policy": f"oracle {kind}"}, best),
-                    where=ELSEWHERE,
-                ),
-            )
-        ),
-        Claim(
-            "waiting beats thresholds, both learned (6.5.3: by 6 %).",
-            better({"policy": "learned wait"}, {"policy": "learned threshold"}),
-            where=ELSEWHERE,
-        ),
+    *(
+        _claim(f"{kind}: {text}", statistic, bound)
+        for kind, best in (("wait", WAIT), ("threshold", THRESHOLD))
+        for text, statistic, bound in (
+            ("better than its best fixed omega.", better(_learned(kind), best), 0.0),
+            ("no worse than its best fixed omega by 1 %.", no_worse(_learned(kind), best), -0.01),
+            ("better than a uniformly random set.", better(_learned(kind), RANDOM), 0.0),
+            (
+                "the best omega differs between decisions: who knew it beforehand would win.",
+                better({"policy": f"oracle {kind}"}, best),
+                0.0,
+            ),
+        )
     ),
-    PANELS,
+    _claim("waiting beats thresholds, both learned (6.5.3: by 6 %).", better(_learned("wait"), _learned("threshold"))),
 )
 
 # --- the state's parts (6.33) --------------------------------------------------------------------------------
@@ -207,12 +191,12 @@ LEFT_OUT = {
 }
 
 
-def _state_case(name: str, kinds: Sequence[Action], variants: dict[str, tuple[str, ...]], flush: bool) -> LearningCase:
+def _state_case(name: str, kinds: Sequence[Action], variants: dict[str, tuple[str, ...]]) -> LearningCase:
     variants = _usable(variants)
     # All variants have the same decisions, drawn with all parts that any of them uses.
     parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
     select = kinds == ("select",)
-    setting = room("ch5" if select else "ch6", held_out=FOUR_VIEWPOINTS, parts=parts, flush=flush)
+    setting = room("ch5" if select else "ch6", held_out=FOUR_VIEWPOINTS, parts=parts)
     reward = RewardChoice("set", "moving") if select else RewardChoice("corrected", weights={"age": THESIS_AGE})
     trainings = [
         Training(f"{kind} by {variant}", kind, {True: 100, False: 600}, used)
@@ -222,54 +206,44 @@ def _state_case(name: str, kinds: Sequence[Action], variants: dict[str, tuple[st
 
 
 def _ablation_cases(request: StudyRequest) -> list[LearningCase]:
-    cases = {
-        "which views": (("select",), WHICH_VIEWS, False),
-        "chapter 6": (("threshold", "wait", "wait-arrived"), LEFT_OUT, False),
-        "wait after a flush": (("wait",), LEFT_OUT, True),
+    cases: dict[str, tuple[tuple[Action, ...], dict[str, tuple[str, ...]]]] = {
+        "which views": (("select",), WHICH_VIEWS),
+        "chapter 6": (("threshold", "wait", "wait-arrived"), LEFT_OUT),
     }
-    chosen = request.chosen(list(cases), list(cases)[:1])
-    return [_state_case(name, *cases[name]) for name in chosen]  # type: ignore[arg-type]  # actions
+    return [_state_case(name, *cases[name]) for name in request.chosen(list(cases), list(cases)[:1])]
 
 
-ABLATION = Study(
+ABLATION = _study(
     "ablation",
     "What each part of the state is worth: age, pose, semantics (6.33)",
     _ablation_cases,
-    measure("ablation"),
-    ("reward",),
-    (
-        *(
-            Claim(
-                f"{kind} by {variant}: better than the best fixed one.",
-                better({"policy": f"{kind} by {variant}"}, {"policy": fixed, "best": "value"}),
-                where=ELSEWHERE,
-            )
-            for kind, fixed, variants in (
-                ("select", "threshold", WHICH_VIEWS),
-                ("threshold", "threshold", LEFT_OUT),
-                ("wait", "wait", LEFT_OUT),
-                ("wait-arrived", "wait-arrived", LEFT_OUT),
-            )
-            for variant in variants
-        ),
-        *(
-            Claim(
-                f"{kind}: better by {WHOLE} than by {variant}.",
-                better({"policy": f"{kind} by {WHOLE}"}, {"policy": f"{kind} by {variant}"}),
-                where=ELSEWHERE,
-            )
-            for kind, variants in (("select", WHICH_VIEWS), ("threshold", LEFT_OUT), ("wait", LEFT_OUT))
-            for variant in variants
-            if variant != WHOLE
-        ),
-        Claim(
-            "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5), at the best "
-            "fixed omega of each.",
-            better(WAIT_ARRIVED, WAIT),
-            where=ELSEWHERE,
-        ),
+    *(
+        _claim(
+            f"{kind} by {variant}: better than the best fixed one.",
+            better({"policy": f"{kind} by {variant}"}, {"policy": fixed, "best": "value"}),
+        )
+        for kind, fixed, variants in (
+            ("select", "threshold", WHICH_VIEWS),
+            ("threshold", "threshold", LEFT_OUT),
+            ("wait", "wait", LEFT_OUT),
+            ("wait-arrived", "wait-arrived", LEFT_OUT),
+        )
+        for variant in variants
     ),
-    PANELS,
+    *(
+        _claim(
+            f"{kind}: better by {WHOLE} than by {variant}.",
+            better({"policy": f"{kind} by {WHOLE}"}, {"policy": f"{kind} by {variant}"}),
+        )
+        for kind, variants in (("select", WHICH_VIEWS), ("threshold", LEFT_OUT), ("wait", LEFT_OUT))
+        for variant in variants
+        if variant != WHOLE
+    ),
+    _claim(
+        "frames that arrive while it waits (6.16) serve better than those generated meanwhile (6.5), at the best "
+        "fixed omega of each.",
+        better(WAIT_ARRIVED, WAIT),
+    ),
 )
 
 # --- the reward's weights (6.36-6.38) ------------------------------------------------------------------------
@@ -292,33 +266,23 @@ def _weight_cases(request: StudyRequest) -> list[LearningCase]:
     return [LearningCase("swing", room("swing"), WEIGHTED, trainings, ["wait"], ("random",), (8, 100))]
 
 
-WEIGHTS = Study(
+WEIGHTS = _study(
     "weights",
     "Sensitivity to the weights of the reward (6.36-6.38)",
     _weight_cases,
-    measure("weights"),
-    ("reward",),
-    tuple(
-        claim
+    *(
+        _claim(text, statistic, judged_by=name)
         for name in WEIGHTED
-        for where in ({**ELSEWHERE, "judged_by": name},)
-        for claim in (
-            Claim(
-                "what was learned by it is better than the best fixed wait.",
-                better({"policy": f"learned by {name}"}, WAIT),
-                where=where,
-            ),
-            Claim(
+        for text, statistic in (
+            ("what was learned by it is better than the best fixed wait.", better(_learned(f"by {name}"), WAIT)),
+            (
                 "it matters: what was learned by other weights is worse by these.",
                 better_than_all(
-                    {"policy": f"learned by {name}"},
-                    tuple({"policy": f"learned by {o}"} for o in WEIGHTED if o != name),
+                    _learned(f"by {name}"), tuple(_learned(f"by {other}") for other in WEIGHTED if other != name)
                 ),
-                where=where,
             ),
         )
     ),
-    PANELS,
 )
 
 # --- a channel that changes during use -----------------------------------------------------------------------
@@ -340,44 +304,31 @@ CHANGES: dict[str, tuple[str | Row, tuple[str, ...]]] = {
 def _drift_cases(request: StudyRequest) -> list[LearningCase]:
     found = []
     for name, (channel, silent) in CHANGES.items():
-        priced = "cost" in name
-        action: Action = "select" if priced else "threshold"
-        reward = (
-            RewardChoice("set", weights={"views": -PRICE})
-            if priced
-            else RewardChoice("corrected", weights={"age": LESS_AGE})
-        )
+        action: Action = "select" if "cost" in name else "threshold"
+        reward = RewardChoice("corrected", weights={"age": LESS_AGE})
+        if action == "select":
+            reward = RewardChoice("set", weights={"views": -PRICE})
         trainings = [
             Training("learned before", action, {True: 40, False: 600}, setting=room("ch5")),
             Training("learned afterwards", action, {True: 40, False: 600}),
         ]
-        found.append(
-            LearningCase(
-                name, room(channel, silent=silent), {"its reward": reward}, trainings, ["threshold"], seeds=(8, 100)
-            )
-        )
+        setting, rewards = room(channel, silent=silent), {"its reward": reward}
+        found.append(LearningCase(name, setting, rewards, trainings, ["threshold"], seeds=(8, 100)))
     return _chosen(request, found, 1)
 
 
-DRIFT = Study(
+DRIFT = _study(
     "drift",
     "The channel changes during use: what was learned before, and what is learned afterwards",
     _drift_cases,
-    measure("drift"),
-    ("reward",),
-    (
-        Claim(
-            "what is learned on the new channel is better than what was learned on the old.",
-            better({"policy": "learned afterwards"}, {"policy": "learned before"}),
-            where=ELSEWHERE,
-        ),
-        Claim(
-            "what was learned on the old channel is still better than the best fixed threshold.",
-            better({"policy": "learned before"}, THRESHOLD),
-            where=ELSEWHERE,
-        ),
+    _claim(
+        "what is learned on the new channel is better than what was learned on the old.",
+        better(_learned("afterwards"), _learned("before")),
     ),
-    PANELS,
+    _claim(
+        "what was learned on the old channel is still better than the best fixed threshold.",
+        better(_learned("before"), THRESHOLD),
+    ),
 )
 
 # --- semantics where images can help -------------------------------------------------------------------------
@@ -404,47 +355,26 @@ def _semantics_cases(request: StudyRequest) -> list[LearningCase]:
     ]
     found = []
     for name, (speed, reward) in SIGHTS.items():
-        setting = room(
-            "ch5",
-            scene="tower",
-            speed_m_per_s=speed,
-            params={"movers": "person"},
-            parts=parts,
-            steps=40,
-            refresh_ms=900.0,
-            **SIDES,
-        )
+        world = {"scene": "tower", "speed_m_per_s": speed, "params": {"movers": "person"}}
+        setting = room("ch5", **world, parts=parts, steps=40, refresh_ms=900.0, **SIDES)
         found.append(LearningCase(name, setting, {"its reward": reward}, trainings, ["threshold"], BASELINE_POLICIES))
     return _chosen(request, found, len(found))
 
 
-WITH, WITHOUT = {"policy": "learned with"}, {"policy": "learned without"}
-SEMANTICS = Study(
+WITH, WITHOUT = _learned("with"), _learned("without")
+SEMANTICS = _study(
     "semantics",
     "Where semantics help, and whether they cost anything where they do not (6.31-6.33)",
     _semantics_cases,
-    measure("semantics"),
-    ("reward",),
-    (
-        Claim(
-            "semantics help where something important moves.",
-            better(WITH, WITHOUT),
-            where={"case": "somebody moves", **ELSEWHERE},
-        ),
-        Claim(
-            "semantics cost no more than 1 % where nothing moves.",
-            no_worse(WITH, WITHOUT),
-            -0.01,
-            {"case": "nothing moves", **ELSEWHERE},
-        ),
-        *(
-            Claim(
-                f"{name} semantics: better than all that does not learn.",
-                better_than_all(policy, (THRESHOLD, *({"policy": p} for p in BASELINE_POLICIES))),
-                where=ELSEWHERE,
-            )
-            for name, policy in (("with", WITH), ("without", WITHOUT))
-        ),
+    _claim("semantics help where something important moves.", better(WITH, WITHOUT), case="somebody moves"),
+    _claim(
+        "semantics cost no more than 1 % where nothing moves.", no_worse(WITH, WITHOUT), -0.01, case="nothing moves"
     ),
-    PANELS,
+    *(
+        _claim(
+            f"{name} semantics: better than all that does not learn.",
+            better_than_all(_learned(name), (THRESHOLD, *({"policy": p} for p in BASELINE_POLICIES))),
+        )
+        for name in ("with", "without")
+    ),
 )

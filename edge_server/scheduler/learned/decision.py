@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
@@ -22,7 +22,3 @@ class Decision:
     action: NDArray[Any]
     logp: float
     actor: Actor
-
-    def without_frames(self) -> Decision:
-        """The same without the frames, which are large and only needed for explanations."""
-        return replace(self, state=replace(self.state, frames={}))

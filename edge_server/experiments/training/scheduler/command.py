@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import read_config
-from edge_server.experiments import compare
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -36,9 +35,6 @@ from freshfield.files import out_folder, write_csv, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
-# Policies that train-scheduler --hold compares the learned one with.
-COMPARED = ("all", "threshold:120", "threshold:300", "wait:60", "freshest-k:6", "age-driven")
-
 DESCRIPTION = """\
 Learn when to update the field and from which views: decisions are drawn from the scenario in virtual time,
 each action is carried out by a real field fit and rewarded on a held-out camera at the instant of
@@ -52,10 +48,6 @@ publication. Another camera, which is not trained on either, reports how well th
   --kind threshold   how old a view may be (6.3)
   --kind wait        how long to wait for views generated meanwhile (6.3)
   --kind wait-arrived   the same for views that arrive meanwhile, however old (6.16, algorithm 2)
-
-  --hold MS          the scheduler decides in the running deployment, every MS milliseconds; the reward is
-                     for what is shown until the next decision, with computing charged (edge.compute). The
-                     field is the scenario's
 
   --on whole | moving   pixels that the reward's PSNR is over. In a scene that hardly moves, the whole image
                         teaches to ignore how old views are; where nothing moves there are no moving pixels
@@ -71,8 +63,8 @@ Images are small (--size) and the field is fast (--field), so that there are man
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
 learning curve with each term of the reward, OUT/evaluation.csv and summary.json its rewards on seeds it was
-not trained on. With --hold, instead of these two, OUT/scores.json has what edge-server compare finds in the
-unmodified scenario. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
+not trained on. edge-server compare says what it shows in the whole deployment. After Ctrl-C the same command
+continues, bit for bit, whatever --jobs is.
 """
 
 
@@ -114,20 +106,8 @@ def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: Trai
     learner.actor.save(args.out / "actor.npz")
     print(f"  {config.episodes} episodes; trained for {spent_s:.0f} s in all", flush=True)
     draw_curve(args.out / "training.png", rows)
-    if args.test and config.spec.hold_ms:
-        _compare(args)
-    elif args.test:
+    if args.test:
         _evaluate(args, setting, config, folders, learner.actor, spent_s)
-
-
-def _compare(args: argparse.Namespace) -> None:
-    """Compare the learned policy with fixed ones in the unmodified scenario, to OUT/scores.json."""
-    learned = f"{BANDIT}{args.out / 'actor.npz'}"
-    words = [args.scenario, "all", learned, *COMPARED[1:], "--seeds", str(args.test), "--jobs", str(args.jobs)]
-    words += ["--json", str(args.out / "scores.json"), "--results", str(args.out / "runs.jsonl")]
-    words += ["--data", str(args.data)] if args.data else []
-    if compare.main(words):
-        raise TrainingError("the learned policy was not compared: see above")
 
 
 def _evaluate(
@@ -168,19 +148,16 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
-    quick = ("" if args.hold else "splat") if args.field is None else args.field
-    if quick:
-        if quick not in field_names():
-            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {quick!r}")
-        edge["field"], edge["updates"] = quick, "cycle"
-        edge["field_options"] = {"effort": "low"} if quick in ("splat", "ngp") else {}
+    if args.field:
+        if args.field not in field_names():
+            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
+        edge["field"], edge["updates"] = args.field, "cycle"
+        edge["field_options"] = {"effort": "low"} if args.field in ("splat", "ngp") else {}
     if args.distance == "perceptual":
         edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})
     edge["policy"] = {"name": "all"}
     report = _reporting(args, scenario)
     held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
-    if args.hold and not set(report) <= set(scenario.held_out):  # the additional held-out camera rewards
-        report = scenario.held_out
     given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
         given,
@@ -188,9 +165,6 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch,
         decisions=args.decisions,
-        deployed=bool(args.hold),
-        lead_ms=compare.LEAD_S * 1e3 if args.hold else 1000.0,
-        span_ms=args.hold * args.decisions or 6000.0,
         compute=read_config(given).compute,
         parts=_parts(args.parts),
     )
@@ -220,7 +194,7 @@ def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
 
 
 def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
-    name = args.reward or ("set" if args.kind == "select" or args.hold else "corrected")
+    name = args.reward or ("set" if args.kind == "select" else "corrected")
     network = read_config(setting.scenario).lpips
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
@@ -239,7 +213,6 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         layout_of(setting, setting.parts),
         _omegas(args),
         network=args.network,
-        hold_ms=args.hold,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.samples, args.seed)
@@ -273,16 +246,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
     add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
     add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
-    add(
-        "--hold",
-        type=float,
-        default=0.0,
-        metavar="MS",
-        help="decide in the running deployment, every MS milliseconds [single decisions]",
-    )
     add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
     add("--samples", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
-    add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select and with --hold, else corrected]")
+    add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select, else corrected]")
     add(
         "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"
     )
@@ -331,7 +297,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PX",
         help="pixels a side in synthetic scenes; 0: the scenario's [%(default)s]",
     )
-    add("--field", metavar="NAME", help="representation; '': the scenario's ['' with --hold, else splat]")
+    add("--field", default="splat", metavar="NAME", help="representation; '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add("--test", type=int, default=20, metavar="N", help="unseen seeds to test on at the end [%(default)s]")
     add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")

@@ -55,16 +55,14 @@ def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
 
 
 @pytest.mark.parametrize(
-    "policy",
-    ["all", "threshold:70", "wait:60", "wait-arrived:60", "wait-flush:60", "freshest-k:2", "periodic:400", "bandit:"],
+    "policy", ["all", "threshold:70", "wait:60", "wait-arrived:60", "freshest-k:2", "periodic:400", "bandit:"]
 )
 def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     if policy.startswith("bandit:"):
         learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
         learner.save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
-    flush = policy.startswith("wait-flush")
-    factory = EpisodeFactory(setting(compute=Compute(5.0), flush=flush), NOTHING)
+    factory = EpisodeFactory(setting(compute=Compute(5.0)), NOTHING)
     episode = factory.episode(5)
     point = episode.points[0]
     choice = choose(named(policy)(np.random.default_rng(0)), episode, 0)

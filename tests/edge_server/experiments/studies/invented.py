@@ -9,7 +9,7 @@ from typing import Any
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
-from edge_server.experiments.studies.registry import make_study
+from edge_server.experiments.studies.registry import STUDIES
 from edge_server.experiments.studies.study import StudyRequest, Verdict, judge
 from edge_server.scheduler.learned.rewards import W_S, f_w
 
@@ -51,13 +51,13 @@ def peak(at: float) -> Callable[[Any], dict[str, Any]]:
 
 def table_of(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> SeedTable:
     """The rows of a study of trials on ``room`` whose results follow a rule."""
-    points = make_study(name).cases(request(tmp_path, seeds=seeds, scenes=("room",)))
+    points = STUDIES[name].cases(request(tmp_path, seeds=seeds, scenes=("room",)))
     rows = [{**p.labels, "seed": p.trial.seed, **rule(p.trial)} for p in points]
     return SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, -W_S)} for row in rows])
 
 
 def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> list[Verdict]:
-    return judge(make_study(name), table_of(name, tmp_path, rule, seeds))
+    return judge(STUDIES[name], table_of(name, tmp_path, rule, seeds))
 
 
 def answers(found: list[Verdict], *words: str) -> set[str]:

@@ -15,7 +15,7 @@ from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.studies import learning
 from edge_server.experiments.studies.learned_schedulers import CHANGES, LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS, room
-from edge_server.experiments.studies.registry import LEARNING, make_study
+from edge_server.experiments.studies.registry import LEARNING, STUDIES
 from edge_server.experiments.studies.study import StudyRequest, judge, run_study
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
 from tests.edge_server.experiments.rollouts.small import FIELD
@@ -51,7 +51,7 @@ def table_of(levels: Mapping[str, float], trainings: int = 3, seeds: int = 12, *
 def test_cases_judge_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
     assert set(FOUR_VIEWPOINTS).isdisjoint(REPORT) and TRAININGS[False] >= 3
     for name in LEARNING:
-        cases = make_study(name).cases(StudyRequest(False, tmp_path, Folders()))
+        cases = STUDIES[name].cases(StudyRequest(False, tmp_path, Folders()))
         assert len({case.name for case in cases}) == len(cases) > 0, name
         for case in cases:
             apart = {*case.setting.judging, *case.setting.rewarding}
@@ -64,7 +64,7 @@ def test_cases_judge_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
 def test_figure_5_9_holds_if_and_only_if_what_was_learned_is_better(level, said):
     baselines = dict.fromkeys(BASELINE_POLICIES, 0.2)
     found = judge(
-        make_study("ppo-select"),
+        STUDIES["ppo-select"],
         table_of({**baselines, **FIXED, "learned": level, "oracle": 1.0, "oracle threshold": 0.6}),
     )
     assert answers([v for v in found if "differs between decisions" not in v.claim]) == {said}
@@ -76,11 +76,11 @@ def test_figure_5_9_holds_if_and_only_if_what_was_learned_is_better(level, said)
 def test_figure_6_8_holds_if_and_only_if_what_was_learned_is_better(level, said):
     oracle = {"oracle wait": 0.6, "oracle threshold": 0.6}
     both = {"learned wait": level + 0.2, "learned threshold": level}
-    found = judge(make_study("ppo-wait"), table_of({**FIXED, **oracle, **both}))
+    found = judge(STUDIES["ppo-wait"], table_of({**FIXED, **oracle, **both}))
     assert answers(found, "best fixed omega") == answers(found, "uniformly random") == {said}
     assert answers(found, "waiting beats thresholds") == {"holds"}
     turned = {"learned wait": level, "learned threshold": level + 0.2}
-    found = judge(make_study("ppo-wait"), table_of({**FIXED, **oracle, **turned}))
+    found = judge(STUDIES["ppo-wait"], table_of({**FIXED, **oracle, **turned}))
     assert answers(found, "waiting beats thresholds") == {"does not hold"}
 
 
@@ -88,7 +88,7 @@ def test_figure_6_8_holds_if_and_only_if_what_was_learned_is_better(level, said)
 def test_ablation_holds_if_and_only_if_the_whole_state_is_better(step, said):
     levels = {f"select by {variant}": 3.0 + step * (3 - k) for k, variant in enumerate(WHICH_VIEWS)}
     levels |= {f"{kind} by {v}": 3.0 + step * k for kind in ("threshold", "wait") for k, v in enumerate(LEFT_OUT)}
-    found = judge(make_study("ablation"), table_of({**FIXED, **levels, "wait-arrived:60": 0.6 + step}))
+    found = judge(STUDIES["ablation"], table_of({**FIXED, **levels, "wait-arrived:60": 0.6 + step}))
     assert answers(found, "better by Z, age, pose than") == {said}
     assert answers(found, "best fixed one") == {"holds"}
     assert answers(found, "arrive while it waits") == {"holds" if step > 0 else "does not hold"}
@@ -97,24 +97,24 @@ def test_ablation_holds_if_and_only_if_the_whole_state_is_better(step, said):
 @pytest.mark.parametrize(("gap", "said"), [(1.0, "holds"), (-1.0, "does not hold")])
 def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
     levels = {f"learned by {name}": 3.0 - gap * (name != "moving") for name in WEIGHTED}
-    found = judge(make_study("weights"), table_of({**FIXED, **levels}, judged_by="moving"))
+    found = judge(STUDIES["weights"], table_of({**FIXED, **levels}, judged_by="moving"))
     assert answers(found, "it matters") == {said} and answers(found, "best fixed wait") == {"holds"}
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
 def test_drift_and_semantics_hold_if_and_only_if_what_they_compare_is_better(gap, said):
-    found = judge(make_study("drift"), table_of({**FIXED, "learned before": 3.0, "learned afterwards": 3.0 + gap}))
+    found = judge(STUDIES["drift"], table_of({**FIXED, "learned before": 3.0, "learned afterwards": 3.0 + gap}))
     assert answers(found, "on the new channel") == {said} and answers(found, "still better") == {"holds"}
     levels = {**dict.fromkeys(BASELINE_POLICIES, 0.0), **FIXED, "learned with": 3.0 + gap, "learned without": 3.0}
-    found = judge(make_study("semantics"), table_of(levels, case="somebody moves"))
+    found = judge(STUDIES["semantics"], table_of(levels, case="somebody moves"))
     assert answers(found, "semantics help") == {said} and answers(found, "does not learn") == {"holds"}
-    found = judge(make_study("semantics"), table_of(levels, case="nothing moves"))
+    found = judge(STUDIES["semantics"], table_of(levels, case="nothing moves"))
     assert answers(found, "cost no more than 1 %") == {said}
 
 
 def test_the_spread_of_repeated_trainings_is_part_of_an_interval():
     """The mean gain is the same, and hardly differs between seeds; another training may come to anything."""
-    study = make_study("drift")
+    study = STUDIES["drift"]
     alike = table_of({**FIXED, "learned before": 3.0, "learned afterwards": 3.2})
     assert answers(judge(study, alike), "on the new channel") == {"holds"}
     spread = {0: 0.7, 1: 0.2, 2: -0.3}
@@ -145,13 +145,13 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, case, t
     request = StudyRequest(
         True, tmp_path, Folders(lpips=tmp_path / "no weights"), seeds=2, cases=(case,) if case else (), episodes=3
     )
-    first = run_study(make_study(name), request)
+    first = run_study(STUDIES[name], request)
     assert first and all(v.line() for v in first)
     rows = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
     assert {row["training"] for row in rows} == {"", "0", "1"} and all(row["reward"] for row in rows)
     assert {row["judged_from"] for row in rows} == {"elsewhere", "where it is rewarded"}
     assert list(tmp_path.glob(f"{name}*.png"))
     known = (tmp_path / f"results/{name}.jsonl").read_bytes()
-    assert run_study(make_study(name), request) == first
+    assert run_study(STUDIES[name], request) == first
     assert (tmp_path / f"results/{name}.jsonl").read_bytes() == known
     capsys.readouterr()

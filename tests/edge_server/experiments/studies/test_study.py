@@ -13,7 +13,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
 from edge_server.experiments.studies.command import main
-from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES, make_study
+from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
 from edge_server.scheduler import make_policy
 from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, request, verdicts
@@ -22,7 +22,7 @@ from tests.edge_server.experiments.studies.invented import answers, figures, noi
 @pytest.mark.parametrize("name", ON_A_CHANNEL)
 @pytest.mark.parametrize("quick", [True, False])
 def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
-    points = make_study(name).cases(StudyRequest(quick, tmp_path, Folders(), seeds=1))
+    points = STUDIES[name].cases(StudyRequest(quick, tmp_path, Folders(), seeds=1))
     distinct = {(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}
     assert points and len(distinct) == len(points)
     for point in points:
@@ -33,7 +33,7 @@ def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tm
 
 def test_every_study_is_what_its_name_says():
     for name in STUDIES:
-        study = make_study(name)
+        study = STUDIES[name]
         assert study.name == name and study.claims and study.metrics
 
 
@@ -52,7 +52,7 @@ def test_a_study_takes_anybodys_channel_and_scene(name: str, tmp_path: Path):
     scene.write_text(OWN_SCENE)
     channel = {"service": {"law": "deterministic", "mean_ms": 77.0}, "discipline": "fcfs"}
     asked = request(tmp_path, seeds=1, scenes=(str(scene),), channel=channel, channel_name="slow")
-    points = make_study(name).cases(asked)
+    points = STUDIES[name].cases(asked)
     used = [p for p in points if p.trial.channel != {"preset": "ideal"}]
     assert used and {p.trial.channel["discipline"] for p in used} == {"fcfs"}
     assert {p.labels["scene"] for p in points} == {"mine"}
@@ -275,6 +275,6 @@ def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, c
 
 
 def test_a_study_without_rows_of_a_claim_says_nothing_of_it(tmp_path: Path):
-    study = make_study("images")
+    study = STUDIES["images"]
     empty = Study(study.name, study.title, lambda _: [], lambda cases, _: [], study.metrics, study.claims, study.panels)
     assert run_study(empty, request(tmp_path)) == []

@@ -16,7 +16,6 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome
 from edge_server.experiments.rollouts.rollout import Decided, Run
 from edge_server.experiments.rollouts.setting import Setting, reward_of, seeds
-from edge_server.experiments.training.scheduler import command
 from edge_server.experiments.training.scheduler.command import main
 from edge_server.experiments.training.scheduler.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.scheduler.learning_curve import draw_curve
@@ -28,7 +27,6 @@ from edge_server.experiments.training.scheduler.trainer import (
     train,
 )
 from edge_server.scheduler import make_policy
-from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
@@ -249,22 +247,3 @@ def test_a_stand_in_distance_is_measured_and_learned_from(tmp_path: Path, capsys
     assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
     (row,) = read_log(out)
     assert row["term_perceptual"] == pytest.approx(-row["perceptual"])
-
-
-@pytest.mark.slow  # some seconds of virtual deployments
-def test_a_scheduler_that_decides_itself_is_rewarded_by_what_is_shown_and_compared(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(command, "COMPARED", ("all", "age-driven"))
-    monkeypatch.setattr("edge_server.experiments.compare.LEAD_S", 1.2)
-    monkeypatch.setattr("edge_server.experiments.compare.SPAN_S", 0.6)
-    edge = {**RAW["edge"], "steps": 3, "compute": {"ms_per_step": 2.0, "ms_per_view": 1.0}}
-    edge |= {"updates": "arrivals", "update_ms": 20}
-    asked = "--kind threshold --hold 200 --omegas 50,200 --episodes 2 --batch 1 --decisions 3 --size 0 --test 1"
-    words, out = command_line(tmp_path, asked, {**RAW, "channel": {"preset": "swing"}, "edge": edge})
-    assert main(words) == 0
-    assert "rewarded from cam03; judged from cam00" in capsys.readouterr().out
-    # Decisions of the first of two samples, once frames are there.
-    assert all(2 <= row["decisions"] <= 3 for row in read_log(out))
-    found = json.loads((out / "scores.json").read_text())["policies"]
-    assert found["all"]["psnr_db_over_all"][0] == 0.0 and found["bandit:actor.npz"]["psnr_db"][0] > 5.0
-    assert found["age-driven"]["views"][0] < found["all"]["views"][0] == 4.0
-    assert Actor.load(out / "actor.npz").spec.hold_ms == 200.0
