@@ -174,7 +174,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
 
 @dataclass
 class Frontier:
-    """A run of the command: measures the missing points, then writes tables, CSV, figures and conclusion.
+    """A run of the command: measures the missing points, then writes tables, CSV and figures.
 
     weights, lpips_missing: folder of LPIPS weights, or why there are none.
     points: a file for the points of figure 2.

@@ -1,4 +1,4 @@
-"""Writes the output of the frontier: two CSV files, two figures, tables and a conclusion."""
+"""Writes the output of the frontier: two CSV files, two figures and tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_output(out: Path, data: Row) -> str:
     if updates:
         write_csv(out / "updates.csv", _flat(updates))
         draw_updates(out / "updates.png", updates, data)
-        text += [updates_table(updates), conclusion(updates)]
+        text.append(updates_table(updates))
     return "\n\n".join(["", *text])
 
 
@@ -70,25 +70,6 @@ def recommendation(rows: Sequence[Row]) -> str:
     points = points_of(rows)
     update_ms = max(round(best_point(points).update_ms), round(LEAST_UPDATE_MS)) if points else "any"
     return f"for this scene: update_ms: {update_ms}"
-
-
-def conclusion(rows: Sequence[Row]) -> str:
-    """One line: the best update time at each speed, and what the longest one costs."""
-    parts = []
-    for speed in dict.fromkeys(row["speed_m_per_s"] for row in rows):
-        group = [row for row in rows if row["speed_m_per_s"] == speed]
-        whole, moving = best(group, "shown_psnr_db"), best(group)
-        if whole is None or moving is None:
-            continue
-        longest = max((r for r in group if _label(r) == _label(moving)), key=lambda row: row["update_s"])
-        most = moving["shown_psnr_moving_db"]
-        lost = most - (longest["shown_psnr_moving_db"] or most)
-        parts.append(
-            f"at {speed:g} m/s {whole['update_s']:.2f} s ({_label(whole)}) for the whole image and "
-            f"{moving['update_s']:.2f} s ({_label(moving)}) where it moves "
-            f"({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
-        )
-    return "Best time to spend on an update: " + "; ".join(parts) + "."
 
 
 def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:

@@ -30,7 +30,7 @@ verdicts.
   edge-server study all --quick --data ~/data
   edge-server study omega --quick --channel my-channel.yaml --scene my-scene.yaml
   edge-server study omega --seeds 20 --jobs 8 --scene kitchen --data ~/data
-  edge-server study phase --ray auto
+  edge-server study mat --ray auto
 
 {"".join(f"  {name:17} {study.title}{chr(10)}" for name, study in STUDIES.items())}
 Studies that train policies, ppo-select and below, take half an hour to an hour each with --quick on two
@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
         "study",
         choices=[*STUDIES, "all", "learning"],
         metavar="NAME",
-        help=f"{', '.join(STUDIES)}; all: up to phase; learning: from ppo-select on",
+        help=f"{', '.join(STUDIES)}; all: up to representations; learning: from ppo-select on",
     )
     add("--quick", action="store_true", help="small images, few points and seeds: a quarter of an hour for all")
     add("--seeds", type=int, metavar="N", help="seeds per point [the study's own]")

@@ -16,7 +16,7 @@ from edge_server.experiments.studies.learning import (
     measure,
     room,
 )
-from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyError, StudyRequest
+from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyRequest
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
 from edge_server.scheduler.learned.learner_spec import Action
 
@@ -328,53 +328,5 @@ DRIFT = _study(
     _claim(
         "what was learned on the old channel is still better than the best fixed threshold.",
         better(_learned("before"), THRESHOLD),
-    ),
-)
-
-# --- semantics where images can help -------------------------------------------------------------------------
-
-# A workshop where a person walks or stands on one of four sides, only images show which one, and each view has a
-# cost: with free views there is nothing to choose. The cameras look outward: one a side for the reward and one a
-# side for the evaluation. One update per second, so that a view of the motion since the last one is worth its cost.
-# With moving pixels only the PSNR counts, because SSIM and the distance are of the whole image.
-SIDES = {"held_out": ("cam00", "cam08", "cam15", "cam16"), "report": ("cam14", "cam11", "cam06", "cam07")}
-VIEW_COST = {"views": -0.002}
-SIGHTS = {
-    "somebody moves": (1.0, RewardChoice("set", "moving", {**VIEW_COST, "ssim": 0.0, "distance": 0.0})),
-    "nothing moves": (0.0, RewardChoice("set", weights=VIEW_COST)),
-}
-
-
-def _semantics_cases(request: StudyRequest) -> list[LearningCase]:
-    if missing := embeddings_missing():
-        raise StudyError(f"semantics: {missing}")
-    parts = ("semantics", "age", "pose")
-    trainings = [
-        Training(f"learned {name}", "select", {True: 300, False: 1200}, used)
-        for name, used in (("with", parts), ("without", parts[1:]))
-    ]
-    found = []
-    for name, (speed, reward) in SIGHTS.items():
-        world = {"scene": "tower", "speed_m_per_s": speed, "params": {"movers": "person"}}
-        setting = room("ch5", **world, parts=parts, steps=40, refresh_ms=900.0, **SIDES)
-        found.append(LearningCase(name, setting, {"its reward": reward}, trainings, ["threshold"], BASELINE_POLICIES))
-    return _chosen(request, found, len(found))
-
-
-WITH, WITHOUT = _learned("with"), _learned("without")
-SEMANTICS = _study(
-    "semantics",
-    "Where semantics help, and whether they cost anything where they do not (6.31-6.33)",
-    _semantics_cases,
-    _claim("semantics help where something important moves.", better(WITH, WITHOUT), case="somebody moves"),
-    _claim(
-        "semantics cost no more than 1 % where nothing moves.", no_worse(WITH, WITHOUT), -0.01, case="nothing moves"
-    ),
-    *(
-        _claim(
-            f"{name} semantics: better than all that does not learn.",
-            better_than_all(_learned(name), (THRESHOLD, *({"policy": p} for p in BASELINE_POLICIES))),
-        )
-        for name in ("with", "without")
     ),
 )

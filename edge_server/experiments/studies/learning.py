@@ -82,22 +82,18 @@ class LearningCase:
     seeds: tuple[int, int] = (10, 100)
 
 
-def room(channel: Mapping[str, Any] | str = "ch5", *, scene: str = "room", **more: Any) -> Setting:
-    """The usual setting: a world at 64 x 64, nineteen cameras and a warm splat field.
+def room(channel: Mapping[str, Any] | str = "ch5", **more: Any) -> Setting:
+    """The usual setting: a room at 64 x 64, nineteen cameras and a warm splat field.
 
     channel: a preset, or the section of a scenario.
-    more: fields of ``Setting``, ``scratch=True`` as in the thesis; held_out: cameras that reward; report: cameras that
-        judge; speed_m_per_s; params: of the world.
+    more: fields of ``Setting``, ``scratch=True`` as in the thesis; held_out: cameras that reward.
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
-    held_out, report = more.pop("held_out", ("cam00",)), more.pop("report", REPORT)
-    speed, params = more.pop("speed_m_per_s", 1.0), more.pop("params", {})
-    trial = Trial(scene, 0, section, size=SIZE, field_options=FIELD_OPTIONS, speed_m_per_s=speed)
-    scenario = trial.scenario()
-    source = {**scenario.source, "params": {**scenario.source.get("params", {}), **params}}
-    apart = tuple(c for c in scenario.cameras if c in {*held_out, *report})
-    scenario = dataclasses.replace(scenario, held_out=apart, source=source if params else scenario.source)
-    return Setting(scenario, report=report, **{"steps": 50 if more.get("scratch") else 20, **more})
+    held_out = more.pop("held_out", ("cam00",))
+    scenario = Trial("room", 0, section, size=SIZE, field_options=FIELD_OPTIONS).scenario()
+    apart = tuple(c for c in scenario.cameras if c in {*held_out, *REPORT})
+    scenario = dataclasses.replace(scenario, held_out=apart)
+    return Setting(scenario, report=REPORT, **{"steps": 50 if more.get("scratch") else 20, **more})
 
 
 Cases = Callable[[StudyRequest], Sequence[LearningCase]]

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from edge_server.experiments.studies.age_curves import LAMBDA, MAT, MAT_DELAY
-from edge_server.experiments.studies.learned_schedulers import ABLATION, DRIFT, PPO_SELECT, PPO_WAIT, SEMANTICS, WEIGHTS
+from edge_server.experiments.studies.learned_schedulers import ABLATION, DRIFT, PPO_SELECT, PPO_WAIT, WEIGHTS
 from edge_server.experiments.studies.metric_distortions import METRIC_DISTORTIONS
 from edge_server.experiments.studies.preferences import PREFERENCES
 from edge_server.experiments.studies.study import Study
-from edge_server.experiments.studies.trade_map import PHASE
 from edge_server.experiments.studies.viewpoints import VIEWPOINTS
 from edge_server.experiments.studies.waiting_curves import IMAGES, OMEGA, REPRESENTATIONS
 
-_OF_TRIALS = (MAT, MAT_DELAY, LAMBDA, OMEGA, IMAGES, REPRESENTATIONS, PHASE)
+_OF_TRIALS = (MAT, MAT_DELAY, LAMBDA, OMEGA, IMAGES, REPRESENTATIONS)
 _OF_CAPTURES = (VIEWPOINTS, PREFERENCES)
-_OF_LEARNING = (PPO_SELECT, PPO_WAIT, ABLATION, WEIGHTS, DRIFT, SEMANTICS)
+_OF_LEARNING = (PPO_SELECT, PPO_WAIT, ABLATION, WEIGHTS, DRIFT)
 STUDIES: dict[str, Study] = {
     study.name: study for study in (METRIC_DISTORTIONS, *_OF_TRIALS, *_OF_CAPTURES, *_OF_LEARNING)
 }

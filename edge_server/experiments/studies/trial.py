@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
-from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -44,6 +44,7 @@ _TRUTHS_KEPT = 4096
 # Number of random instants at which a publication is scored, one in each equal part of the time it is shown.
 _SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
+_PATIENCE = 20  # times every_ms, until a trial has failed
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,8 @@ class Trial:
     size: image width and height of a synthetic world.
     scale: divides the image sizes of a recording.
     cameras: number of cameras of a synthetic world; None: the scenario's own.
-    steps: optimizer steps per update.
-    scratch: restart the field at each update (thesis); otherwise it stays warm, and the first update has
-        ``first_steps``.
-    compute: charged ms_per_step and ms_per_update; empty in the thesis.
-    decisions: number of decisions scored, ``every_ms`` apart; a warm field skips the first ``settle``.
+    steps: optimizer steps of the update, from an empty field, as in the thesis.
+    every_ms: longest time for the update, until there would be the next decision.
     """
 
     scene: str
@@ -75,11 +73,6 @@ class Trial:
     field: str = "splat"
     field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     steps: int = 200
-    scratch: bool = True
-    first_steps: int = 0
-    compute: dict[str, float] = dataclasses.field(default_factory=dict)
-    decisions: int = 1
-    settle: int = 0
     every_ms: float = 900.0
     lpips: bool = True
 
@@ -125,15 +118,7 @@ class Trial:
         return parse(data, shipped.path)
 
     def run_settings(self) -> RunSettings:
-        return RunSettings(
-            steps=self.steps,
-            first_steps=self.first_steps,
-            compute=Compute(**self.compute),
-            epoch_ms=self.every_ms,
-            grace_ms=0.0,
-            first_ms=self.first_ms,
-            scratch=self.scratch,
-        )
+        return RunSettings(steps=self.steps, epoch_ms=self.every_ms, grace_ms=0.0, first_ms=self.first_ms, scratch=True)
 
 
 def scenario_of(scene: str, seed: int = 0) -> Scenario:
@@ -267,7 +252,7 @@ class Stage:
 
 
 def run_trial(trial: Trial, folders: Folders) -> Row:
-    """Run a trial. Returns means over its decisions.
+    """Run a trial. Returns what its decision came to.
 
     psnr_db, psnr_moving_db, ssim, lpips: at publication, the thesis's measure; None without a score.
     shown_psnr_db, ...: at random instants, of what a deployment shows (``_shown_scores``).
@@ -275,61 +260,50 @@ def run_trial(trial: Trial, folders: Folders) -> Row:
     aaoi_ms: their mean age at publication (6.35).
     age_sum_ms: sum of the ages of all cameras (5.8).
     wait_ms: from decision to publication.
-    decisions: number of decisions.
     Raises ScenarioError or DatasetError.
     """
-    rows: list[Row] = []
     rng = np.random.default_rng(seed_sequence(trial.seed, "shown"))  # the same instants for every policy
 
-    def published(publication: Publication) -> None:
-        counts = trial.settle <= len(rows) < trial.settle + trial.decisions
-        shown = _shown_scores(publication, deployment, rng) if counts else {}
-        rows.append(_row(publication, deployment) | shown)
+    def look(publication: Publication, deployment: VirtualDeployment) -> Row:
+        return _row(publication, deployment) | _shown_scores(publication, deployment, rng)
 
-    deployment = _deploy(trial, folders, published)
-    _finish(deployment, trial)
-    kept = rows[trial.settle : trial.settle + trial.decisions]
-    if not kept:
-        raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
-    return {**{n: mean_or_none([row[n] for row in kept]) for n in kept[0]}, "decisions": len(kept)}
+    return _decided(trial, folders, look)
 
 
 def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:
-    """(truth, rendering, figures) of the trial's last decision on the held-out camera, uint8 (H, W, 3)."""
-    found: list[tuple[NDArray[np.uint8], NDArray[np.uint8], Row]] = []
+    """(truth, rendering, figures) of the trial's decision on the held-out camera, uint8 (H, W, 3)."""
 
-    def look(publication: Publication) -> None:
-        truth, rendering = _rendered(trial, deployment, publication.published_ns)
-        found.append((truth, rendering, _row(publication, deployment)))
+    def look(publication: Publication, deployment: VirtualDeployment) -> Any:
+        return *_rendered(trial, deployment, publication.published_ns), _row(publication, deployment)
 
-    deployment = _deploy(trial, folders, look)
-    _finish(deployment, trial)
-    return found[-1]
+    return _decided(trial, folders, look)
 
 
-def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeployment:
-    scenario = trial.scenario()
-    stage = _stage(json.dumps(trial.stage), trial, folders)
-    return build_deployment(
+def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, VirtualDeployment], Any]) -> Any:
+    """What ``look`` sees at the publication of the trial's decision, however long its policy waits."""
+    found: list[Any] = []
+
+    def published(publication: Publication) -> None:
+        if not found:
+            found.append(look(publication, deployment))
+
+    scenario, stage = trial.scenario(), _stage(json.dumps(trial.stage), trial, folders)
+    deployment = build_deployment(
         scenario,
         trial.run_settings(),
         field=_field(trial),
         cameras=stage.cameras,
         data=folders.data,
-        on_published=on_published,
+        on_published=published,
         truth=stage.truth,
     )
-
-
-def _finish(deployment: VirtualDeployment, trial: Trial) -> None:
-    """Run until the last decision is published, however long its policy waits."""
-    wanted = trial.settle + trial.decisions
     # Stop just before the second decision, whose update may not be needed.
     deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
-    for _ in range(4 * wanted + 16):
-        if len(deployment.publications) >= wanted:
-            return
+    for _ in range(_PATIENCE):
+        if found:
+            return found[0]
         deployment.run(trial.every_ms / 1e3)
+    raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
 
 
 def _row(publication: Publication, deployment: VirtualDeployment) -> Row:

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_live_policy, make_policy, policy_help
-from edge_server.scheduler.registry import resolve_checkpoint
 from tests.work import MOST_MS, work_ms
 
 MS = 1_000_000
@@ -145,13 +144,6 @@ def test_all_that_is_offered_can_be_made_live_and_has_help():
     assert set(OFFERED) == set(POLICIES) - {"wait-flush"}
     for name in OFFERED:
         assert make_live_policy(name, None, np.random.default_rng(0)).name == name and policy_help(name)
-
-
-def test_names_of_learned_policies_and_help(tmp_path):
-    assert policy_help("threshold") == "frames no older than omega (6.12-6.14); value: omega_ms"
-    assert "learned" in policy_help("bandit:a.npz")
-    assert resolve_checkpoint("wait", tmp_path) == "wait"
-    assert resolve_checkpoint("bandit:a.npz", tmp_path) == f"bandit:{tmp_path}/a.npz"
 
 
 def test_flushing_is_asked_for_only_where_something_is_waited_for():

@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import command, from_scratch
-from edge_server.experiments.frontier.output import conclusion, recommendation
+from edge_server.experiments.frontier.output import recommendation
 from edge_server.experiments.frontier.update_time import (
     Charged,
     MovingScene,
@@ -23,7 +23,6 @@ from edge_server.experiments.frontier.update_time import (
     static_steps,
     steps_for,
 )
-from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.live.frontier import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
@@ -72,12 +71,6 @@ def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch)
     stamps = [{v.generated_ns for v in views} for views in seen]
     assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
     assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
-
-
-def test_longer_updates_show_older_views():
-    start = WarmStart(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=2)
-    short, long = (start.run(steps, COMPUTE, seconds=1.5) for steps in (1, 12))
-    assert long["aaoi_ms"] - short["aaoi_ms"] == pytest.approx(11 * 30.0, abs=60.0)
 
 
 def test_the_front_is_what_nothing_beats_in_both():
@@ -132,22 +125,6 @@ def test_seeds_are_averaged_with_their_standard_error():
     assert row["psnr_db"] == 20.0 and row["seeds"] == 2
 
 
-def test_the_conclusion_names_the_best_time_of_each_speed():
-    def row(speed, update_s, whole, moving):
-        return {
-            "field": "ngp",
-            "effort": "low",
-            "speed_m_per_s": speed,
-            "update_s": update_s,
-            "shown_psnr_db": whole,
-            "shown_psnr_moving_db": moving,
-        }
-
-    said = conclusion([row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)])
-    assert "at 1 m/s 2.00 s (ngp low) for the whole image and 0.10 s (ngp low) where it moves (2.0 s" in said
-    assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
-
-
 def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
     def row(speed, update_s, whole, moving):
         return {
@@ -187,7 +164,6 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
     first = capsys.readouterr().out
-    assert "Best time to spend on an update: at 1 m/s" in first
     assert first.splitlines()[-1].startswith("for this scene: update_ms: ")
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
@@ -205,14 +181,6 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     again = (tmp_path / "results.jsonl").read_text().splitlines()
     assert again == lines, "virtual time gives the same point again"
     assert json.loads((tmp_path / "frontier.json").read_text())["updates"] == data["updates"]
-
-
-def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():
-    """By several seeds, and from short updates on."""
-    sweep, still = command.SHIPPED, synthetic_still("room", size=command.SHIPPED.size)
-    assert len(still.training) == sweep.moving.cameras - len(still.held_out)
-    assert still.training[0].image.shape[:2] == (sweep.moving.size, sweep.moving.size)
-    assert sweep.seeds >= 3 and sweep.update_s[0] <= 0.05
 
 
 def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
+from functools import partial
 
 import numpy as np
 import pytest
 
 from edge_server.config import ComputeConfig
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.rollouts import rollout as rollout_module
 from edge_server.experiments.rollouts.episode import EpisodeFactory
-from edge_server.experiments.rollouts.rollout import Run, learned, named, rollout, run_rollouts
+from edge_server.experiments.rollouts.rollout import Job, learned, named, rollout, run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -46,24 +49,17 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
 
 
 @pytest.mark.parametrize("what", [setting(), deployed()], ids=["single decisions", "deployed"])
-def test_two_processes_give_what_one_gives(what: Setting, tmp_path):
-    spec = SELECT if not what.deployed else dataclasses.replace(SELECT, hold_ms=300.0)
-    actors = {"all": "all", "random": "random", "learned": Learner(spec, 0).actor}
-    found = [
-        run_rollouts(
-            Engine(jobs=jobs, threads=1, say=lambda line: None),
-            what,
-            NOTHING,
-            seeds(0, "test", 3),
-            actors,
-            explore=True,
-            samples=2,
-        )
-        for jobs in (1, 2)
-    ]
-    assert found[0] == found[1] and found[0].keys() == actors.keys()
-    runs = found[0]["learned"][seeds(0, "test", 1)[0]][0]
-    assert len(runs) == 2 and isinstance(runs[0], Run)
+def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: Setting, monkeypatch):
+    """As processes have it: each job is sent to one, which has computed other jobs before, or none."""
+    actor = Learner(dataclasses.replace(SELECT, hold_ms=300.0 * what.deployed), 0).actor
+    makers = {"random": named("random"), "learned": learned(actor, explore=True)}
+    work = partial(rollout_module._carry_out, setting=what, folders=NOTHING, makers=makers)
+    jobs = [Job(what.key, seed, name, samples=2) for seed in seeds(0, "test", 2) for name in makers]
+    found = [work(job) for job in jobs]
+    assert len({str(one) for one in found}) == len(jobs)
+    monkeypatch.setattr(rollout_module, "_FACTORIES", {})
+    sent = pickle.loads(pickle.dumps(work))
+    assert [sent(job) for job in reversed(jobs)] == found[::-1]
 
 
 def test_repeats_have_fields_of_other_seeds_and_cameras_score_by_name():

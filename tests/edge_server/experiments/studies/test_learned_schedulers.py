@@ -102,14 +102,9 @@ def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
 
 
 @pytest.mark.parametrize(("gap", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
-def test_drift_and_semantics_hold_if_and_only_if_what_they_compare_is_better(gap, said):
+def test_drift_holds_if_and_only_if_what_it_compares_is_better(gap, said):
     found = judge(STUDIES["drift"], table_of({**FIXED, "learned before": 3.0, "learned afterwards": 3.0 + gap}))
     assert answers(found, "on the new channel") == {said} and answers(found, "still better") == {"holds"}
-    levels = {**dict.fromkeys(BASELINE_POLICIES, 0.0), **FIXED, "learned with": 3.0 + gap, "learned without": 3.0}
-    found = judge(STUDIES["semantics"], table_of(levels, case="somebody moves"))
-    assert answers(found, "semantics help") == {said} and answers(found, "does not learn") == {"holds"}
-    found = judge(STUDIES["semantics"], table_of(levels, case="nothing moves"))
-    assert answers(found, "cost no more than 1 %") == {said}
 
 
 def test_the_spread_of_repeated_trainings_is_part_of_an_interval():
@@ -133,8 +128,8 @@ def test_where_a_camera_dies_the_policy_learned_afterwards_is_another_one():
 
 
 @pytest.mark.slow  # trainings and fits of some seconds
-@pytest.mark.parametrize(("name", "case"), [("ppo-select", "priced"), ("weights", "")])
-def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, case, tmp_path: Path, monkeypatch, capsys):
+def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(tmp_path: Path, monkeypatch):
+    name = "ppo-select"
     usual = learning.Setting
     small = {"steps": 3, "decisions": 1, "lead_ms": 1000.0, "span_ms": 400.0}
     monkeypatch.setattr(learning, "Setting", lambda *a, **more: usual(*a, **{**more, **small}))
@@ -143,7 +138,7 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, case, t
     monkeypatch.setitem(learning.TRAININGS, True, 2)
     (tmp_path / "no weights").mkdir()  # images of 24 pixels are too small for LPIPS
     request = StudyRequest(
-        True, tmp_path, Folders(lpips=tmp_path / "no weights"), seeds=2, cases=(case,) if case else (), episodes=3
+        True, tmp_path, Folders(lpips=tmp_path / "no weights"), seeds=2, cases=("priced",), episodes=3
     )
     first = run_study(STUDIES[name], request)
     assert first and all(v.line() for v in first)
@@ -154,4 +149,3 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, case, t
     known = (tmp_path / f"results/{name}.jsonl").read_bytes()
     assert run_study(STUDIES[name], request) == first
     assert (tmp_path / f"results/{name}.jsonl").read_bytes() == known
-    capsys.readouterr()

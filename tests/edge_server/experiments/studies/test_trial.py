@@ -26,7 +26,7 @@ def test_a_trial_repeats_bit_for_bit_whatever_ran_before_it():
     first = run_trial(TRIAL, NO_DATA)
     run_trial(replace(TRIAL, seed=5, policy="wait", value=60.0), NO_DATA)
     assert run_trial(TRIAL, NO_DATA) == first
-    assert first["decisions"] == 1 and first["psnr_db"] > 5.0
+    assert first["psnr_db"] > 5.0
 
 
 def test_policies_decide_at_the_same_instants_on_the_same_deliveries():
@@ -45,11 +45,6 @@ def test_the_three_readings_of_wait_differ_in_what_was_on_its_way():
     assert found["wait-arrived"]["wait_ms"] == pytest.approx(240.0) and found["wait-arrived"]["views"] == 4.0
     assert found["wait"]["wait_ms"] > 300.0 and found["wait-arrived"]["aaoi_ms"] > 200.0
     assert found["wait-flush"]["wait_ms"] == pytest.approx(240.0) and found["wait-flush"]["views"] == 4.0
-
-
-def test_nothing_is_old_where_nothing_is_delayed():
-    ideal = run_trial(replace(TRIAL, channel={"preset": "ideal"}), NO_DATA)
-    assert ideal["aaoi_ms"] < 30.0 and ideal["views"] == 4.0
 
 
 def shown_after_ms(trial: Trial, monkeypatch) -> list[float]:
@@ -76,18 +71,6 @@ def shown_after_ms(trial: Trial, monkeypatch) -> list[float]:
 def test_an_image_is_looked_at_until_the_next_could_come(monkeypatch):
     free = shown_after_ms(replace(TRIAL, policy="all", value=None), monkeypatch)
     assert [int(ms // 10) for ms in free] == [0, 1, 2], "a capture period, where nothing takes time"
-    charged = shown_after_ms(replace(TRIAL, compute={"ms_per_step": 75.0}), monkeypatch)
-    assert [int(ms // 100) for ms in charged] == [0, 1, 2]
-    two = shown_after_ms(replace(TRIAL, scratch=False, decisions=2, settle=1), monkeypatch)
-    assert len(two) == len(set(two)) == 6, "of the decisions that count, at instants of their own"
-
-
-def test_a_warm_field_goes_on_and_computing_ages_the_scene():
-    warm = replace(TRIAL, scratch=False, first_steps=20, decisions=2, settle=1)
-    free, late = run_trial(warm, NO_DATA), run_trial(replace(warm, compute={"ms_per_step": 10.0}), NO_DATA)
-    assert free["decisions"] == 2 and late["wait_ms"] == pytest.approx(40.0)
-    assert late["age_sum_ms"] != free["age_sum_ms"]
-    assert run_trial(replace(warm, scratch=True, first_steps=0), NO_DATA)["psnr_db"] != free["psnr_db"]
 
 
 def test_images_are_of_the_trial():

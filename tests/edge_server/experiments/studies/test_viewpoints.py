@@ -19,7 +19,7 @@ from edge_server.viewpoints.candidates import half_hemisphere
 from freshfield.geometry import Pinhole
 from tests.edge_server.experiments.studies.invented import answers
 
-TINY = viewpoints.Workload((3, 8), 16, 3, 24)
+TINY, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
 
 
 def test_verdicts_of_viewpoints_follow_the_figures():
@@ -105,17 +105,22 @@ def test_plans_to_compare_have_the_views_asked_for_where_candidates_are_few():
 
 @pytest.mark.slow
 def test_both_studies_run_whole(tmp_path, monkeypatch):
+    """With few arms, tastes and habits: the others differ in what they choose."""
     monkeypatch.setattr(viewpoints, "QUICK", TINY)
-    monkeypatch.setattr(preferences, "_POOL", {True: 15})
+    monkeypatch.setattr(viewpoints, "ARMS", {arm: viewpoints.ARMS[arm] for arm in SOME})
+    monkeypatch.setattr(viewpoints, "_SHOWN", SOME[:1])
+    monkeypatch.setattr(preferences, "_POOL", {True: 9})
     monkeypatch.setattr(preferences, "_UPDATES", {True: 1})
-    monkeypatch.setattr(preferences, "ASKED", (3, 6))
+    monkeypatch.setattr(preferences, "ASKED", (2, 4))
+    monkeypatch.setattr(preferences, "_ARMS", SOME[:1])
+    monkeypatch.setattr(preferences, "TASTES", {"edges": preferences.TASTES["edges"]})
     request = StudyRequest(True, tmp_path, Folders(), seeds=2)
     for study in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
         assert run_study(study, request)
     assert "Simulated experts only" in (tmp_path / "preferences.md").read_text()
     table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
-    assert {r["arm"] for r in table} == set(viewpoints.ARMS) and len(table) == len(viewpoints.ARMS) * 2 * 2
-    first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage" and r["views"] == "3"}
+    assert {r["arm"] for r in table} == set(SOME) and len(table) == len(SOME) * 2 * 2
+    first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage, short way" and r["views"] == "3"}
     assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
     assert (tmp_path / "viewpoints-tile-paths.png").exists() and (tmp_path / "preferences-tile.png").exists()
 

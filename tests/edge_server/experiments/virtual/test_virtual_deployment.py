@@ -20,7 +20,6 @@ from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
-from tests.conftest import data_dir
 from tests.edge_server.experiments.sets import SMALL, write_recording
 
 SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0))
@@ -198,16 +197,6 @@ def test_a_recording_is_scored_against_its_nearest_capture(tmp_path):
     gaps = [p.truth_gap_ms for p in deployment.publications]
     assert gaps and all(gap is not None and abs(gap) <= 50.0 for gap in gaps)
     assert any(p.psnr_moving_db is not None for p in deployment.publications)
-
-
-def test_the_kitchen_in_virtual_time():
-    data = str(data_dir("blender_kitchen") / "transforms.json")
-    what = scenario(
-        cameras={"ids": ["cam00", "cam01", "cam07", "cam13", "cam18"], "held_out": ["cam00"]},
-        source={"kind": "transforms", "data": data, "scale": 4},
-    )
-    deployment = run(what)
-    assert deployment.publications and closes(deployment.frames())
 
 
 def world_with(effects: dict[str, Any], scene: str = "tower", **source: Any) -> dict[str, Any]:

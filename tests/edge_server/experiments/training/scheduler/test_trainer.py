@@ -1,4 +1,4 @@
-"""Training: independent of the processes, continued bit for bit after a stop, and it learns."""
+"""Training: continued bit for bit after a stop, and it learns."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def quiet(line: str) -> None:
     del line
 
 
-def trained(out: Path, of: Setting | None = None, config: TrainingConfig = CONFIG, say=quiet, jobs: int = 1) -> Learner:
-    return train(of or setting(), config, NOTHING, jobs, out, say)
+def trained(out: Path, of: Setting | None = None, config: TrainingConfig = CONFIG, say=quiet) -> Learner:
+    return train(of or setting(), config, NOTHING, 1, out, say)
 
 
 def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], Path]:
@@ -54,17 +54,6 @@ def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], 
     (folder / "small.yaml").write_text(yaml.safe_dump(raw))
     out = folder / "out"
     return [str(folder / "small.yaml"), *words.split(), "--jobs", "1", "--out", str(out)], out
-
-
-def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
-    alone, both = trained(tmp_path / "one"), trained(tmp_path / "two", jobs=2)
-    assert same(alone, both) and not same(alone, Learner(CONFIG.spec, CONFIG.seed))
-    timeless = [
-        [{k: v for k, v in row.items() if k != "seconds"} for row in read_log(tmp_path / name)]
-        for name in ("one", "two")
-    ]
-    assert timeless[0] == timeless[1]
-    assert not same(alone, trained(tmp_path / "other", config=dataclasses.replace(CONFIG, seed=1)))
 
 
 def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):
@@ -82,6 +71,7 @@ def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):
     parts = trained(tmp_path / "parts")
     assert same(whole, parts) and same(Learner.load(tmp_path / "parts/policy.npz"), parts)
     assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
+    assert not same(whole, trained(tmp_path / "other", config=dataclasses.replace(CONFIG, seed=1)))
     with pytest.raises(TrainingError, match="other settings"):
         trained(tmp_path / "parts", setting(steps=5))
 
